@@ -15,7 +15,6 @@
     ├── BadConfiguration      a mission file, a setting: names file, key and allowed values
     └── Busy                  the queue is full, or the database does not answer
         ├── BeingBuilt        another thread builds what the work needs
-        ├── Standby           another service writes to the database
         └── Stopping          the service is stopping: a later attempt here will fail too
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
@@ -125,21 +124,6 @@ class BeingBuilt(Busy):
     def __init__(self, done: "Future[Any]") -> None:
         super().__init__("a part of the sky that this needs is built for the first time", 5)
         self.done = done
-
-
-class Standby(Busy):
-    """Another service writes to the database; this one takes over where that ends."""
-
-    def __init__(self, is_known: bool = True) -> None:
-        """`is_known` False: the connection was lost, and no other service may have taken over."""
-        if is_known:
-            super().__init__("another service writes to the database; this one stands by", 2)
-        else:
-            super().__init__(
-                "the connection that writes to the database was lost; this service takes it up "
-                "again, unless another one has",
-                2,
-            )
 
 
 class Stopping(Busy):

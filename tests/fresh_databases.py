@@ -22,7 +22,7 @@ from service.storage.sql.migrations import upgrade
 
 LOCK_TIMEOUT_MS = 2_000
 # As the service takes it: whoever still holds it has not been closed.
-WRITING_LOCK = "1633906037, '{schema}.event_counter'::regclass::oid::int"
+PROJECTOR_LOCK = "1633906037, '{schema}.event_counter'::regclass::oid::int"
 
 
 def sqlite_at(path: Path) -> str:
@@ -96,7 +96,7 @@ class _Schema:
 
     def empty(self) -> bool:
         """Make it as it was; False where a test changed its tables, or something still uses it."""
-        lock = WRITING_LOCK.format(schema=self.name)
+        lock = PROJECTOR_LOCK.format(schema=self.name)
         try:
             with _connected() as connection, connection.begin():
                 if self._shape_of(connection) != self._shape:

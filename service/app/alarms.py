@@ -125,7 +125,7 @@ class Alarms:
         with self._context.reading() as connection:
             due = is_due_by_clock(connection, self._context.missions, moment)
         if due:
-            self._context.store.writer.change(
+            self._context.store.writer.project(
                 lambda connection: evaluate_by_clock(connection, self._context.missions, moment)
             ).result()
         return due

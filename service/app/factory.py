@@ -19,7 +19,7 @@ from service.app.replays import Replays
 from service.app.results import Results
 from service.app.runs import Runs
 from service.app.service import Service
-from service.app.serving.single_writer import SingleWriter
+from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Spacecraft
 from service.app.submissions import Submissions
 from service.app.telemetry.grades import Grades
@@ -57,7 +57,7 @@ class App:
         self.missions = context.missions
         self.sky = context.sky
         self.store = context.store
-        self.single_writer = SingleWriter(context.store)
+        self.single_projector = SingleProjector(context.store)
         self.projector = Projector(context.store)
         self.access = Access(
             context.reading_record, context.change, is_loopback(context.settings.host), utc_now
@@ -97,12 +97,12 @@ class App:
             kernels,
             self.upgrade,
             self.expiries,
-            self.single_writer,
+            self.single_projector,
         )
 
     def close(self) -> None:
         """Stop the replays, write and project what is queued, and close the database."""
-        self.single_writer.stop()
+        self.single_projector.stop()
         self.webhooks.sender.stop()
         self.replays.stop()
         self.calibrations.close()
@@ -125,7 +125,7 @@ def open_app(
 ) -> App:
     """Read missions and catalog, open the database, start writing.
 
-    With `serving`, another service may write to the database: then this one stands by.
+    With `serving`, other services may share the database: one of them projects.
     With `reads_only`, one may write to a SQLite file, too: nothing is recorded of this start.
 
     `mission`, where given, takes the place of the one of that name.  `create`
@@ -152,18 +152,15 @@ def open_app(
     # A mission that is given takes the place of what was adopted, too.
     leave = mission.name if mission is not None else None
 
-    def take_over() -> None:
-        # Another service may have adopted a calibration in the meantime.
-        app.adoptions.load(leave)
-        if reads_only:
-            return
-        _register(app.context)
-        if serving:
-            # A command may run beside the service that computes one.
-            app.calibrations.interrupt()
-
     try:
-        app.single_writer.start(take_over, lambda: app.adoptions.follow(leave))
+        app.adoptions.load(leave)
+        if not reads_only:
+            _register(app.context)
+            if store.lock is None:
+                _end_left_work(app, serving)
+        if store.lock is not None:
+            app.submissions.ingest.before_solving = app.adoptions.follow_in
+        app.single_projector.start(app.adoptions.follow)
         app.projector.start()
     except BaseException:
         app.close()
@@ -172,7 +169,7 @@ def open_app(
 
 
 def _register(context: Context) -> None:
-    """Record the missions and the catalog in use, and close replays of an earlier process."""
+    """Record the missions and the catalog in use."""
     moment = utc_now().text
     mission_rows = [
         {
@@ -186,5 +183,13 @@ def _register(context: Context) -> None:
     catalog = context.sky.catalog
     catalog_row = {"digest": catalog.digest, "name": catalog.name, "first_used": moment}
     context.change(lambda connection: register(connection, mission_rows, catalog_row))
-    stored = Spool(context.settings.spool_folder).ids()
-    context.change(lambda connection: mark_interrupted(connection, moment, stored))
+
+
+def _end_left_work(app: App, serving: bool) -> None:
+    """Close replays and calibrations of an earlier process, where this is the only service."""
+    moment = utc_now().text
+    stored = Spool(app.settings.spool_folder).ids()
+    app.context.change(lambda connection: mark_interrupted(connection, moment, stored))
+    if serving:
+        # A command may run beside the service that computes a calibration.
+        app.calibrations.interrupt()

@@ -97,6 +97,8 @@ class Replays:
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()
         self._replays: list[RunningReplay] = []
+        self._given_up: set[str] = set()
+        """Those that this process could not continue: it does not try again."""
         self._closing = False
 
     @property
@@ -157,10 +159,14 @@ class Replays:
     def resume(self) -> None:
         """Continue the uploads that an earlier process has not finished."""
         for about in self._spool.left():
+            if about.id in self._given_up:
+                self._spool.release(about.id)
+                continue
             try:
                 self._resume(about)
             except (AcquisitionError, OSError) as error:
                 log.warning("replay %s is not continued: %s", about.id, error)
+                self._given_up.add(about.id)
                 self._spool.release(about.id)
                 close = partial(close_waiting, id=about.id, now=utc_now().text)
                 self._context.change(close)
@@ -199,6 +205,7 @@ class Replays:
         state = stored or _new_state(checked_run_name(run), options)
 
         def ended(end: str) -> None:
+            self._context.store.at_work.discard(state.id)
             self._spool.release(state.id)
             if end != "interrupted":
                 drop(state.id)
@@ -218,6 +225,7 @@ class Replays:
                 raise Stopping("the service is stopping")
             self._require_slot(options.get("owner"))
             self._replays = [*self.at_work, replay]
+            self._context.store.at_work.add(state.id)
         return replay
 
     def _require_slot(self, owner: str | None) -> None:

@@ -12,7 +12,7 @@ from service.acquire.kernel_build import KernelBuild
 from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
-from service.app.serving.single_writer import SingleWriter
+from service.app.single_projector import SingleProjector
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy
 from service.ingest.kernel_progress import progress_logged
@@ -49,7 +49,7 @@ class Service:
         kernels: KernelBuild | None,
         upgrade: BackgroundUpgrade,
         expiries: ExpiryDates,
-        single_writer: SingleWriter,
+        single_projector: SingleProjector,
     ) -> None:
         self._context = context
         self._submissions = submissions
@@ -57,7 +57,7 @@ class Service:
         self._kernels = kernels
         self._upgrade = upgrade
         self._expiries = expiries
-        self._single_writer = single_writer
+        self._single_projector = single_projector
         self._warming = threading.Lock()
         self._is_warm = False
         self._ids = Ulids()
@@ -69,8 +69,7 @@ class Service:
         Other calls return as soon as batches with a zone do, while the first call compiles the
         rest.
         Raises `Busy` while another call does so, if the database cannot be read, and if the
-        last write failed and another write, tried now, fails too; `Standby` where this service
-        is as ready, but another one writes.
+        last write failed and another write, tried now, fails too.
         """
         if not self._is_warm:
             if not self._warming.acquire(blocking=False):
@@ -84,7 +83,6 @@ class Service:
             finally:
                 gc.enable()
                 self._warming.release()
-        self._single_writer.require()
         self._context.store.writer.require()
         self._context.store.writer.require_written()
         with self._context.reading_record() as connection:
@@ -99,12 +97,10 @@ class Service:
         self._become_warm()
         if self._kernels is not None:
             # Only the service does this by itself, not a command beside it.
-            self._single_writer.when_writing(self._begin_work)
+            self._replays.resume()
+            self._single_projector.resume_with(self._replays.resume)
+            self._single_projector.when_projecting(self._upgrade.start)
             self._expiries.warn()
-
-    def _begin_work(self) -> None:
-        self._replays.resume()
-        self._upgrade.start()
 
     def _begin_with_zones(self) -> None:
         """Load the kernels of batches with a zone, and be ready for these."""
@@ -159,9 +155,7 @@ class Service:
                 self._prewarm_sky([mission], sent.batch.time)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
-                    self._submissions.ingest.warm_up(
-                        structs.replace(sent, batch=batch), write=self._single_writer.is_writing
-                    )
+                    self._submissions.ingest.warm_up(structs.replace(sent, batch=batch))
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)

@@ -27,7 +27,7 @@ from service.errors import BeingBuilt, Busy, Stopping
 from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
-from service.storage.recording.identity import Identity, OwnKey
+from service.storage.recording.identity import Identity, OwnKey, PredictionOutdated
 from service.storage.recording.transaction import QueuedJob, WriteOutcome, WriteOutcomes
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, WriterState
@@ -243,8 +243,13 @@ class IngestQueue:
 
     def _answer_written(self) -> None:
         written, self._written = self._written, []
-        if written:
-            self._finish(written)
+        for pending, outcome in written:
+            if isinstance(outcome, PredictionOutdated):
+                # Until its time is over it is computed from the attitude that is the last one now.
+                self._start(pending)
+        done = [each for each in written if not isinstance(each[1], PredictionOutdated)]
+        if done:
+            self._finish(done)
 
     # ---- answers -----------------------------------------------------------------------------
 

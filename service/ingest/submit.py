@@ -29,7 +29,7 @@ from service.ingest.outcomes import (
 )
 from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
-from service.ingest.tracking import with_prediction
+from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
@@ -76,6 +76,8 @@ class SubmissionService:
         self._single_s = -float("inf")
         self.observers: list[Observer] = []
         """Called with every batch that is new, after its commit."""
+        self.before_solving: Callable[[Connection], object] = lambda connection: None
+        """Called before each group of submissions is solved, with a connection for look-ups."""
 
     def submit(
         self,
@@ -237,11 +239,11 @@ class SubmissionService:
             is_long=may_take_long(batch),
         )
 
-    def warm_up(self, submission: Submission, write: bool = True) -> None:
+    def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 
         Connections are opened and statements prepared that the first batch
-        would wait for.  Without `write` the batch is not even recorded.
+        would wait for.
         """
         pending = PendingBatch(
             identity_of(submission.batch),
@@ -258,8 +260,6 @@ class SubmissionService:
             record(connection, [unsaved])
             raise _WarmedUp
 
-        if not write:
-            return
         with suppress(_WarmedUp):
             self._store.writer.change(record_and_roll_back).result()
 
@@ -316,11 +316,20 @@ class SubmissionService:
 
     def _solve(self, pending: PendingBatch, may_wait: bool) -> UnsavedResult:
         submission = pending.make()
-        if self.solver.asks_for_last(submission.batch):
-            mission = self.solver.missions[submission.batch.spacecraft]
+        is_outdated: Callable[[Connection], bool] | None = None
+        if self.solver.asks_for_last(batch := submission.batch):
+            mission = self.solver.missions[batch.spacecraft]
             with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
+                if self._store.lock is not None:
+                    # Other services record attitudes of this spacecraft, too.
+                    last = last_results(connection, batch, mission)
+
+                    def is_outdated(connection: Connection) -> bool:
+                        return last_results(connection, batch, mission) != last
+
         unsaved = self.solver.solve(submission, pending.received, pending.key, may_wait=may_wait)
+        unsaved.is_outdated = is_outdated
         note_handed_over([unsaved])
         return unsaved
 
@@ -337,6 +346,7 @@ class SubmissionService:
                 {each.identity for each in group},
                 {each.key for each in group if each.key is not None},
             )
+            self.before_solving(connection)
         holders = [holder_of(registry, e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}

@@ -50,6 +50,13 @@ def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
     return is_default and batch.a_priori is None and batch.measurement is None
 
 
+def last_results(connection: Connection, batch: ObservationBatch, mission: Mission) -> list[str]:
+    """The results whose attitudes the prediction of a batch begins with."""
+    settings = mission.tracking or TrackingSettings()
+    found = last_attitudes(connection, batch.spacecraft, batch.run, batch.time, settings.max_age_s)
+    return [each.result for each in found]
+
+
 def with_prediction(
     connection: Connection, submission: Submission, mission: Mission, gyro_run: str | None = None
 ) -> Submission:

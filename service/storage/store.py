@@ -27,8 +27,9 @@ from service.storage.sql.engines import (
     writing_engine,
 )
 from service.storage.sql.file_lock import FileLock
+from service.storage.sql.heard_events import HeardEvents
 from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
-from service.storage.sql.writing_lock import WritingLock
+from service.storage.sql.projector_lock import ProjectorLock
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +119,7 @@ class Store(Readers):
         from the `archive_folder`.
         One process at a time writes to a SQLite file, from its first write on; with `serving`,
         from the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL
-        lets one service alone write.
+        lets one service alone project.
         Raises `BadConfiguration` with what to do.
         """
         self.archive = Archive(archive_folder)
@@ -146,9 +147,11 @@ class Store(Readers):
                 self.file_lock.release()
             raise
         super().__init__(database, serving=serving, file=file)
-        self.lock = WritingLock() if serving and file is None else None
-        """Of PostgreSQL: nothing is written before it is taken."""
+        self.lock = ProjectorLock() if serving and file is None else None
+        """Of PostgreSQL: nothing is projected before it is taken."""
         wait_s = TURN_S if serving else None
+        self.at_work = set[str]() if self.lock is None else self.lock.at_work
+        """The ids of replays and calibrations that this process is at work on."""
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
@@ -156,8 +159,16 @@ class Store(Readers):
         """Waits for the projections, and tells by how many seconds they are still behind."""
         self.hold_back: Callable[[], object] = lambda: None
         """Waits while too much is to be projected; called before much is recorded at once."""
+        self._heard: HeardEvents | None = None
         if serving and self.file_lock is not None:
             self.writer.change(remove_probe).result()
+        elif serving:
+            self._heard = HeardEvents(self.url, self.writer.tell_of_events)
+
+    @property
+    def is_projecting(self) -> bool:
+        """Whether this process projects, as far as is known without asking the database."""
+        return self.lock is None or self.lock.is_held
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
@@ -197,6 +208,8 @@ class Store(Readers):
 
     def close(self) -> None:
         """Write what is queued, then let go of the database."""
+        if self._heard is not None:
+            self._heard.close()
         self.writer.close()
         # The writer goes last: the last connection to leave checkpoints the log.
         super().close()

@@ -18,7 +18,7 @@ from starlette.staticfiles import StaticFiles
 
 from service import __version__
 from service.app.factory import App
-from service.errors import AcquisitionError, Standby
+from service.errors import AcquisitionError
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     advice,
@@ -103,9 +103,9 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         reporting = asyncio.create_task(report_to_supervisor(app))
         try:
             await web_app.state.live.start()
-            app.single_writer.when_writing(app.webhooks.sender.start)
+            app.webhooks.sender.start()
             app.live_filter.start()
-            app.single_writer.when_writing(app.definitive.start_schedule)
+            app.definitive.start_schedule()
             yield
         finally:
             reporting.cancel()
@@ -180,8 +180,6 @@ def _warm_up(web_app: FastAPI, app: App, loop: asyncio.AbstractEventLoop) -> Non
     try:
         app.service.ready()
         asyncio.run_coroutine_threadsafe(warm_request(web_app), loop).result()
-    except Standby as error:
-        log.info("%s", error)
     except Exception as error:
         # /readyz reports it, and its next call tries again.
         log.warning("not ready yet: %s", error)
@@ -206,11 +204,7 @@ async def report_to_supervisor(app: App) -> None:
     own = anyio.CapacityLimiter(1)
     while not await anyio.to_thread.run_sync(_is_ready, app, limiter=own):
         await asyncio.sleep(TRY_AGAIN_S)
-    if app.single_writer.is_writing:
-        notify_supervisor("READY=1\nSTATUS=ready")
-    else:
-        notify_supervisor("READY=1\nSTATUS=standing by")
-        app.single_writer.when_writing(lambda: notify_supervisor("STATUS=ready"))
+    notify_supervisor("READY=1\nSTATUS=ready")
     every_s = int(os.environ.get("WATCHDOG_USEC", "0")) / 2e6
     while every_s > 0.0:
         try:
@@ -242,9 +236,6 @@ def notify_supervisor(message: str) -> None:
 def _is_ready(app: App) -> bool:
     try:
         app.service.ready()
-    except Standby:
-        # It has started: a supervisor that waits for more would end it.
-        return True
     except Exception:  # the warm-up logs why, and the next call tries again
         return False
     return True

@@ -1,9 +1,9 @@
 """Live events: recorded events, sent to every listener without a gap.
 
-The same task checks every second for silent spacecraft.
+The same task checks every second for silent spacecraft, in the service that projects.
 
-One task reads new events, at once when this process wrote them and every second
-for what others wrote.  The latest are held in memory; each listener takes them
+One task reads new events, at once when they were recorded and every second, should another
+process not have been heard.  The latest are held in memory; each listener takes them
 at its own pace and, when it has fallen far behind, reads from the records.  So
 there is no queue that a slow listener could fill.
 """
@@ -205,7 +205,7 @@ class Live:
         now_s = asyncio.get_running_loop().time()
         if now_s >= self._swept_s + POLL_S:
             self._swept_s = now_s
-            if self._app.single_writer.is_writing:
+            if self._app.single_projector.is_projecting:
                 await self._read(self._app.alarms.evaluate_by_clock)
 
     async def _take(self) -> None:

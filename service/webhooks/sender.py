@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 
 from sqlalchemy import Connection
 
-from service.errors import Busy, Standby, Stopping
+from service.errors import Busy, Stopping
 from service.settings import Network
 from service.storage.recording.events import Event, events_after, first_event, last_event
 from service.storage.recording.ids import unguessable_ulid
@@ -174,9 +174,6 @@ class WebhookSender:
             self._news.clear()
             try:
                 await self._round()
-            except Standby:
-                # The service that writes delivers.
-                await asyncio.sleep(POLL_S)
             except Exception as error:
                 # The records are out of reach for a while: nothing is lost, it comes later.
                 log.warning("webhooks are not delivered: %s", error)
@@ -199,6 +196,10 @@ class WebhookSender:
             self.log.listed(known)
             # What changed meanwhile is perhaps not in the list.
             self._listed_s = now_s if changes == self._changes else -LISTED_FOR_S
+        if not self._store.is_projecting:
+            # Another service delivers.
+            await self._turn.give_up()
+            return
         if not self._webhooks or not await self._turn.take(self._read):
             return
         active = [each for each in self._webhooks.values() if each.state == "active"]

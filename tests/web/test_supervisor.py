@@ -3,17 +3,14 @@
 import os
 import signal
 import socket
-from contextlib import suppress
 
-import httpx
 import pytest
 from sqlalchemy import create_engine
 from sqlalchemy.pool import NullPool
 
 from service.storage.sql.engines import database_url
-from service.storage.sql.writing_lock import WritingLock
+from service.storage.sql.projector_lock import ProjectorLock
 from tests.fresh_databases import sqlite_at
-from tests.waiting import wait_until
 from tests.web.serving import served, serving
 
 
@@ -55,20 +52,9 @@ def test_it_reports_ready_then_signs_of_life_none_where_it_stands_and_that_it_st
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
-def test_a_service_that_stands_by_has_started(heard, database):
+def test_a_service_beside_one_that_projects_is_ready(heard, database):
     engine = create_engine(database_url(database), poolclass=NullPool)
     with engine.connect() as other:
-        assert WritingLock().take(other) == "taken"
-        with serving(database) as (_, url):
-            wait_until(lambda: standing_by(url))
-            assert heard() == "READY=1\nSTATUS=standing by"
-            other.close()
-            while (told := heard()) != "STATUS=ready":
-                assert told == "WATCHDOG=1"
-
-
-def standing_by(url):
-    with suppress(httpx.TransportError):
-        answer = httpx.get(f"{url}/readyz")
-        return answer.status_code == 503 and answer.json()["type"] == "/problems/standby"
-    return False
+        assert ProjectorLock().take(other) == "taken"
+        with serving(database):
+            assert heard() == "READY=1\nSTATUS=ready"

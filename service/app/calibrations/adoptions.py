@@ -68,22 +68,31 @@ class CalibrationAdoptions:
         self._missions_changed = missions_changed
         self._ids = Ulids()
         self._lock = threading.Lock()
+        self._leave: str | None = None
         self._loaded: str | None = None
         """The newest adoption when they were loaded; empty where there was none."""
 
-    def follow(self, leave: str | None = None) -> None:
-        """`load` where they were not loaded yet, or another service has adopted one since."""
-        with self._context.reading() as connection:
-            newest = stored.newest_adoption(connection)
-        if (newest or "") != self._loaded:
-            self.load(leave)
+    def follow(self) -> None:
+        """`load` again where another service has adopted one since."""
+        with self._context.reading_record() as connection:
+            self.follow_in(connection)
+
+    def follow_in(self, connection: Connection) -> None:
+        """`follow`, with a connection that sees the record as it is now.
+
+        Each group of posts begins with this: whoever posts after an adoption was answered, by
+        whichever service, is answered with the calibration that was adopted.
+        """
+        if stored.newest_adoption(connection) != self._loaded:
+            self.load(self._leave)
 
     def load(self, leave: str | None = None) -> None:
         """Put what was adopted over the mission files, but for the spacecraft `leave`."""
+        self._leave = leave
         with self._lock:
             before = dict(self._context.missions)
-            with self._context.reading() as connection:
-                self._loaded = stored.newest_adoption(connection) or ""
+            with self._context.reading_record() as connection:
+                self._loaded = stored.newest_adoption(connection)
                 adopted = adopted_missions(connection, self._files, leave)
             self._context.missions.update(self._files | adopted)
             if self._context.missions != before:
@@ -168,10 +177,9 @@ class CalibrationAdoptions:
         note: str,
         entry: Entry | None,
     ) -> CalibrationAdoption:
-        name, id, moment = file.name, self._ids.new(), utc_now().text
+        name, moment = file.name, utc_now().text
         mission = file if trackers is None else with_geometry(file, trackers)
         row = {
-            "id": id,
             "spacecraft": name,
             "adopted": moment,
             "who": who,
@@ -192,12 +200,14 @@ class CalibrationAdoptions:
 
         def change(connection: Connection) -> CalibrationAdoption:
             register(connection, [settings], used)
-            stored.add_adoption(connection, row)
+            id = stored.begin_adoption(connection, self._ids.new())
+            stored.add_adoption(connection, row | {"id": id})
             adopted = stored.list_adoptions(connection, name)[0]
             told = {each: getattr(adopted, each) for each in TOLD}
             events.add_event(connection, "calibration", told, spacecraft=name)
             return adopted
 
+        self.follow()
         with self._lock:
             if mission_named(self._context.missions, name).digest == mission.digest:
                 raise WrongState("these settings are in force already")

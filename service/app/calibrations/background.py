@@ -12,7 +12,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.app.calibrations.estimates import CalibrationRequest, CalibrationRun, Estimator
 from service.app.calibrations.findings import result_of
 from service.app.context import Context
-from service.errors import AcquisitionError, Busy, Standby, Stopping
+from service.errors import AcquisitionError, Busy, Stopping
 from service.missions.mission import Mission
 from service.storage.calibrations import stored
 from service.storage.sql.columns import Row
@@ -52,11 +52,12 @@ class BackgroundCalibrations:
             if self._unfinished >= MOST_WAITING:
                 raise Busy(f"{self._unfinished} calibrations wait already", 10)
             self._unfinished += 1
+            self._context.store.at_work.add(id)
         try:
             begin()
             self._thread.submit(self._compute, id, wanted, mission)
         except BaseException:
-            self._over()
+            self._over(id)
             raise
 
     def close(self) -> None:
@@ -70,7 +71,7 @@ class BackgroundCalibrations:
         progress = _Progress(self._context, id, lambda: self._closing)
         try:
             ended = found_columns(self._estimator.estimate(wanted, mission, progress.step))
-        except (Standby, Stopping):
+        except Stopping:
             ended = {"state": "interrupted"}
         except AcquisitionError as error:
             ended = {"state": "failed", "fault": str(error)}
@@ -80,7 +81,7 @@ class BackgroundCalibrations:
             fault = "the fault is on the service's side; it is logged"
             ended = {"state": "failed", "fault": fault}
         finally:
-            self._over()
+            self._over(id)
         ended |= {"ended": utc_now().text}
         while True:
             try:
@@ -88,13 +89,14 @@ class BackgroundCalibrations:
                 return
             except (AcquisitionError, SQLAlchemyError) as error:
                 log.warning("the end of calibration %s cannot be recorded yet: %s", id, error)
-            # After this the next service that writes records it as interrupted.
+            # After this another service, or the next start, records it as interrupted.
             if self._closed.wait(SAVED_EVERY_S):
                 return
 
-    def _over(self) -> None:
+    def _over(self, id: str) -> None:
         with self._lock:
             self._unfinished -= 1
+            self._context.store.at_work.discard(id)
 
 
 class _Progress:

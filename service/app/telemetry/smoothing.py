@@ -10,7 +10,7 @@ from msgspec import structs
 from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context, checked_run_name
 from service.app.telemetry.grades import Grades, SmoothProgress
-from service.errors import AcquisitionError, Busy, NotFound, Standby, Stopping
+from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.day import LOOK_AHEAD_S
 from service.missions.mission import mission_named
 from service.storage.grades.models import DefinitiveJob, DefinitiveJobList
@@ -73,7 +73,7 @@ class DefinitiveAttitudes:
         """Queue a job for the UTC days of a period that have batches; without one, all days.
 
         Raises `Busy` where too many wait or kernels are still compiled, `Stopping` while the
-        service closes, `Standby` where another service writes.
+        service closes.
         """
         mission_named(self._context.missions, spacecraft)
         run = LIVE if run is None else checked_run_name(run)
@@ -153,9 +153,11 @@ class DefinitiveAttitudes:
 
     def _keep_schedule(self) -> None:
         while not self._stopped.wait(5.0 if not self._made else LOOK_EVERY_S):
+            if not self._context.store.is_projecting:
+                continue
             try:
                 self.begin_due(utc_now())
-            except (Busy, Standby, Stopping) as error:
+            except (Busy, Stopping) as error:
                 log.info("the daily definitive attitude waits: %s", error)
             except Exception:
                 # The next look may find the database back.
@@ -178,7 +180,7 @@ class DefinitiveAttitudes:
                 wanted.spacecraft, run=wanted.run, start=wanted.start, end=wanted.end, step=step
             )
             ended = {"state": "done", "fault": None}
-        except (Standby, Stopping):
+        except Stopping:
             ended = {"state": "interrupted", "fault": None}
         except NotFound as error:
             ended = {"state": "done", "fault": str(error)}

@@ -1,6 +1,7 @@
 """Calibrations in the records: begun, ended, read, and adopted."""
 
 import json
+from collections.abc import Collection
 
 import msgspec
 from sqlalchemy import Connection, Select, func, insert, select, update
@@ -14,12 +15,15 @@ from service.storage.calibrations.models import (
     TrackerGeometry,
 )
 from service.storage.models.base import Page
+from service.storage.recording.ids import following_ulid
 from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
 from service.storage.sql.columns import Row
+from service.storage.sql.prepared import execute
 
 _GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])
 _RESULT = msgspec.json.Decoder(CalibrationResult)
 UNFINISHED = ("queued", "running")
+_NEWEST_ADOPTION = "SELECT max(id) FROM calibration_adoptions"
 _PLAIN = (
     "id",
     "spacecraft",
@@ -50,16 +54,23 @@ def change_calibration(connection: Connection, id: str, changes: Row) -> None:
     connection.execute(update(calibrations).where(calibrations.c.id == id).values(changes))
 
 
-def interrupt_calibrations(connection: Connection, now: str) -> None:
-    """Close the calibrations that a stopped process left unfinished.
+def unfinished_calibrations(connection: Connection) -> set[str]:
+    """The ids of the calibrations that are computed, or wait for that."""
+    unfinished = calibrations.c.state.in_(UNFINISHED)
+    return set(connection.scalars(select(calibrations.c.id).where(unfinished)))
+
+
+def interrupt_calibrations(
+    connection: Connection, now: str, only: Collection[str] | None = None
+) -> None:
+    """Close the calibrations that a stopped process left unfinished; with `only`, of these alone.
 
     One that another process is at work on is set to what it came to when that process ends it.
     """
-    connection.execute(
-        update(calibrations)
-        .where(calibrations.c.state.in_(UNFINISHED))
-        .values(state="interrupted", ended=now)
-    )
+    left = [calibrations.c.state.in_(UNFINISHED)]
+    if only is not None:
+        left.append(calibrations.c.id.in_(only))
+    connection.execute(update(calibrations).where(*left).values(state="interrupted", ended=now))
 
 
 def read_calibration(connection: Connection, id: str) -> Calibration:
@@ -114,10 +125,21 @@ def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationA
     return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
 
 
-def newest_adoption(connection: Connection) -> str | None:
-    """The id of the last change of any spacecraft."""
-    id: str | None = connection.scalar(select(func.max(calibration_adoptions.c.id)))
-    return id
+def newest_adoption(connection: Connection) -> str:
+    """The id of the last change of any spacecraft; empty where there was none."""
+    ((newest,),) = execute(connection, _NEWEST_ADOPTION)
+    return newest or ""
+
+
+def begin_adoption(connection: Connection, id: str) -> str:
+    """An id for a change, at least this one: it follows all others, whatever clocks say.
+
+    Until the end of the transaction no other process adds one.
+    """
+    if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql("LOCK TABLE calibration_adoptions IN SHARE ROW EXCLUSIVE MODE")
+    newest = newest_adoption(connection)
+    return id if id > newest else following_ulid(newest)
 
 
 def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:

@@ -4,8 +4,9 @@
 
 It takes results in the order of the record, many at a time, and notes how far it came in the
 same transaction: after a crash it goes on from there, and no result is projected twice or not
-at all.  Several processes may project one database; the row with the position is locked, so
-that they take turns.
+at all.  Of the services on one database the one that holds the lock projects what all of them
+record (`ProjectorLock`).  Commands may project beside it; the row with the position is locked,
+so that they take turns.
 """
 
 import logging
@@ -16,14 +17,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 
-from sqlalchemy import Connection, func, select, update
+from sqlalchemy import Connection, update
 
-from service.errors import BadConfiguration, Busy, Standby
+from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals, states
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
-from service.storage.sql.prepared import execute, prepared
-from service.storage.sql.tables import projector, results
+from service.storage.sql.prepared import execute
+from service.storage.sql.projector_lock import NotProjecting
+from service.storage.sql.tables import projector
 from service.storage.store import Store
 
 log = logging.getLogger(__name__)
@@ -41,7 +43,13 @@ LONGEST_S = 0.05
 EVERY_S = 0.1
 """Between the beginnings of two transactions, unless a reader waits."""
 LOOK_S = 1.0
-"""Between two looks for what other processes recorded."""
+"""Between two looks for what other processes recorded, and for where another one projects."""
+SHARED_LOOK_S = 0.1
+"""The same on PostgreSQL in the process that projects: other services record all the time."""
+POLL_S = 0.02
+"""Between two looks of a reader for where another process projects."""
+GAP_S = 0.01
+"""The pause before a gap in the record is looked at again."""
 WAIT_S = 1.0
 """The longest wait of a reader for the projections."""
 MOST_BEHIND = 20_000
@@ -52,7 +60,7 @@ CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
 
 _BEHIND = "SELECT count(*) FROM results WHERE seq > (SELECT seq FROM projector)"
-_NEWEST = prepared(select(func.max(results.c.seq).label("seq")))
+_PLACES = "SELECT (SELECT coalesce(max(seq), 0) FROM results), (SELECT seq FROM projector)"
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,8 @@ class _Step:
     """True if the transaction projected every result that it could see."""
     has_time: bool
     """The next one may wait until there is more."""
+    is_blocked: bool = False
+    """True if the next result is one after a gap that may still be filled."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +99,8 @@ class Projector:
     def __init__(self, store: Store) -> None:
         """Readers of the store wait for the projections once the thread is started."""
         self._store, self._writer = store, store.writer
+        self._is_shared = store.file is None
+        """Other processes record and project, too."""
         self._is_closing = False
         self._changed = threading.Condition()
         self._position = 0
@@ -116,13 +128,21 @@ class Projector:
 
         The seconds that the projections are behind then; zero where they are not.
         """
-        if self._projected >= self._writer.commits or not self._is_projecting:
+        if not self._is_shared and (
+            self._projected >= self._writer.commits or not self._is_projecting
+        ):
             return 0.0
-        commits, newest = self._writer.commits, self._newest()
+        commits = self._writer.commits
+        newest, position = self._places()
+        if position >= newest:
+            return 0.0
+        if not self._is_projecting:
+            return self._wait_for_another(newest)
 
         def has_passed() -> bool:
-            is_passed = self._position >= newest or self._projected >= commits
-            return is_passed or self._is_closing or not self._is_projecting
+            # Of others' results the writer's count says nothing.
+            is_own = not self._is_shared and self._projected >= commits
+            return self._position >= newest or is_own or self._is_closing
 
         with self._changed:
             self._readers += 1
@@ -133,15 +153,14 @@ class Projector:
 
     def catch_up(self, most: int = 0) -> None:
         """Wait while more than so many results are to be projected."""
-        while self._is_projecting and not self._is_closing and self.lag().results > most:
+        while not self._is_closing and (self._is_projecting or self._is_shared):
+            if self._count_behind(most) <= most:
+                return
             self.wait()
 
     def lag(self) -> Lag:
         """How far behind the projections are."""
-        if self._projected >= self._writer.commits:
-            return Lag(0, 0.0)
-        with self._store.lookup() as connection:
-            ((behind,),) = execute(connection, _BEHIND)
+        behind = self._count_behind(0)
         return Lag(behind, time.monotonic() - self._up_to_date_s if behind else 0.0)
 
     def close(self) -> None:
@@ -152,11 +171,34 @@ class Projector:
         if self._thread is not None:
             self._thread.join()
 
-    def _newest(self) -> int:
-        """The place of the newest result in the record."""
+    def _count_behind(self, most: int) -> int:
+        """How many results are to be projected; counted only if there may be more than so many."""
+        if not self._is_shared and self._projected >= self._writer.commits:
+            return 0
+        newest, position = self._places()
+        if newest - position <= most:
+            return max(0, newest - position)
         with self._store.lookup() as connection:
-            (row,) = _NEWEST.read(connection, {})
-        return row["seq"] or 0
+            ((behind,),) = execute(connection, _BEHIND)
+        return int(behind)
+
+    def _places(self) -> tuple[int, int]:
+        """The places of the newest result and of the projector in the record."""
+        asked_s = time.monotonic()
+        with self._store.lookup() as connection:
+            ((newest, position),) = execute(connection, _PLACES)
+        if position >= newest:
+            self._up_to_date_s = max(self._up_to_date_s, asked_s)
+        return newest, position
+
+    def _wait_for_another(self, newest: int) -> float:
+        """`wait` for the process that projects."""
+        end_s = time.monotonic() + WAIT_S
+        while time.monotonic() < end_s and not self._is_closing:
+            time.sleep(POLL_S)
+            if self._places()[1] >= newest:
+                return 0.0
+        return time.monotonic() - self._up_to_date_s
 
     # ---- the projector's thread --------------------------------------------------------------
 
@@ -171,7 +213,7 @@ class Projector:
         while True:
             begun_s = time.monotonic()
             commits = self._writer.commits
-            step = self._try_step()
+            step = self._try_step() if self._may_step() else None
             with self._changed:
                 if step is not None:
                     self._position = step.position
@@ -185,15 +227,37 @@ class Projector:
                     continue
                 if step is None or step.is_all:
                     self._is_idle = True
-                    self._changed.wait_for(self._has_work, LOOK_S)
+                    is_alert = self._is_shared and self._is_projecting
+                    self._changed.wait_for(self._has_work, SHARED_LOOK_S if is_alert else LOOK_S)
                     self._is_idle = False
+                elif step.is_blocked:
+                    self._changed.wait(GAP_S)
                 pause_s = begun_s + EVERY_S - time.monotonic()
                 if pause_s > 0.0 and (step is None or step.has_time):
                     self._changed.wait_for(lambda: self._readers or self._is_closing, pause_s)
 
     def _has_work(self) -> bool:
         is_behind = self._projected < self._writer.commits
-        return self._is_closing or (self._is_projecting and is_behind)
+        is_asked = self._is_shared and self._readers > 0
+        return self._is_closing or (self._is_projecting and (is_behind or is_asked))
+
+    def _may_step(self) -> bool:
+        """False if nothing is to be projected, or by another process; asked on PostgreSQL alone.
+
+        A transaction of the projector locks its row, even where it finds nothing.
+        """
+        if not self._is_shared:
+            return True
+        commits = self._writer.commits
+        self._is_projecting = self._store.is_projecting
+        try:
+            newest, self._position = self._places()
+        except Busy:
+            return False
+        if self._position < newest:
+            return self._is_projecting
+        self._projected = commits
+        return False
 
     def _try_step(self) -> _Step | None:
         """Project some results; None where nothing can be written now."""
@@ -210,8 +274,8 @@ class Projector:
     def _write(self, step: Callable[[Connection], _Step]) -> _Step | None:
         try:
             done = self._writer.project(step).result()
-        except (Standby, BadConfiguration):
-            # Another process writes, and projects.
+        except (NotProjecting, BadConfiguration):
+            # Another process projects.
             self._is_projecting = False
             return None
         except Busy:
@@ -232,6 +296,7 @@ class Projector:
         if oldest is not None:
             whole = self._without_gaps(connection, position, new, oldest)
             is_all, new = is_all and len(whole) == len(new), whole
+        is_blocked = not new and not is_all
         if new:
             position = new[-1].seq
             connection.execute(update(projector).values(seq=position))
@@ -239,7 +304,7 @@ class Projector:
                 apply(connection, new)
             took_s = time.monotonic() - begun_s
             self._most = max(1, min(MOST_AT_ONCE, int(2 * len(new) * LONGEST_S / took_s)))
-        return _Step(position, is_all, has_time=is_all)
+        return _Step(position, is_all, has_time=is_all, is_blocked=is_blocked)
 
     def _without_gaps(
         self, connection: Connection, position: int, new: list[RecordedResult], oldest: int

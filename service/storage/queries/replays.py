@@ -124,16 +124,28 @@ def is_cancelled(connection: Connection, id: str) -> bool:
     return connection.scalar(select(replays.c.state).where(replays.c.id == id)) == CANCELLED
 
 
-def mark_interrupted(connection: Connection, now: str, stored: Collection[str] = ()) -> None:
+def unfinished_replays(connection: Connection) -> set[str]:
+    """The ids of the replays that run, or wait to go on."""
+    return set(connection.scalars(select(replays.c.id).where(replays.c.state.in_(UNFINISHED))))
+
+
+def mark_interrupted(
+    connection: Connection,
+    now: str,
+    stored: Collection[str] = (),
+    only: Collection[str] | None = None,
+) -> None:
     """Close the replays that a stopped process left unfinished; those that are `stored` wait.
 
-    If another process still runs one, that process sets its state to `running` again
-    when it next stores its progress.
+    With `only`, of these alone.  If another process still runs one, that process sets its state
+    to `running` again when it next stores its progress.
     """
     # A process that stopped in order has written `interrupted` itself.
     waits = replays.c.id.in_(stored), replays.c.state.in_((*UNFINISHED, "interrupted"))
     connection.execute(update(replays).where(*waits).values(state="waiting", finished=None))
-    ended = replays.c.id.not_in(stored), replays.c.state.in_(UNFINISHED)
+    ended = [replays.c.id.not_in(stored), replays.c.state.in_(UNFINISHED)]
+    if only is not None:
+        ended.append(replays.c.id.in_(only))
     connection.execute(update(replays).where(*ended).values(state="interrupted", finished=now))
 
 

@@ -14,6 +14,7 @@ import msgspec
 from sqlalchemy import Connection, delete, func, select
 
 from service.storage.sql.columns import Row
+from service.storage.sql.heard_events import CHANNEL
 from service.storage.sql.prepared import execute
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import event_counter, events
@@ -94,6 +95,9 @@ def numbered(connection: Connection) -> Iterator[None]:
     now = utc_now().text
     rows = [{"id": first + place, "at": now} | row for place, row in enumerate(outbox)]
     insert_all(connection, events, rows)
+    if connection.dialect.name == "postgresql":
+        # Other services wake at the commit, and read the table.
+        execute(connection, f"SELECT pg_notify('{CHANNEL}', '')")
     if first // PRUNED_EVERY != (last + 1) // PRUNED_EVERY:
         connection.execute(delete(events).where(events.c.id <= last - KEPT))
 

@@ -8,7 +8,7 @@ import msgspec
 from msgspec import Struct
 from sqlalchemy import Connection, insert
 
-from service.errors import Conflict, KeyReused, shown_value
+from service.errors import Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
 from service.storage.sql.packed_text import unpack
 from service.storage.sql.prepared import execute
@@ -73,6 +73,10 @@ class ExistingResult(Struct, frozen=True):
     fingerprint: str
     archived: bool = False
     """Whether its batch is in the archive."""
+
+
+class PredictionOutdated(Busy):
+    """Another service recorded an attitude after the one that a batch was predicted from."""
 
 
 class ArchivedMeanwhile(Exception):

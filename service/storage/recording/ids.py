@@ -35,7 +35,19 @@ class Ulids:
                 fresh if fresh >> _RANDOM_BITS > self._last >> _RANDOM_BITS else self._last + 1
             )
             value = self._last
-        return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
+        return _text_of(value)
+
+
+def following_ulid(id: str) -> str:
+    """The identifier that follows another one."""
+    value = 0
+    for letter in id:
+        value = value << 5 | _ALPHABET.index(letter)
+    return _text_of(value + 1)
+
+
+def _text_of(value: int) -> str:
+    return "".join([_PAIRS[value >> shift & 1023] for shift in _SHIFTS])
 
 
 def derived_ulid(id: str, *of: str) -> str:

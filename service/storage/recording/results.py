@@ -10,6 +10,7 @@ from service.storage.recording import events
 from service.storage.recording.digests import digest_of_row
 from service.storage.recording.identity import (
     ExistingResult,
+    PredictionOutdated,
     Registry,
     key_row,
     look_up,
@@ -38,6 +39,9 @@ from service.storage.sql.tables import (
 
 RecordOutcome = Answered | AcquisitionError
 
+_TAKE_TURN = (
+    "SELECT pg_advisory_xact_lock(hashtextextended(%(pair)s, 'batches'::regclass::oid::int8))"
+)
 _RUNS = "runs"
 """Where a connection remembers the runs that it has inserted, or found there."""
 _REMEMBERED = 1_000
@@ -94,6 +98,9 @@ def record(
     may still insert between the two: then an `IntegrityError` is raised, and
     to call again is to look again.
 
+    One that was predicted from an attitude that is not the last one any more gets the error
+    `PredictionOutdated`.
+
     With `assume_new` the tables are not searched first: the caller has done so and
     found none of them.  If one is there after all, the same error is raised, since
     identities and keys are unique.
@@ -106,8 +113,9 @@ def record(
             {unsaved.key for unsaved in unsaved_results if unsaved.key is not None},
         )
     keys_before = set(registry.keys)
+    outdated = _outdated(connection, unsaved_results)
     holders: list[ExistingResult | AcquisitionError] = [
-        _holder(unsaved, registry) for unsaved in unsaved_results
+        outdated.get(unsaved.id) or _holder(unsaved, registry) for unsaved in unsaved_results
     ]
     fresh = [
         (unsaved, unsaved.to_json(len(unsaved_results)))
@@ -132,6 +140,24 @@ def record(
         _outcome(unsaved, holder, answers)
         for unsaved, holder in zip(unsaved_results, holders, strict=True)
     ]
+
+
+def _outdated(
+    connection: Connection, unsaved_results: Sequence[UnsavedResult]
+) -> Mapping[str, PredictionOutdated]:
+    """By id, an error for each result whose prediction is not from the last attitude any more.
+
+    Until the transaction ends no other service records one that asks for the last attitude of
+    the same spacecraft and run.  All locks are taken first, and in order.
+    """
+    asked = [unsaved for unsaved in unsaved_results if unsaved.is_outdated is not None]
+    for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved in asked}):
+        execute(connection, _TAKE_TURN, {"pair": pair})
+    return {
+        unsaved.id: PredictionOutdated("another attitude was recorded meanwhile")
+        for unsaved in asked
+        if unsaved.is_outdated is not None and unsaved.is_outdated(connection)
+    }
 
 
 def _outcome(

@@ -42,6 +42,8 @@ class QueuedJob:
     change: Callable[[Connection], Any] | None = None
     low_priority: bool = False
     """As a bulk load has: it is written by itself, after what else waits."""
+    needs_lock: bool = False
+    """For a step of the projector: the session that holds its lock alone may take it."""
     post: Any = None
     since_s: float = field(default_factory=time.monotonic)
 

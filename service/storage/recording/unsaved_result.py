@@ -8,10 +8,11 @@ objects.
 
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import msgspec
 from msgspec import UNSET, Struct, structs
+from sqlalchemy import Connection
 
 from service.acquire import Acquisition
 from service.observations.frame_record import FrameRecord
@@ -68,6 +69,8 @@ class UnsavedResult(Struct, eq=False):
     """The values of each tracker, of a mission with several (`tracker_values`)."""
     audit: Row | None = None
     """The entry of the audit list that is stored with a recorded what-if."""
+    is_outdated: Callable[[Connection], bool] | None = None
+    """On PostgreSQL, of a batch that asked for the last attitude: whether there is a later one."""
 
     @property
     def id(self) -> str:

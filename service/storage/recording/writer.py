@@ -19,7 +19,7 @@ from typing import Any, TypeVar
 from sqlalchemy import Connection, Engine, update
 from sqlalchemy.exc import DBAPIError
 
-from service.errors import AcquisitionError, Busy, Standby, Stopping
+from service.errors import AcquisitionError, Busy, Stopping
 from service.storage.recording import events
 from service.storage.recording.transaction import (
     QueuedJob,
@@ -32,8 +32,8 @@ from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile
 from service.storage.sql.engines import TO_WRITE, patience
 from service.storage.sql.file_lock import FileLock
+from service.storage.sql.projector_lock import Attempt, NotProjecting, ProjectorLock
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
-from service.storage.sql.writing_lock import Attempt, WritingLock
 
 log = logging.getLogger(__name__)
 
@@ -77,14 +77,14 @@ class Writer:
         *,
         file: DatabaseFile | None = None,
         wait_s: float | None = None,
-        lock: WritingLock | None = None,
+        lock: ProjectorLock | None = None,
         file_lock: FileLock | None = None,
     ) -> None:
         """`file` is that of SQLite; `wait_s` bounds how long results wait to be written.
 
-        Those of a bulk load, and other changes, wait as long as it takes.  With a `lock` nothing
-        is written but by the session that holds it; see `take_lock`.  `file_lock` is taken before
-        anything is queued.
+        Those of a bulk load, and other changes, wait as long as it takes.  With a `lock` the
+        session that holds it projects, and no other one; see `take_lock`.  `file_lock` is taken
+        before anything is queued.
         """
         self._lock, self._file_lock = lock, file_lock
         self._connection = PersistentConnection(engine, TO_WRITE, file)
@@ -135,30 +135,23 @@ class Writer:
     def project(self, step: Callable[[Connection], T]) -> "Future[T]":
         """Queue a step of the projector: a change with a transaction of its own.
 
-        Posts go first, and the queue is never too full for it.
-        """
-        done: Future[T] = Future()
-        self.put(QueuedJob(_settling(done), change=step, low_priority=True))
-        return done
-
-    def take_lock(self) -> Attempt:
-        """Take the lock of the service that writes, if no other session has it.
-
-        Raises an error of SQLAlchemy's where the database is out of reach.
-        """
-        if self._lock is None:
-            return "kept"
-        with self._connection.lookup() as connection:
-            return self._lock.take(connection)
-
-    def give_lock(self) -> None:
-        """Leave the lock to another service.
-
-        Raises an error of SQLAlchemy's where the database is out of reach.
+        Posts go first, and the queue is never too full for it.  Raises `NotProjecting` where
+        another service that shares the database projects.
         """
         if self._lock is not None:
-            with self._connection.lookup() as connection:
-                self._lock.give(connection)
+            self._lock.require()
+        return self._put_step(step, needs_lock=True)
+
+    def take_lock(self) -> Attempt:
+        """Take the projector's lock, if no other session has it; raises `Busy`."""
+        if self._lock is None:
+            return "kept"
+        return self._put_step(self._lock.take, needs_lock=False).result()
+
+    def _put_step(self, step: Callable[[Connection], T], needs_lock: bool) -> "Future[T]":
+        done: Future[T] = Future()
+        self.put(QueuedJob(_settling(done), change=step, low_priority=True, needs_lock=needs_lock))
+        return done
 
     def require(self) -> None:
         """Raise `Stopping` unless what is queued will be written."""
@@ -208,7 +201,7 @@ class Writer:
             if self._closing:
                 raise Stopping("the service is stopping")
             if job.post is None:
-                self._require_locks()
+                self._require_lock()
             # A job that alone is larger than the queue is still taken by an empty one.
             is_full = self._queued and self._queued + job.weight > self._max_queued
             if is_full and not job.is_projection:
@@ -217,9 +210,7 @@ class Writer:
             self._queued += job.weight
             self._changed.notify()
 
-    def _require_locks(self) -> None:
-        if self._lock is not None:
-            self._lock.require()
+    def _require_lock(self) -> None:
         if self._file_lock is not None:
             self._file_lock.take()
 
@@ -266,7 +257,7 @@ class Writer:
             cause = error.orig if isinstance(error, DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
             told = _told(error)
-            is_trouble = isinstance(told, Busy) and not isinstance(told, Standby | Stopping)
+            is_trouble = isinstance(told, Busy) and not isinstance(told, NotProjecting | Stopping)
             if is_trouble and not jobs[0].is_projection:
                 self.note_failure(sum(job.weight for job in jobs))
             for job in jobs:
@@ -302,7 +293,7 @@ class Writer:
             self._solving_since_s = None
         try:
             if solved:
-                self._require_locks()
+                self._require_lock()
         except AcquisitionError as error:
             for job in solved:
                 job.settle(error)
@@ -356,9 +347,14 @@ class Writer:
             self._connection.transaction() as connection,
             patience(connection) if has_time else nullcontext(),
         ):
-            if self._lock is not None:
+            if self._lock is not None and jobs[0].needs_lock:
                 self._lock.require_in(connection)
             yield connection
+
+    def tell_of_events(self) -> None:
+        """Call those who wait for events: another process recorded some."""
+        for listener in list(self.after_events):
+            listener()
 
     def _tell(self) -> None:
         listeners = [*self.after_commit, *(self.after_events if self._has_events else ())]

@@ -119,7 +119,6 @@ class Layout:
     """Of the service, as the reader's browser has it."""
     alarms: "AlarmCounts | None" = None
     """Alarms of the run, which every page counts; None: of a page that shows no run."""
-    stands_by: bool = False
     """Whether another service writes to the database."""
     behind_s: float = 0.0
     """How far trends and alarms are behind the record, where they could not be waited for."""
@@ -191,7 +190,6 @@ class PageContext:
             may_operate="operate" in self.caller.scopes,
             address=self.address,
             alarms=alarms,
-            stands_by=not self.app.single_writer.is_writing,
             behind_s=request.behind_s if (request := logs.request.get()) is not None else 0.0,
         )
 

@@ -77,7 +77,7 @@ _PROBLEMS = {
     415: "This route does not accept the content type or the content coding of the body.",
     422: "Invalid input; `errors` names every field and value.",
     429: "The token's request rate is exceeded; `Retry-After` says when to try again.",
-    503: "The service is busy, stands by or is unavailable; `Retry-After` says when to try again.",
+    503: "The service is busy or unavailable; `Retry-After` says when to try again.",
 }
 READING_JSON = (400, 408, 413, 415, 503)
 READING_NDJSON = READING_FRAME = (408, 413, 415)

@@ -120,9 +120,9 @@ class _GaugeCollector(Collector):
         if "webhooks" in found:
             yield from _of_webhooks(found["webhooks"])
         yield GaugeMetricFamily(
-            "starid_standby",
-            "1 where another service writes to the database and this one stands by, else 0.",
-            value=float(not self._app.single_writer.is_writing),
+            "starid_projecting",
+            "1 where this one of the services that share a database projects what all record.",
+            value=float(self._app.single_projector.is_projecting),
         )
         yield _of_attempts(self._app.webhooks.sender.log.counts)
 

@@ -13,7 +13,6 @@ from service.errors import (
     NotAvailable,
     NotFound,
     RateLimited,
-    Standby,
     Unauthenticated,
     WrongState,
 )
@@ -150,15 +149,6 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "The answer does not say whether the request was recorded.",
         "Wait for as many seconds as the header Retry-After says, then send the same request "
         "again. A batch that was recorded after all is not recorded twice.",
-    ),
-    Standby: ProblemType(
-        503,
-        "The service stands by",
-        "standby",
-        "Another service writes to the same database, and this one takes over as soon as that "
-        "ends. It answers reads; nothing is recorded.",
-        "Send the request to the service that writes: its /readyz answers 200. While one service "
-        "takes over from another, wait for as many seconds as the header Retry-After says.",
     ),
 }
 WRONG_HOST = ProblemType(

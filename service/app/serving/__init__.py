@@ -1,1 +1,0 @@
-"""Which of several services on one database writes."""

@@ -1,0 +1,137 @@
+"""One of the services on a PostgreSQL database projects; where it ends another takes over.
+
+Every service accepts and records.  The one that holds the projector's lock also does what one of
+them does alone: it raises alarms by the clock, delivers webhooks, makes the attitudes of each day
+and ends the work that a service has left behind.
+"""
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from functools import partial
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.errors import AcquisitionError
+from service.storage.calibrations.stored import interrupt_calibrations, unfinished_calibrations
+from service.storage.queries.replays import mark_interrupted, unfinished_replays
+from service.storage.sql.projector_lock import left_behind
+from service.storage.store import Store
+from service.times import utc_now
+
+TRY_EVERY_S = 0.5
+RECOVER_EVERY_S = 2.0
+"""What is at work nowhere at two looks in a row is ended; a cut session takes a new one by then."""
+
+log = logging.getLogger(__name__)
+
+
+class SingleProjector:
+    """Whether this process is the one that projects; `start` makes it so where no other is.
+
+    A process without the lock of `Store` always projects: on SQLite, and a command.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store, self._lock = store, store.lock
+        self._follow: Callable[[], object] = lambda: None
+        self._resume: Callable[[], object] = lambda: None
+        self._listeners: list[Callable[[], object]] = []
+        self._telling = threading.Lock()
+        self._looked_s = 0.0
+        self._suspected: set[str] = set()
+        self._stopped = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    @property
+    def is_projecting(self) -> bool:
+        """Whether this process projects, as far as is known without asking the database."""
+        return self._store.is_projecting
+
+    def start(self, follow: Callable[[], object]) -> None:
+        """Begin to project if no other service does; else try again twice a second.
+
+        `follow` is called at each try, to take over what another service has changed.
+        """
+        if self._lock is None:
+            return
+        self._follow = follow
+        self._try()
+        if not self.is_projecting:
+            log.info("another service projects what is recorded; this one takes over if it ends")
+        self._thread = threading.Thread(
+            target=self._keep_trying, name="single-projector", daemon=True
+        )
+        self._thread.start()
+
+    def resume_with(self, resume: Callable[[], object]) -> None:
+        """From now on continue what ended services left behind on this machine."""
+        self._resume = resume
+
+    def when_projecting(self, begin: Callable[[], object]) -> None:
+        """Call a function as soon as this process projects, and again each time it begins to."""
+        with self._telling:
+            self._listeners.append(begin)
+            if self.is_projecting:
+                begin()
+
+    def stop(self) -> None:
+        """Stop trying; a lock that is held ends with its connection."""
+        self._stopped.set()
+        if self._lock is not None:
+            self._lock.lost.set()
+        if self._thread is not None:
+            self._thread.join()
+
+    def _keep_trying(self) -> None:
+        assert self._lock is not None
+        while True:
+            # A transaction may find before this thread does that the lock is lost.
+            self._lock.lost.wait(TRY_EVERY_S)
+            if self._stopped.is_set():
+                return
+            self._lock.lost.clear()
+            try:
+                self._try()
+            except (AcquisitionError, SQLAlchemyError) as error:
+                log.warning("whether another service projects is not known: %s", error)
+            except Exception:
+                log.exception("a look at what other services do failed; it is repeated")
+
+    def _try(self) -> None:
+        was_projecting = self.is_projecting
+        attempt = self._store.writer.take_lock()
+        if attempt == "refused" and was_projecting:
+            log.warning("another service projects what is recorded now")
+        elif attempt == "taken":
+            self._begin()
+        self._follow()
+        now_s = time.monotonic()
+        if attempt != "refused" and now_s - self._looked_s >= RECOVER_EVERY_S:
+            self._looked_s = now_s
+            self._resume()
+            self._end_left_work()
+
+    def _begin(self) -> None:
+        with self._telling:
+            for begin in self._listeners:
+                try:
+                    begin()
+                except Exception:
+                    # It belongs to one part of the service: results are projected in any case.
+                    log.exception("work that begins with projecting failed")
+        log.info("this service projects what is recorded from now on")
+
+    def _end_left_work(self) -> None:
+        """Note replays and calibrations as interrupted whose service has ended."""
+        with self._store.reading_record() as connection:
+            ids = unfinished_replays(connection) | unfinished_calibrations(connection)
+        others = ids - self._store.at_work
+        project = self._store.writer.project
+        left = project(partial(left_behind, ids=others)).result() if others else set()
+        ended, self._suspected = left & self._suspected, left
+        if ended:
+            now = utc_now().text
+            project(lambda connection: mark_interrupted(connection, now, only=ended)).result()
+            project(lambda connection: interrupt_calibrations(connection, now, ended)).result()

@@ -1,0 +1,142 @@
+"""`acquire follow`: telemetry from a stream of NATS JetStream."""
+
+import sys
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from service.cli.arguments import SERVICE, add_command, add_json, count, print_json
+from service.cli.configuration import service_url, settings_of
+from service.errors import BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.follow.jetstream import Metrics
+
+DEFAULT_CONCURRENCY = 16
+SCHEMES = ("nats", "tls")
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "follow",
+        "Send the messages of a NATS stream to the service: each is a batch or a gyro block, and "
+        "is acknowledged once it is recorded.  Several followers of one consumer share the work.",
+        """
+        acquire follow nats://127.0.0.1:4222/TELEMETRY --consumer acquire
+        acquire follow tls://bus.example/TELEMETRY --consumer acquire --credentials acquire.creds
+        acquire follow nats://127.0.0.1/TELEMETRY --consumer acquire --answers attitudes
+        """,
+        run,
+    )
+    parser.add_argument("source", metavar="nats://HOST/STREAM", help="or tls://HOST/STREAM")
+    parser.add_argument(
+        "--consumer",
+        required=True,
+        metavar="NAME",
+        help="the durable consumer; made where the stream has none of that name",
+    )
+    parser.add_argument("--url", help=SERVICE)
+    parser.add_argument(
+        "--refusals",
+        metavar="SUBJECT",
+        help="where refused messages go with their problem; default: acquire.refused.STREAM",
+    )
+    parser.add_argument("--answers", metavar="SUBJECT", help="where answers go; default: nowhere")
+    parser.add_argument(
+        "--credentials", type=Path, metavar="FILE", help="credentials of NATS (.creds)"
+    )
+    parser.add_argument(
+        "--authority", type=Path, metavar="FILE", help="certificate that NATS is trusted by (PEM)"
+    )
+    parser.add_argument(
+        "--concurrency",
+        type=count,
+        default=DEFAULT_CONCURRENCY,
+        metavar="N",
+        help="messages at work together (default 16); 1 keeps their order",
+    )
+    parser.add_argument(
+        "--metrics-port", type=count, metavar="PORT", help="serve metrics on this loopback port"
+    )
+    parser.add_argument(
+        "--until-empty", action="store_true", help="end when every message is settled"
+    )
+    add_json(parser, "the counts")
+
+
+def run(parsed: Namespace) -> int:
+    """Follow until a signal, and print what became of the messages."""
+    import asyncio
+    import signal
+
+    from service.extras import require_extra
+
+    require_extra("nats", "nats", "SOURCE", parsed.source)
+    from acquire_client import AsyncClient
+    from prometheus_client import start_http_server
+
+    from service.follow.jetstream import Follower, Metrics, Source
+    from service.replay.over_http import checked_url, translated
+
+    servers, stream = _server_and_stream(parsed.source)
+    source = Source(
+        servers,
+        stream,
+        parsed.consumer,
+        parsed.refusals or f"acquire.refused.{stream}",
+        parsed.answers,
+        _there(parsed.credentials, "--credentials"),
+        _there(parsed.authority, "--authority"),
+        parsed.concurrency,
+    )
+    url, metrics = checked_url(service_url(parsed)), Metrics()
+    token = settings_of(parsed).token
+
+    async def follow() -> None:
+        async with AsyncClient(url, token=token) as client:
+            follower = Follower(source, client, metrics, _show)
+            loop = asyncio.get_running_loop()
+            for number in (signal.SIGINT, signal.SIGTERM):
+                loop.add_signal_handler(number, follower.stop)
+            try:
+                await follower.run(parsed.until_empty)
+            except ExceptionGroup as errors:
+                # Of the messages at work together: one says why.
+                raise errors.exceptions[0] from None
+
+    if parsed.metrics_port is not None:
+        start_http_server(parsed.metrics_port, "127.0.0.1", metrics.registry)
+    with translated(url):
+        asyncio.run(follow())
+    if parsed.json:
+        print_json(metrics.counts)
+    else:
+        print(_text(metrics))
+    return 1 if metrics.counts["refused"] else 0
+
+
+def _show(metrics: "Metrics") -> None:
+    print(_text(metrics), file=sys.stderr, flush=True)
+
+
+def _text(metrics: "Metrics") -> str:
+    told = ", ".join(f"{number:,} {name}" for name, number in metrics.counts.items())
+    return f"{told}; {metrics.lag:,} to come"
+
+
+def _server_and_stream(text: str) -> tuple[str, str]:
+    parts = urlsplit(text)
+    stream = parts.path.strip("/")
+    if parts.scheme not in SCHEMES or not parts.hostname or not stream or "/" in stream:
+        message = "must be nats://HOST/STREAM or tls://HOST/STREAM"
+        raise BadInput(Fault("SOURCE", message, shown_value(text)))
+    return f"{parts.scheme}://{parts.netloc}", stream
+
+
+def _there(file: Path | None, name: str) -> Path | None:
+    if file is not None and not file.is_file():
+        raise BadInput(Fault(name, "is not there, or is no file", shown_value(str(file))))
+    return file
