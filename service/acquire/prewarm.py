@@ -10,6 +10,7 @@ import numpy as np
 from service.acquire import acquire
 from service.filtering.compiling import compile_filtering
 from service.identify.prior_attitude import prior_attitude, search_region
+from service.imaging.frames.jpeg import compile_walk
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Band, Mission
 from service.observations.batch import APriori, BoresightPrior, SunPointedPrior
@@ -133,6 +134,7 @@ def prewarm_kernels(
     if seldom:
         compile_linking()
         compile_filtering()
+        compile_walk()
 
 
 def _prewarm_seldom(sky: SkyModel, mission: Mission, body: dict[str, Any]) -> None:

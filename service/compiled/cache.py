@@ -17,6 +17,8 @@ SOURCES = (
     "service/compiled",
     "service/filtering",
     "service/identify",
+    "service/imaging/frames/frame.py",
+    "service/imaging/frames/jpeg.py",
     "service/missions",
     "service/observations/batch.py",
     "service/observations/calibrate.py",

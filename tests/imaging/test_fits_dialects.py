@@ -48,6 +48,7 @@ def values(rng):
 
 TIMES = {
     "start and exposure in the primary header": ({}, {"DATE-OBS": NOON, "EXPTIME": 4.0}, 2.0),
+    "start with a Z": ({"DATE-OBS": NOON + ".000Z", "EXPTIME": 4.0}, {}, 2.0),
     "start in the extension": ({"DATE-OBS": NOON}, {"EXPTIME": 4.0}, 2.0),
     "the extension's own start": (
         {"DATE-OBS": NOON, "EXPTIME": 4.0},
@@ -120,6 +121,13 @@ NO_TIMES = {
         {"DATE-AVG": NOON, "DATE-BEG": "2026-03-01T12:30:00", "EXPTIME": 1.0},
         "not between",
     ),
+    "average behind start and exposure": (
+        # A program may write the computer's clock into one, and the camera's into the other.
+        {"DATE-OBS": NOON, "DATE-AVG": "2026-03-01T12:00:05", "EXPTIME": 2.0},
+        "not between",
+    ),
+    "an exposure without a number": ({"DATE-OBS": NOON, "EXPTIME": None}, "no exposure"),
+    "local time alone": ({"DATE-LOC": NOON, "EXPTIME": 2.0}, "none of DATE-AVG"),
     "exposure in furlongs": ({"DATE-OBS": NOON, "EXPTIME": (1.0, "[furlong]")}, "no exposure"),
     "a day that is none": ({"DATE-AVG": "2026-02-30T12:00:00"}, "cannot be read"),
 }

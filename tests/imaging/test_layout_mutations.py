@@ -75,14 +75,23 @@ FILES = {
     "TIFF in strips": lambda v: tiff(v, photometric="minisblack", rowsperstrip=64),
     "PNG": lambda v: saved(v, "PNG"),
     "JPEG": lambda v: saved(v, "JPEG", quality=95),
+    "JPEG with codes of its own": lambda v: saved(v, "JPEG", quality=50, optimize=True),
+    "progressive JPEG": lambda v: saved(v, "JPEG", quality=80, progressive=True),
+    "JPEG in colour with restarts": lambda v: saved(
+        np.stack([v] * 3, axis=2), "JPEG", optimize=True, restart_marker_rows=8
+    ),
+    "TIFF of JPEG strips": lambda v: saved(v, "TIFF", compression="jpeg", quality=80),
     "FITS": fits_file,
 }
 
 
 def mutated(data, name, draw):
-    """The file with one field of its layout replaced."""
+    """The file with one field of its layout replaced; of a JPEG, any byte."""
     data = bytearray(data)
-    if "TIFF" in name:
+    if "JPEG" in name and draw.random() < 0.5:
+        scan = data.find(b"\xff\xda")
+        data[draw.randrange(scan, len(data))] = draw.randrange(256)
+    elif "TIFF" in name:
         order = "<" if data[:2] == b"II" else ">"
         (at,) = struct.unpack_from(order + "L", data, 4)
         (count,) = struct.unpack_from(order + "H", data, at)
@@ -109,24 +118,10 @@ def mutated(data, name, draw):
         )
         data[at : at + 80] = f"{word.decode():<8}= {draw.choice(values):>20}".ljust(80).encode()
     else:
-        places = _header_of_jpeg(data) if name == "JPEG" else range(2, 33)
+        places = range(2, data.find(b"\xff\xda") + 10 if "JPEG" in name else 33)
         data[draw.choice(places)] = draw.randrange(256)
         data = bytearray(with_right_sums(bytes(data))) if name == "PNG" else data
     return bytes(data)
-
-
-def _header_of_jpeg(data):
-    """The places of a JPEG file's headers, without its tables of codes.
-
-    These belong to the coded picture: one other code moves all that follows by a block of 8
-    pixels.  No layout tells, and no checksum (docs/cameras.md).
-    """
-    places, at = [], 2
-    while data[at + 1] != 0xDA:
-        end = at + 2 + int.from_bytes(data[at + 2 : at + 4])
-        places += range(at, at + 4 if data[at + 1] == 0xC4 else end)
-        at = end
-    return [*places, *range(at, at + 10)]
 
 
 def _number(draw, form):

@@ -14,6 +14,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
 from tests.imaging.colour_files import LONG, SHORT, png_of_16_bits
 from tests.imaging.colour_files import tiff as tiff_of
+from tests.scale import draws
 
 ROWS, COLUMNS = 31, 47
 
@@ -264,6 +265,74 @@ def test_the_size_that_a_tracker_needs_is_that_of_the_picture_shown(rng):
         assert read(data, shape=(COLUMNS, ROWS)).counts.shape == (COLUMNS, ROWS)
         with pytest.raises(BadFile, match="must have the 47 x 31 px"):
             read(data, shape=(ROWS, COLUMNS))
+
+
+JPEGS = {
+    "plain": {},
+    "codes of its own": {"optimize": True},
+    "progressive": {"progressive": True},
+    "restarts": {"optimize": True, "restart_marker_blocks": 5},
+}
+
+
+def jpeg(values, **options):
+    file = io.BytesIO()
+    Image.fromarray(values).save(file, "JPEG", **{"quality": 60, **options})
+    return file.getvalue()
+
+
+@pytest.mark.parametrize("name", JPEGS)
+def test_a_jpeg_with_a_changed_bit_is_refused_or_ends_in_its_place(rng, name):
+    # Neither black nor full anywhere, so that a block out of its place shows in the last rows.
+    values = np.kron(rng.integers(90, 160, (9, 12)), np.ones((8, 8))) + rng.normal(0, 6, (72, 96))
+    data = jpeg(values.astype(np.uint8), **JPEGS[name])
+    truth, scan, refused, moved = read(data).counts, data.find(b"\xff\xda") + 10, 0, 0
+    for at in rng.integers(scan, len(data) - 8, draws(100, 1_000)):
+        damaged = bytearray(data)
+        damaged[at] ^= 1 << rng.integers(8)
+        try:
+            frame = read(bytes(damaged))
+        except BadFile as error:
+            refused += "damaged" in str(error)
+            continue
+        # A changed mean of a block changes all that follow alike; the last may be changed itself.
+        change = (frame.counts - truth)[-8:, 48:]
+        moved += np.ptp(change) > 60
+    assert refused > 5
+    assert moved <= 3
+
+
+def test_a_jpeg_with_a_byte_more_or_less_is_refused_where_pillow_reads_it(rng):
+    data = jpeg(rng.integers(60, 190, (64, 64)).astype(np.uint8))
+    for changed in (data[:-2] + b"\0" + data[-2:], data[:-3] + data[-2:]):
+        assert Image.open(io.BytesIO(changed)).tobytes()
+        with pytest.raises(BadFile, match="a damaged JPEG"):
+            read(changed)
+        with pytest.raises(BadFile, match="a damaged JPEG"):
+            read(in_a_tiff(changed))
+    assert np.array_equal(read(in_a_tiff(data)).counts, read(data).counts)
+
+
+def in_a_tiff(data):
+    """A TIFF of 64 by 64 pixels whose only strip is a JPEG file."""
+    tags = {256: 64, 257: 64, 258: 8, 259: 7, 262: 1, 273: 512, 277: 1, 278: 64, 279: len(data)}
+    entries = b"".join(struct.pack("<HHLL", tag, 4, 1, value) for tag, value in tags.items())
+    head = b"II*\0" + struct.pack("<LH", 8, len(tags)) + entries + bytes(4)
+    return head.ljust(512, b"\0") + data
+
+
+def test_a_jpeg_may_end_in_zeros_where_ones_are_usual(rng):
+    read_ones = 0
+    for _ in range(8):
+        greys = np.kron(rng.integers(60, 190, (4, 4)), np.ones((4, 4)))
+        data = bytearray(jpeg(greys.astype(np.uint8)))
+        # The end of a block, 1010, ends with a zero: what is behind it is no code.
+        ones = len(f"{data[-3]:08b}") - len(f"{data[-3]:08b}".rstrip("1"))
+        before = read(bytes(data)).counts
+        data[-3] &= 0xFF << ones & 0xFF
+        assert np.array_equal(read(bytes(data)).counts, before)
+        read_ones += ones > 0
+    assert read_ones > 0
 
 
 def pgm(values, largest, magic=b"P5"):

@@ -81,6 +81,15 @@ def test_scalar_first_and_the_other_direction_are_turned_into_ours():
         assert at(read(text), START)[0] == pytest.approx(GOLDEN, abs=1e-15)
 
 
+def test_between_two_states_of_opposite_sign_lies_the_shorter_turn():
+    half = np.radians(10.0) / 2
+    turned = f"{-0.0} {-0.0} {-np.sin(half)} {-np.cos(half)}"
+    first, last = V2.splitlines()[-3:-1]
+    text = V2.replace(first, f"{first[:23]} 0 0 0 1").replace(last, f"{last[:22]} {turned}")
+    middle = at(read(text), "1996-01-10T12:00:00.5Z")[0]
+    assert apart(middle, np.array([0, 0, np.sin(half / 2), np.cos(half / 2)])) < 1e-12
+
+
 @pytest.mark.parametrize("form", ["aem", "aem-xml"])
 def test_every_record_that_the_service_wrote_is_read_again(form, rng, tmp_path):
     pages = [

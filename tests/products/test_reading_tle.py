@@ -31,6 +31,16 @@ def read(lines):
     return read_tle("iss.tle", io.BytesIO(text), "--ephemeris")
 
 
+@pytest.mark.parametrize("number", ["T0000", "A5544", "    5"])
+def test_a_number_with_a_letter_or_with_spaces_changes_no_state(number):
+    """Numbers above 99999 begin with a letter, not I or O ("Alpha-5")."""
+    moment = ISS_EPOCH
+    renamed = [with_checksum(line[:2] + number + line[7:]) for line in ISS]
+    assert np.array_equal(read(renamed).at(moment), read(ISS).at(moment))
+    with pytest.raises(BadFile, match="satellite number"):
+        read([with_checksum(line[:2] + "I0000" + line[7:]) for line in ISS])
+
+
 def published():
     """The lines of each verification set, and its states: minutes, km and km/s in TEME."""
     lines = VERIFICATION.joinpath("SGP4-VER.TLE").read_text("ascii").splitlines()

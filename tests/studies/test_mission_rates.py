@@ -192,12 +192,20 @@ class TestCommand:
         assert out.startswith("MINE, STARTRACKER_1, by starid: 2 zones of the whole sky")
         assert "At most 50 % ambiguous, with 95 % confidence" in out
         assert (tmp_path / "rates.svg").read_text().count("<svg") == 1
+        out_text = out
         code, out, _ = acquire(*arguments, "--json")
         found = json.loads(out)
         assert [each["swept"] for each in found["settings"]] == [
             {"separation_deg": s, "magnitude_mag": m} for s in (0.0066, 0.02) for m in (0.3, 0.6)
         ]
+        assert len(found["settings"]) == 4
         for each in found["settings"]:
+            shares = [each[name] for name in ("unique_right", "ambiguous", "unmatched", "wrong")]
+            told = [
+                "{:.2f} ({:.2f} to {:.2f})".format(*(100 * s[k] for k in ("value", "low", "high")))
+                for s in shares
+            ]
+            assert any(all(cell in line for cell in told) for line in out_text.splitlines())
             names = ("unique_right", "ambiguous", "unmatched", "wrong")
             assert sum(each[name]["value"] for name in names) == pytest.approx(1.0)
             for share in (each[name] for name in names):

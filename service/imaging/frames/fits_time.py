@@ -118,6 +118,8 @@ class _Told:
             )
         if middle is not None:
             late = start is not None and _seconds_between(start, middle) < -SAME_S
+            if start is not None and end is None and exposure_s is not None:
+                end = shifted(start, exposure_s)
             early = end is not None and _seconds_between(middle, end) < -SAME_S
             if late or early:
                 raise _NoTime("the average time is not between start and end")

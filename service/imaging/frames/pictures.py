@@ -11,6 +11,7 @@ from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, exactly, full_scale_of
 from service.imaging.frames.exif import exif_of, exposure_of, require_small_exif
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
+from service.imaging.frames.jpeg import require_whole
 from service.imaging.frames.orientation import TAG, as_shown
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "F")
@@ -49,6 +50,9 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
                 values, full_scale = _plain_light(image, file)
             else:
                 values, full_scale = _light(image)
+            if file_format == "JPEG":
+                file.seek(0)
+                require_whole(file.read(), limits.max_pixels)
     except BadFile:
         raise
     except UnidentifiedImageError:

@@ -25,6 +25,7 @@ from service.imaging.frames.exif import (
     told_exposure,
 )
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
+from service.imaging.frames.jpeg import require_whole
 from service.imaging.frames.orientation import TAG, as_shown
 
 MAX_TAGS, MAX_PAGES = 256, 256
@@ -61,6 +62,8 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
             tag = page.tags.valueof(TAG)
             time, exposure_s = _told(page)
             if page.photometric in _BY_PILLOW or page.compression == _JPEG:
+                if page.compression == _JPEG:
+                    _require_whole_segments(page, file, limits)
                 # Pillow turns what it decodes by itself.
                 counts, full_scale = _by_pillow(file, page, number)
                 _, orientation = as_shown(np.zeros((1, 1)), tag)
@@ -279,6 +282,14 @@ def _by_pillow(file: IO[bytes], page: Any, number: int) -> tuple[CountArray, flo
             return as_counts(np.asarray(image)), 255.0
         channels = np.asarray(image.convert("RGB"))
     return as_counts(channels.sum(axis=2, dtype=np.uint16)), 3.0 * 255.0
+
+
+def _require_whole_segments(page: Any, file: IO[bytes], limits: FrameLimits) -> None:
+    """Raise `BadFile` for a page whose strips or tiles of JPEG data are damaged."""
+    tables = page.jpegtables[:-2] if page.jpegtables else b"\xff\xd8"
+    for at, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+        file.seek(at)
+        require_whole(tables + file.read(size)[2:], limits.max_pixels)
 
 
 def _told(page: Any) -> tuple[str | None, float | None]:

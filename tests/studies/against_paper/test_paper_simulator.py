@@ -35,7 +35,7 @@ from studies.paper_1994.views import (
     rotation,
 )
 from tests.chance import at_most
-from tests.scale import draws, is_full
+from tests.scale import draws, is_full, some_in_a_sitting
 
 
 def run_named(table, name):
@@ -286,6 +286,30 @@ def test_the_command_prints_a_table_and_writes_its_rows(tmp_path, seed):
     assert "### Table 8." in text
     assert "of 4" in text
     assert (tmp_path / "paper-places.svg").stat().st_size > 0
+
+
+@pytest.mark.parametrize("table", some_in_a_sitting(range(2, 11)))
+def test_the_rates_of_the_text_are_those_of_the_rows(table, tmp_path, seed):
+    out, path = io.StringIO(), tmp_path / "rows.json"
+    run_paper(table, 1, [seed], path, processes=1, out=out)
+    starid, verified = out.getvalue().split("by the identifier `verified`")
+    rows = json.loads(path.read_text(encoding="utf-8"))
+    assert {row["identifier"] for row in rows} == {"starid", "verified"}
+    for row in rows:
+        stars, wrong = row["stars"], row["misidentified"]
+        missed = row["ambiguous"] + row["unmatched"]
+        if row["identifier"] == "starid":
+            shown = [
+                f" {stars} |",
+                f" {100 * missed / stars:.2f} ±",
+                f" {100 * wrong / stars:.2f} ±",
+            ]
+        else:
+            counts = (row["ambiguous"], row["unmatched"], wrong)
+            shown = [f" {stars} |", *(f" {n} ({100 * n / stars:.2f} %)" for n in counts)]
+        text = starid if row["identifier"] == "starid" else verified
+        lines = [line for line in text.splitlines() if f" {row['run']} " in line]
+        assert any(all(each in line for each in shown) for line in lines), (row, lines)
 
 
 @pytest.mark.parametrize("table", [11, 12, 13, 14])

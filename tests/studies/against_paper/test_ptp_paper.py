@@ -209,6 +209,34 @@ class TestCommand:
             for value in (each for each in row.values() if isinstance(each, int)):
                 assert f" {value:,} " in out.getvalue() or f" SAO {value} " in out.getvalue()
 
+    @pytest.mark.parametrize(
+        "name",
+        [
+            *(pytest.param(name, marks=pytest.mark.slow) for name in ("ptp-5", "ptp-6")),
+            *(pytest.param(f"figure-{n}", marks=pytest.mark.slow) for n in (11, 13)),
+            *("figure-10", "figure-12"),
+        ],
+    )
+    def test_the_rates_of_drawn_fields_are_those_of_the_text(self, name, tmp_path):
+        out, path = io.StringIO(), tmp_path / "rows.json"
+        run_ptp(name, 3, 1, path, processes=1, out=out)
+        rows = json.loads(path.read_text())
+        assert rows
+        for row in rows:
+            assert (row["table"], row["scenes"]) == (name, 3)
+            if name == "figure-10":
+                figures = (f"{row['mean']:.2f}", row["least"], row["most"])
+                assert all(f" {each} |" in out.getvalue() for each in figures)
+                continue
+            counts = (row[each] for each in ("strict", "loose", "checked", "wrong"))
+            shares = [f" {100 * count / 3:.2f} (" for count in counts]
+            lines = [line for line in out.getvalue().splitlines() if line.startswith("|")]
+            label = row["algorithm"].removeprefix("PTP, ").removesuffix(" slaves")
+            label = "4" if name == "ptp-5" and label == "PTP" else label
+            assert any(
+                f" {label} " in line and all(share in line for share in shares) for line in lines
+            ), row
+
     def test_what_changes_nothing_is_refused(self, acquire):
         for option in ("--seed", "--scenes"):
             code, out, err = acquire("simulate", "paper", "--table", "figure-6", option, "2")

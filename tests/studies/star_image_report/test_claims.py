@@ -71,6 +71,9 @@ def test_one_row_is_printed_written_and_drawn(tmp_path):
         assert (tmp_path / "plots" / f"{name}.svg").read_text("utf-8").startswith("<?xml")
     told = json.loads(claims.read_text("utf-8"))
     assert {claim["row"] for claim in told} == {"IM-5", "IM-6"}
+    for claim in told:
+        cells = (claim[each].replace("|", "\\|") for each in ("section", "report", "here"))
+        assert "| {} | {} | {} | ".format(*cells) in text
     assert told[0]["figures"]["slope per arcmin"] == pytest.approx(0.109, abs=0.003)
 
 

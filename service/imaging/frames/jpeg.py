@@ -1,0 +1,298 @@
+"""The check that JPEG data are whole: their codes must end where the data end.
+
+JPEG has no checksum.  A changed bit makes a decoder see one block of 8 x 8 pixels more or less, and
+everything after it lies 8 px from its place; libjpeg reports this only where more than about eight
+bytes are left over or missing.  This module reads the lengths of all codes, without their values,
+and compares to the bit.  Source: ITU-T T.81, annexes B (markers), C, F.2.2 and G.1.2 (codes).
+"""
+
+import io
+import math
+import re
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from service.compiled.jit import njit_no_refcount
+from service.imaging.frames.frame import bad_frame
+
+_MARKER = re.compile(rb"\xff+([^\x00\xff])")
+_STUFFED = re.compile(rb"\xff+\x00")
+_TABLES, _SCAN, _RESTARTS, _END = 0xC4, 0xDA, 0xDD, 0xD9
+_BASELINE, _EXTENDED, _PROGRESSIVE = 0xC0, 0xC1, 0xC2
+_OTHER_CODINGS = {*range(0xC3, 0xD0)} - {_TABLES}
+_BEYOND = 1024
+"""Bytes that a block may be read beyond its data before the walk stops."""
+_WINDOW = 1 << 16
+"""Numbers of the 16 bits of the longest code."""
+
+
+class _Component(NamedTuple):
+    """A component of the picture: blocks of a unit, of its own size, and of the padded grid."""
+
+    across: int
+    down: int
+    columns: int
+    rows: int
+    grid_columns: int
+    first: int
+    """The number of its first block among those of all components."""
+
+
+class _Picture(NamedTuple):
+    """What the header says: components by their id, units, and whether it is progressive."""
+
+    components: dict[int, _Component]
+    unit_columns: int
+    unit_rows: int
+    blocks: int
+    is_progressive: bool
+
+
+def require_whole(data: bytes, max_pixels: int) -> None:
+    """Raise `BadFile` for JPEG data whose scans hold more or fewer bits than their blocks need.
+
+    Data that end too early, or whose segments are cut, raise IndexError or ValueError.
+    """
+    at, interval = 2, 0
+    tables = np.zeros((8, _WINDOW), np.uint16)
+    picture: _Picture | None = None
+    known = np.zeros(0, np.uint64)
+    while (found := _MARKER.match(data, at)) is not None and found[1][0] != _END:
+        marker, at = found[1][0], found.end()
+        length = int.from_bytes(data[at : at + 2])
+        segment, at = data[at + 2 : at + length], at + max(length, 2)
+        if marker == _TABLES:
+            _read_tables(segment, tables)
+        elif marker == _RESTARTS:
+            interval = int.from_bytes(segment[:2])
+        elif marker in _OTHER_CODINGS:
+            raise bad_frame("is a JPEG in lossless or arithmetic coding, which is not read")
+        elif marker in (_BASELINE, _EXTENDED, _PROGRESSIVE):
+            picture = _read_header(segment, marker == _PROGRESSIVE, max_pixels)
+            known = np.zeros(picture.blocks + 1 if picture.is_progressive else 1, np.uint64)
+        elif marker == _SCAN:
+            if picture is None:
+                raise ValueError("a scan before the header")
+            parts, at = _parts(data, at)
+            if not _is_whole(segment, parts, picture, interval, tables, known):
+                raise bad_frame(
+                    "is a damaged JPEG: its coded data have not the length that its size needs, "
+                    "so that parts of the picture may be moved; send an undamaged copy"
+                )
+    if found is None:
+        raise ValueError("no marker where a segment ends")
+
+
+def _read_tables(segment: bytes, tables: npt.NDArray[np.uint16]) -> None:
+    """Fill in, for each number of 16 bits, the length of the code it begins with and its symbol."""
+    while segment:
+        counts, symbols = segment[1:17], segment[17 : 17 + sum(segment[1:17])]
+        kind, name = divmod(segment[0], 16)
+        if kind > 1 or name > 3:
+            raise ValueError("a table of codes of no known kind")
+        table = tables[4 * kind + name]
+        table[:] = 0
+        start, number = 0, 0
+        for bits, count in enumerate(counts, 1):
+            for symbol in symbols[number : number + count]:
+                table[start : start + (_WINDOW >> bits)] = bits << 8 | symbol
+                start += _WINDOW >> bits
+            number += count
+        if start > _WINDOW or number > len(symbols):
+            raise ValueError("a table with more codes than there can be")
+        segment = segment[17 + number :]
+
+
+def _read_header(segment: bytes, is_progressive: bool, max_pixels: int) -> _Picture:
+    height, width = int.from_bytes(segment[1:3]), int.from_bytes(segment[3:5])
+    parts = [segment[at : at + 3] for at in range(6, 6 + 3 * segment[5], 3)]
+    sampling = [divmod(part[1], 16) for part in parts]
+    largest = max(across for across, _ in sampling), max(down for _, down in sampling)
+    if width * height > max_pixels or not all(1 <= n <= 4 for pair in sampling for n in pair):
+        raise ValueError(f"a header of {width} x {height} px that is not possible")
+    unit_columns, unit_rows = -(-width // (8 * largest[0])), -(-height // (8 * largest[1]))
+    components: dict[int, _Component] = {}
+    first = 0
+    for part, (across, down) in zip(parts, sampling, strict=True):
+        # Sizes and blocks are rounded up, one after the other: T.81, A.1.1 and A.2.
+        columns = math.ceil(math.ceil(width * across / largest[0]) / 8)
+        rows = math.ceil(math.ceil(height * down / largest[1]) / 8)
+        grid_columns = unit_columns * across
+        components[part[0]] = _Component(across, down, columns, rows, grid_columns, first)
+        first += grid_columns * unit_rows * down
+    if len(components) < len(parts):
+        raise ValueError("components of one name")
+    return _Picture(components, unit_columns, unit_rows, first, is_progressive)
+
+
+def _parts(data: bytes, at: int) -> tuple[list[tuple[int, bytes]], int]:
+    """The coded data of a scan between restarts, each with the marker before, and their end."""
+    parts: list[tuple[int, bytes]] = []
+    before = -1
+    for found in _MARKER.finditer(data, at):
+        parts.append((before, _STUFFED.sub(b"\xff", data[at : found.start()])))
+        if not 0xD0 <= found[1][0] <= 0xD7:
+            return parts, found.start()
+        before, at = found[1][0] - 0xD0, found.end()
+    raise ValueError("no marker behind a scan")
+
+
+def _is_whole(
+    segment: bytes,
+    parts: list[tuple[int, bytes]],
+    picture: _Picture,
+    interval: int,
+    tables: npt.NDArray[np.uint16],
+    known: npt.NDArray[np.uint64],
+) -> bool:
+    """True if the data of one scan are as long as its blocks need, in each restart interval."""
+    number = segment[0]
+    chosen = [picture.components[segment[1 + 2 * k]] for k in range(number)]
+    names = [divmod(segment[2 + 2 * k], 16) for k in range(number)]
+    first, last, refines = segment[1 + 2 * number], segment[2 + 2 * number], segment[-1] > 15
+    if not picture.is_progressive:
+        first, last, refines = 0, 63, False
+    elif last > 63 or first > last or (first == 0) != (last == 0) or (first and number > 1):
+        raise ValueError("a scan of no known kind")
+    columns, rows = picture.unit_columns, picture.unit_rows
+    if number == 1:
+        # Alone, a component has the blocks of its own size, a unit each.
+        columns, rows = chosen[0].columns, chosen[0].rows
+        chosen = [chosen[0]._replace(across=1, down=1)]
+    units = np.array(
+        [
+            (each.across, each.down, each.grid_columns, each.first, dc & 3, 4 + (ac & 3))
+            for each, (dc, ac) in zip(chosen, names, strict=True)
+        ],
+        np.int64,
+    )
+    used = [*(units[:, 4] if first == 0 and not refines else ()), *(units[:, 5] if last else ())]
+    if not all(tables[table, 0] for table in used):
+        raise ValueError("a scan without its tables of codes")
+    total = columns * rows
+    step = interval or total
+    if [before for before, _ in parts] != [-1, *(k % 8 for k in range(-(-total // step) - 1))]:
+        return False
+    ends = np.cumsum([len(part) for _, part in parts])
+    coded = np.frombuffer(b"".join(part for _, part in parts) + bytes(_BEYOND), np.uint8)
+    kind = np.array([first, last, refines, picture.is_progressive], np.int64)
+    size = np.array([columns, total, step], np.int64)
+    return bool(_walk(coded, ends, size, units, kind, tables, known, np.zeros(1, np.int64)))
+
+
+@njit_no_refcount
+def _walk(coded, ends, size, units, kind, tables, known, run):  # type: ignore[no-untyped-def]
+    """True if the blocks of each interval (bytes up to `ends`) end within its last byte.
+
+    `size`: units in a row, in all, in an interval.  `units` (n, 6): of each component of the
+    scan its blocks across and down, columns of its grid, first block, and rows of `tables`.
+    `kind`: first and last coefficient, whether the scan refines, whether it is progressive.
+    `known`: of each block the coefficients that are not zero, a bit each; one block more than
+    there are.  `run` (1,): blocks that are known to have no more coefficients.
+    """
+    columns, total, step = size
+    start = 0
+    for interval in range(len(ends)):
+        at, end = 8 * start, 8 * ends[interval]
+        start = ends[interval]
+        run[0] = 0
+        for unit in range(interval * step, min(total, (interval + 1) * step)):
+            for c in range(len(units)):
+                across, down, grid, first = units[c, 0], units[c, 1], units[c, 2], units[c, 3]
+                for k in range(across * down):
+                    row = unit // columns * down + k // across
+                    block = first + row * grid + unit % columns * across + k % across
+                    at = _behind(coded, at, units[c], kind, tables, known, block, run)
+                    if at < 0 or at > end:
+                        return False
+        if end - at > 7 or run[0] > 0:
+            return False
+        rest = _bits(coded, at) >> (16 - (end - at))
+        if rest != (1 << (end - at)) - 1 and not (kind[0] == 0 and kind[2]):
+            # The rest of the last byte is ones, or what is no block: one more was meant else.
+            spare = len(known) - 1
+            after = _behind(coded, at, units[0], kind, tables, known, spare, run)
+            if 0 <= after <= end:
+                return False
+    return True
+
+
+@njit_no_refcount
+def _bits(coded, at):  # type: ignore[no-untyped-def]
+    """The 16 bits at a place, as a number."""
+    k = at >> 3
+    three = np.int64(coded[k]) << 16 | np.int64(coded[k + 1]) << 8 | np.int64(coded[k + 2])
+    return three >> (8 - (at & 7)) & 0xFFFF
+
+
+@njit_no_refcount
+def _behind(coded, at, unit, kind, tables, known, block, run):  # type: ignore[no-untyped-def]
+    """The place of the bit behind a block; -1 where no code begins as the data do."""
+    k, last, refines, progressive = kind
+    if k == 0:
+        if refines:
+            return at + 1
+        code = np.int64(tables[unit[4], _bits(coded, at)])
+        if code == 0:
+            return -1
+        at += (code >> 8) + (code & 15)
+        k = 1
+        if last == 0:
+            return at
+    if run[0] > 0:
+        run[0] -= 1
+        return _corrected(coded, at, known, block, k, last) if refines else at
+    codes = unit[5]
+    while k <= last:
+        code = np.int64(tables[codes, _bits(coded, at)])
+        if code == 0:
+            return -1
+        at += code >> 8
+        zeros, size = code >> 4 & 15, code & 15
+        if size == 0 and zeros < 15:
+            if zeros > 0:
+                if not progressive:
+                    return -1
+                run[0] = (1 << zeros) - 1 + (_bits(coded, at) >> (16 - zeros))
+                at += zeros
+            return _corrected(coded, at, known, block, k, last) if refines else at
+        if refines:
+            if size > 1:
+                return -1
+            at += size
+            while k <= last:
+                if known[block] >> np.uint64(k) & np.uint64(1):
+                    at += 1
+                elif zeros == 0:
+                    break
+                else:
+                    zeros -= 1
+                k += 1
+        else:
+            k += zeros
+            at += size
+        if size > 0 and k > last:
+            return -1
+        if size > 0 and progressive:
+            known[block] |= np.uint64(1) << np.uint64(k)
+        k += 1
+    return at if k == last + 1 else -1
+
+
+@njit_no_refcount
+def _corrected(coded, at, known, block, k, last):  # type: ignore[no-untyped-def]
+    """The place behind the bits that refine the coefficients of a block from `k` on."""
+    for j in range(k, last + 1):
+        at += np.int64(known[block] >> np.uint64(j) & np.uint64(1))
+    return at
+
+
+def compile_walk() -> None:
+    """Compile the kernel, or load it, before the first picture needs it."""
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.new("L", (8, 8)).save(file, "JPEG")
+    require_whole(file.getvalue(), 64)
