@@ -1,6 +1,6 @@
 """The API's description for people, from the document that programs get."""
 
-from functools import cache
+from functools import lru_cache
 from typing import Annotated
 
 from fastapi import FastAPI
@@ -32,12 +32,13 @@ def api_shapes_page(request: Request, query: Annotated[PageQuery, InQuery()]) ->
     return rendered("api.html.jinja", layout, heading="API: shapes", reference=shown)
 
 
-# Made once: anybody may ask for these pages, without a token.
-@cache
+# Made once: anybody may ask for these pages, without a token.  Of one app only: a program that
+# opens and closes several keeps no other.
+@lru_cache(maxsize=1)
 def _operations(app: FastAPI) -> Markup:
     return rendered_part("_api.html.jinja", reference=reference_for_people(app))
 
 
-@cache
+@lru_cache(maxsize=1)
 def _shapes(app: FastAPI) -> Markup:
     return rendered_part("_api_shapes.html.jinja", reference=reference_for_people(app))
