@@ -15,9 +15,9 @@ from .connection import Connection
 NDJSON = "application/x-ndjson"
 PACKETS = "application/x-tar"
 POLL_S = 0.25
-INTERRUPTED_FOR_S = 5.0
+INTERRUPTED_FOR_S = 20.0
 """A service that starts marks every replay as interrupted; a process that still works on one
-corrects that with its next lines."""
+corrects that with its next lines, which a busy machine may take a while for."""
 
 
 class Replays(Connection):
