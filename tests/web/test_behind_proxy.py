@@ -131,6 +131,8 @@ def test_pages_work_in_a_browser_and_sign_in_keeps_its_cookie_to_the_path(proxie
     browser.wait(lambda: browser.run("location.pathname") == "/ops/acquire/alarms")
     cookies = browser.call("Network.getCookies", urls=[f"{url}/"])["cookies"]
     assert [each["path"] for each in cookies] == ["/ops/acquire"]
+    # The scripts of the page come after its address.
+    browser.wait(lambda: browser.run(live))
     browser.run("document.getElementById('sign-out').click()")
     browser.wait(lambda: browser.run("location.pathname") == "/ops/acquire/sign-in")
     assert browser.call("Network.getCookies", urls=[f"{url}/"])["cookies"] == []
