@@ -89,9 +89,7 @@ def test_every_page_is_light(client, addresses):
         trends = re.search(r'data-history="([^"]+)"', client.get(address).text)
         if trends:
             weight += len(client.get(trends[1].replace("&amp;", "&")).content)
-        # The shapes of the whole API are one page.
-        bound = 288_000 if address.startswith("/docs/shapes") else 256_000
-        assert weight < bound, (address, weight)
+        assert weight < 256_000, (address, weight)
 
 
 def test_every_page_says_as_of_when_and_of_which_run(client, addresses, full_run):
