@@ -22,7 +22,9 @@ from service.times import utc_now
 
 TRY_EVERY_S = 0.5
 RECOVER_EVERY_S = 2.0
-"""What is at work nowhere at two looks in a row is ended; a cut session takes a new one by then."""
+"""A replay or calibration that no service works on at two looks in a row is marked as interrupted.
+
+A service whose session was cut has taken a new one by the second look."""
 
 log = logging.getLogger(__name__)
 
@@ -97,6 +99,7 @@ class SingleProjector:
             except (AcquisitionError, SQLAlchemyError) as error:
                 log.warning("whether another service projects is not known: %s", error)
             except Exception:
+                # This thread must go on: without it the service would never take over.
                 log.exception("a look at what other services do failed; it is repeated")
 
     def _try(self) -> None:

@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Source:
-    """What is followed, and how."""
+    """The stream, consumer and subjects that a follower uses."""
 
     servers: str
     stream: str
@@ -161,7 +161,7 @@ class Follower:
                 beside.cancel()
         finally:
             with suppress(NatsError, OSError, TimeoutError):
-                # What was acknowledged last is on its way still.
+                # The client may not have sent the last acknowledgements yet.
                 await connection.flush(timeout=5)
             await connection.close()
 

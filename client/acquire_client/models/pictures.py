@@ -42,7 +42,7 @@ class PictureStar(Model, frozen=True, kw_only=True):
 
 
 class Picture(Model, frozen=True, kw_only=True):
-    """What was found on a picture; without an attitude, `remarks` say what to try."""
+    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
 
     width_px: int
     height_px: int

@@ -54,7 +54,7 @@ class PictureStarFound(Record, frozen=True, kw_only=True):
 
 
 class Picture(Record, frozen=True, kw_only=True):
-    """What was found on a picture; without an attitude, `remarks` say what to try."""
+    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
 
     component: ClassVar[str] = "Picture"
     width_px: Count

@@ -52,5 +52,6 @@ class HeardEvents:
                 log.info("events of other services are read each second: %s", error)
                 self._closed.wait(RECONNECT_S)
             except Exception:
+                # An error of a listener must not end the thread that wakes all event streams.
                 log.exception("a listener of events failed")
                 self._closed.wait(RECONNECT_S)
