@@ -11,9 +11,9 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 # Of `make torture`: an expression as pytest -k has it, e.g. "kills and sqlite"; empty: all
 PARTS ?=
-# Processes that share the tests between them, a file to each at a time: one a core, at most eight,
-# of 1 to 1.5 GB; 0 for one after another
-WORKERS ?= auto
+# Processes that share the tests between them, a file to each at a time, of 1 to 1.5 GB; 0 for one
+# after another.  Three for two cores: many tests wait for a process of their own.
+WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) * 3 / 2)))
 BENCH_ARGS ?=
 # Of `make mutants`: e.g. "--seed 2 --suite sitting"; --help says more
 MUTANTS_ARGS ?=
@@ -27,6 +27,9 @@ OVER_POSTGRESQL = [ -z "$$TEST_POSTGRESQL_URL" ] || \
 	$(TEST) --database postgresql -m "not torture"
 # From the environment: TEST_POSTGRESQL_URL, a scratch database for the PostgreSQL tests, which
 # are skipped without it, e.g. postgresql+psycopg://user@127.0.0.1:5432/test
+
+# With it every start of a process compiles each of its modules anew: two seconds of a service.
+unexport PYTHONDONTWRITEBYTECODE
 
 VENV = .venv
 BIN = $(VENV)/bin

@@ -109,11 +109,20 @@ def _why_left_out(config, item):
         return OTHER_DATABASE
     if scale.is_full():
         return None
-    if item.get_closest_marker("slow"):
+    if _is_slow(item):
         return "slow"
     if _is_repeated_over_postgresql(item):
         return "repeated over PostgreSQL"
     return None
+
+
+def _is_slow(item):
+    """Whether a test is marked `slow`: wholly, or for parameters whose name holds what is named."""
+    parameters = getattr(item, "callspec", None)
+    return any(
+        not mark.args or any(each in parameters.id for each in mark.args)
+        for mark in item.iter_markers("slow")
+    )
 
 
 def _is_repeated_over_postgresql(item):

@@ -130,6 +130,7 @@ def shipped(name, *changes):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.slow("soho")
 def test_nothing_is_unusual_in_a_shipped_mission(acquire, name):
     """And its zones are drawn with their pairs."""
     file = SHIPPED_FOLDER / f"{name}.toml"

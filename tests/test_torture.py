@@ -66,6 +66,7 @@ def test_each_part_has_its_result(run):
     assert "not mended yet" in failed[0]["faults"][0]
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_one_was_stopped(run):
     run("-k", "passes")
     done, results = run()

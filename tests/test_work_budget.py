@@ -63,6 +63,7 @@ def spent(monkeypatch):
 
 
 @pytest.mark.parametrize("mission", ["XTE", pytest.param("SOHO", marks=pytest.mark.slow)])
+@pytest.mark.slow("XTE")
 def test_a_costly_batch_ends_at_the_bound_and_says_so(views, mission, spent):
     drawn = views(mission)
     batch = batch_of(drawn, drawn.random_points(250), 600.0)

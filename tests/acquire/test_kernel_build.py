@@ -78,6 +78,7 @@ def test_without_a_second_processor_one_compiles_all(building, monkeypatch):
     assert len(started(1)) == 1
 
 
+@pytest.mark.slow
 def test_they_end_with_a_parent_that_is_killed(nothing_compiled):
     code = (
         "import multiprocessing, threading, time\n"
@@ -162,6 +163,7 @@ def _fail(missions, share, zones_built):
 
 
 @pytest.mark.parametrize("end", ["go-on", pytest.param("fail", marks=pytest.mark.slow)])
+@pytest.mark.slow("go-on")
 def test_zones_are_open_while_the_rest_is_compiled(nothing_compiled, monkeypatch, tmp_path, end):
     monkeypatch.setattr(kernel_build, "_compile", _wait_between)
     build, told = KernelBuild(), []

@@ -28,6 +28,7 @@ def raised(app, run):
 
 
 @pytest.mark.parametrize("way", [(), ("--concurrency", "4")], ids=["as a file", "batch by batch"])
+@pytest.mark.slow
 def test_through_a_server(app, file, way):
     with Server(create_app(app)) as url:
         for run, alarms in (("quiet", ()), ("loud", ("--alarms",))):

@@ -132,6 +132,7 @@ def test_a_calibration_that_one_service_adopted_holds_for_the_next_batch_of_the_
         assert used(sent[32]) == file
 
 
+@pytest.mark.slow
 def test_a_replay_of_a_service_that_has_ended_is_interrupted_and_one_that_goes_on_is_not(
     services, sky, missions
 ):
@@ -159,6 +160,7 @@ def test_a_replay_of_a_service_that_has_ended_is_interrupted_and_one_that_goes_o
     wait_until(lambda: state(kept) == "done", 30.0)
 
 
+@pytest.mark.slow
 def test_an_upload_is_followed_and_cancelled_through_the_other_service(services, sky, missions):
     first, second = services
     go_on = threading.Event()

@@ -391,6 +391,7 @@ def in_seconds(count):
 
 @pytest.mark.parametrize("asked", ["seconds", "date"])
 @pytest.mark.parametrize("status", [429, 503])
+@pytest.mark.slow("503")
 def test_the_client_waits_as_long_as_it_is_asked_to(status, asked):
     # A date has whole seconds: two from now are more than one.
     value = "1" if asked == "seconds" else in_seconds(2)

@@ -83,6 +83,7 @@ CONDITIONS = {
 
 
 @pytest.mark.parametrize("name", CONDITIONS)
+@pytest.mark.slow("hardly any noise")
 def test_fields_are_found_and_none_is_wrong(name, sky, index, seed):
     conditions, told = CONDITIONS[name]
     field = FieldOfView.square(10.0)
@@ -196,6 +197,7 @@ def test_the_order_of_the_points_does_not_matter(sky, solver, seed, rng):
         assert shuffled.log_odds == pytest.approx(straight.log_odds)
 
 
+@pytest.mark.slow
 def test_turning_the_camera_turns_the_attitude_alone(sky, index, seed):
     """A law: the same sky in a circle, rolled about the boresight."""
     solver = LostInSpace(index, FieldOfView(5.0))

@@ -100,6 +100,7 @@ def test_stopping_early_names_what_the_exhaustive_search_names(sky, rng, table, 
     assert same / len(sightings) > 0.97
 
 
+@pytest.mark.slow
 def test_leaving_a_star_out_of_a_fit_is_fitting_without_it(sky, rng, monkeypatch):
     """The hypothesis less one star: taken away from the fit, and fitted anew."""
     caught = []

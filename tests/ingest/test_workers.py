@@ -230,6 +230,7 @@ def test_a_chunk_that_ends_its_processes_is_named_and_costs_no_other(local_worke
     assert workers.submit(6).result(GIVE_UP_S) == [12]
 
 
+@pytest.mark.slow
 def test_the_server_of_workers_is_idle_and_its_death_costs_no_chunk(local_workers):
     """It has no thread and no database that a fork could tear; a stop signal does not reach it."""
     workers = local_workers(double)
@@ -394,6 +395,7 @@ def long_replay(make):
     return [text for _, text in zip(range(20_000), endless(make().text), strict=False)]
 
 
+@pytest.mark.slow
 def test_no_worker_outlives_a_service_that_is_killed(tmp_path, long_replay):
     served = Served(tmp_path, long_replay)
     assert served.children

@@ -82,6 +82,7 @@ print(json.dumps({
 """
 
 
+@pytest.mark.slow
 def test_an_identifier_added_through_the_registry_alone_is_known_everywhere(tmp_path):
     """In missions, batches, the API, its description, the pages and the commands."""
     told = subprocess.run(

@@ -147,6 +147,7 @@ def _asking(prometheus, url, sky, missions):
     return ask
 
 
+@pytest.mark.slow
 def test_every_panel_shows_something_of_a_service_that_takes_batches(prometheus):
     empty = [(board, title) for board, title, query in panels() if not prometheus(query)]
     assert empty == []

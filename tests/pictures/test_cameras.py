@@ -120,6 +120,7 @@ def test_a_time_may_be_absent_where_aberration_is_ignored():
     assert made.batch.a_priori is not None
 
 
+@pytest.mark.slow
 def test_a_frame_without_an_attitude_still_becomes_a_batch(rng):
     mission = parse_mission(ROUGH.format(field=11.0), "flir.toml")
     counts = rng.normal(50.0, 3.0, (768, 1024))

@@ -76,6 +76,7 @@ def test_drawn_pictures_of_random_lenses_are_right_or_have_no_answer(blind, rng)
     assert np.median(squares) < chi2(3).ppf(0.8)
 
 
+@pytest.mark.slow
 def test_an_attitude_of_hundreds_of_arcseconds_is_no_answer(blind):
     """Stars above a thousand black rows fitted a lens whose axis is in the middle, 2 degrees off.
 

@@ -38,6 +38,7 @@ def peak_bytes(name, count):
         for name in attitude_formats()
     ],
 )
+@pytest.mark.slow("json", "fits", "aem", "parquet")
 def test_memory_does_not_grow_with_the_attitudes(name):
     peak_bytes(name, 1)
     size, peak = peak_bytes(name, 30)

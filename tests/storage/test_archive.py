@@ -318,6 +318,7 @@ def test_a_what_if_that_a_service_records_meanwhile_is_not_lost(
 
 @pytest.mark.both_databases
 @pytest.mark.parametrize("work", ["archive", "restore"])
+@pytest.mark.slow("postgresql")
 def test_trends_that_a_service_counts_meanwhile_have_each_batch_once(
     meanwhile, filled, place, make, monkeypatch, work
 ):

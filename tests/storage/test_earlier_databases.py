@@ -212,6 +212,7 @@ def test_each_earlier_schema_has_its_databases():
     assert dumped == set(REVISIONS)
 
 
+@pytest.mark.slow("0009-postgresql", "0016-postgresql")
 def test_the_upgrade_loses_nothing(earlier):
     for name, rows in earlier.before.items():
         if name == "alembic_version" or not rows:
@@ -325,6 +326,7 @@ def runs_of(earlier, address):
     return {row["run"] for row in rows if not named or row["spacecraft"] == named[1]}
 
 
+@pytest.mark.slow("postgresql")
 def test_every_route_that_reads_answers(earlier):
     """Each answer is held against openapi.yaml by the client: later fields have their defaults."""
     names = names_of(earlier)
@@ -360,6 +362,7 @@ def test_events_of_before_are_sent(earlier):
         assert any(line == f"event: {expected}" for line in islice(names, 3))
 
 
+@pytest.mark.slow("postgresql")
 def test_every_page_is_shown(earlier):
     names = names_of(earlier)
     # Of batches that are alike a few pages stand for all: each takes some 30 ms.

@@ -47,6 +47,7 @@ def acknowledged_in(output):
 
 @pytest.mark.both_databases
 @pytest.mark.torture
+@pytest.mark.slow("postgresql")
 def test_nothing_acknowledged_is_lost_torn_or_doubled_by_kills(
     database, tmp_path, sky, missions, rng, figures
 ):

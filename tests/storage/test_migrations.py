@@ -68,6 +68,7 @@ def test_there_are_earlier_versions():
 
 
 @pytest.mark.parametrize("revision", [*some_in_a_sitting(REVISIONS[:-1]), REVISIONS[-1]])
+@pytest.mark.slow("postgresql-0009", "postgresql-0016")
 def test_an_older_database_is_brought_up_to_date_with_all_it_holds(
     revision, present, database, opened, make, tmp_path
 ):

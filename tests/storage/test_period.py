@@ -51,6 +51,7 @@ def test_residuals_are_those_of_the_answers(app, missions, sky, seed, spacecraft
 
 
 @pytest.mark.parametrize("spacecraft", ["XTE", "SOHO"])
+@pytest.mark.slow("postgresql")
 def test_residuals_over_the_expected_are_unit_normal(app, missions, sky, seed, spacecraft, figures):
     record(app, missions, sky, spacecraft, seed, batches=200)
     (tracker,) = app.results.period(spacecraft, **WHOLE).trackers

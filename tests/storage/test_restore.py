@@ -68,6 +68,7 @@ def clear(url):
 @pytest.mark.parametrize(
     "revision", [pytest.param(EARLIER[0], marks=pytest.mark.slow), EARLIER[-1]]
 )
+@pytest.mark.slow("postgresql")
 def test_an_upgrade_is_taken_back_with_the_backup_made_before_it(
     empty_database, tmp_path, revision
 ):

@@ -36,6 +36,7 @@ def assert_trends_whole(app):
 
 @settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(steps=st.lists(st.one_of(BATCH, WHAT_IF, st.lists(BATCH, max_size=4)), max_size=10))
+@pytest.mark.slow("postgresql")
 def test_they_equal_a_recount_after_any_sequence_of_batches_and_adoptions(app, make, steps):
     ids = []
     serial = iter(range(len(steps) * 10))

@@ -208,6 +208,7 @@ def change_freely(app, statement):
 
 
 @pytest.mark.both_databases
+@pytest.mark.slow("postgresql")
 def test_any_changed_value_of_the_record_is_found_and_named(
     filled, framed, opened, missions, database, seed, figures
 ):

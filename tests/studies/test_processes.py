@@ -39,6 +39,7 @@ def wait_for(condition):
 
 
 @pytest.mark.parametrize("command", COMMANDS.values(), ids=COMMANDS)
+@pytest.mark.slow("mission", "zhou_ye")
 def test_they_end_with_a_command_that_is_killed(command):
     with subprocess.Popen(
         [sys.executable, "-m", "service.cli", "simulate", *command, "--processes", "2"],

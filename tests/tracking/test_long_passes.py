@@ -31,6 +31,7 @@ COMPARED_EVERY, FEW = 3, 3
 
 @pytest.mark.torture
 @pytest.mark.parametrize(("name", "identifier", "dense", "share"), CASES)
+@pytest.mark.slow("SOHO-verified-False-20")
 def test_flips_and_gaps_leave_nothing_wrong(
     name, identifier, dense, share, sky, tmp_path, seed, rng, figures
 ):

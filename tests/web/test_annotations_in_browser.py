@@ -79,6 +79,7 @@ def test_a_note_by_keyboard_is_marked_on_the_charts_of_every_reader(browser, oth
         assert each.complaints == []
 
 
+@pytest.mark.slow
 def test_on_a_phone_a_tap_on_a_chart_gives_the_time_and_a_note_can_be_deleted(browser, page):
     opened(browser, page, width=400, height=800)
     place = browser.run(

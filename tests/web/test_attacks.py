@@ -53,6 +53,8 @@ def server(tmp_path_factory):
     # `test_heads` has each of the others refused and its connection closed.
     [pytest.param(kind, marks=[] if kind in QUICK else pytest.mark.slow) for kind in ATTACKS],
 )
+@pytest.mark.slow("small chunks")
+@pytest.mark.slow("held bodies")
 def test_an_attack_costs_a_healthy_client_nothing(server, batch, kind, figures):
     """Its posts and its probes are answered, and memory is kept; at full size as soon as ever."""
     process, url = server

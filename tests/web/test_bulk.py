@@ -80,6 +80,7 @@ def test_a_packed_file_is_the_file(client, drawn, run, packing):
 
 
 @pytest.mark.parametrize("coding", ["gzip", "zstd"])
+@pytest.mark.slow("zstd")
 def test_a_damaged_file_is_recorded_up_to_the_damage_and_says_so(client, drawn, run, coding):
     data = b"".join(json.dumps(each).encode() + b"\n" for each in drawn("XTE", 700, seed=2))
     packed = PACKED[coding](data)

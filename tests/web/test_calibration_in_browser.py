@@ -46,6 +46,7 @@ SIGN = """(form => { form.elements.who.value = 'J. Operator';
     document.querySelector('dialog form'))"""
 
 
+@pytest.mark.slow
 def test_calibrate_try_adopt_and_take_back(browser, folder):
     missions = folder / "assumed"
     app = open_app(in_process_settings(sqlite_at(folder / "acquire.db"), missions=missions))

@@ -21,6 +21,7 @@ PAGES = (
 
 
 @pytest.mark.parametrize(("unix_s", "year"), [(5.0, "1970"), (4.2e9, "2103")])
+@pytest.mark.slow("1970")
 def test_every_page_works_whatever_the_year(chosen_database, drawn, monkeypatch, unix_s, year):
     """As on a machine without a battery: it begins in 1970 until somebody tells it the time."""
     database = in_process_settings(chosen_database())

@@ -687,6 +687,7 @@ def test_a_new_critical_alarm_sounds_once_if_that_is_switched_on(browser, addres
     assert browser.complaints == []
 
 
+@pytest.mark.slow
 def test_a_point_of_the_sky_leads_to_its_batch(browser, address, client, full_run):
     found = client.get("/api/v1/batches", params={"run": full_run, "spacecraft": "XTE"}).json()
     batches = {each["time"]: each["id"] for each in found["items"]}

@@ -259,6 +259,7 @@ def test_a_picture_of_a_mission_s_camera_has_the_attitude_of_the_truth(client, f
     assert np.degrees(np.arccos(boresight @ seen)) < 0.05
 
 
+@pytest.mark.slow
 def test_a_picture_without_stars_says_what_to_try_and_names_no_option_of_a_command(client):
     noise = np.random.default_rng(3).normal(40.0, 3.0, (480, 640)).clip(0, 255).astype(np.uint8)
     file = io.BytesIO()

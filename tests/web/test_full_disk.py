@@ -132,6 +132,7 @@ def test_a_disk_that_fills_and_is_freed_under_load_is_told_by_every_probe(
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+@pytest.mark.slow
 def test_what_waits_is_counted_with_its_age(database, sky, missions):
     with served(database) as (_, url), ThreadPoolExecutor(3) as threads:
 

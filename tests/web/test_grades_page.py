@@ -217,6 +217,7 @@ def test_the_route_names_what_is_wrong(address, asked, status, named):
 
 @in_browser
 @pytest.mark.parametrize("run", ["pass", "bare"])
+@pytest.mark.slow
 def test_it_fits_and_axe_finds_no_fault(address, run, browser):
     assert_fits(browser, f"{address}{PAGE}?run={run}")
     assert browser.complaints == []

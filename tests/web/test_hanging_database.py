@@ -234,6 +234,7 @@ def assert_each_recorded_once(database, clients):
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+@pytest.mark.slow
 def test_a_locked_table_delays_nobody_for_long(database, template, figures):
     refused = 0
     with served(database) as (process, url):
@@ -314,6 +315,7 @@ def test_a_file_that_another_process_writes_to_for_long_delays_nobody_for_long(
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+@pytest.mark.slow
 def test_tokens_out_of_reach_are_told_of_at_once(database, template):
     """Nobody can be known then: everything but the open routes says so, in time."""
     with served(database) as (_, url), locked(database, "access_tokens"):

@@ -123,6 +123,7 @@ def test_what_cannot_be_asked_is_refused_by_name(client, asked):
     assert answer.json()["errors"]
 
 
+@pytest.mark.slow
 def test_batches_of_every_run_are_listed_together(client, full_run, post, batch):
     assert post(batch).status_code == 201
     runs, asked = set(), {"run": "*", "limit": 500}

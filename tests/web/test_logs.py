@@ -137,6 +137,7 @@ def test_at_debug_every_request_has_a_line(service, batch):
     assert "numba" not in made.text
 
 
+@pytest.mark.slow
 def test_an_error_that_is_repeated_is_written_once_and_counted(service):
     made = service(log_format="json")
     with made.running() as client:

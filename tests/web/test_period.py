@@ -54,6 +54,7 @@ def spread_of(page, tracker):
 
 
 @in_browser
+@pytest.mark.slow
 def test_two_clicks_lead_from_the_overview_to_the_residual_map_of_the_tracker(browser, address):
     browser.open(address)
     alarm = "document.querySelector('tbody .c-alarms a')"

@@ -49,6 +49,7 @@ def test_a_picture_is_shown_with_its_stars_and_its_lens_and_not_recorded(
     assert browser.complaints == []
 
 
+@pytest.mark.slow
 def test_a_picture_without_stars_is_followed_by_what_to_try(browser, address, tmp_path):
     noise = np.random.default_rng(3).normal(40.0, 3.0, (480, 640)).clip(0, 255).astype(np.uint8)
     Image.fromarray(noise).save(tmp_path / "noise.png")
@@ -66,6 +67,7 @@ def test_a_picture_without_stars_is_followed_by_what_to_try(browser, address, tm
     browser.complaints.clear()
 
 
+@pytest.mark.slow
 def test_a_dropped_frame_of_a_mission_is_recorded_if_that_is_asked(browser, address, client, app):
     (drawn,) = draw_frames(load_missions()["IMAGER"], app.sky, FrameSettings(frames=1, seed=77))
     file = io.BytesIO(frame_bytes(drawn))

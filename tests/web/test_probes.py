@@ -49,6 +49,7 @@ def test_it_lives_and_becomes_ready(client):
     wait_until(is_ready)
 
 
+@pytest.mark.slow
 def test_answers_say_how_far_trends_are_behind_the_record(client, post, batch, monkeypatch):
     """They come within a second of a held-up projector, and are right once it goes on."""
     go_on = threading.Event()

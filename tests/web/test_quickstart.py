@@ -81,6 +81,7 @@ def moved(text, folder, port):
 
 
 @pytest.mark.usefixtures("server")
+@pytest.mark.slow
 def test_the_lines_of_the_readme_print_the_attitude_that_it_shows(folder, port):
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     shown = json.loads(re.search(r"with more digits than here:\n`(\[.*\])`", text).group(1))

@@ -332,6 +332,8 @@ def test_an_interrupted_command_cancels_its_replay_on_the_server(client, batch, 
     file.write_bytes(many(batch, run))
     command = [sys.executable, "-m", "service.cli", "replay", str(file), "--run", run]
     command += ["--url", str(client.base_url)]
+    # As from a terminal: started by a script in the background, it would ignore the signal.
+    command = ["env", "--default-signal=INT", *command]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     with process:
 

@@ -49,6 +49,7 @@ def connected(port):
 
 
 @pytest.mark.torture
+@pytest.mark.slow
 def test_a_thousand_slow_connections_harm_nobody(server, batch, figures):
     """Some stop in the middle of the head or the body, some trickle, some do not read an answer."""
     process, port, url = server
@@ -195,6 +196,7 @@ def closed_after_s(connection, every_s=0.1, byte=b"x"):
     ],
     ids=["nothing", "a head", "a second head", "a body that was refused"],
 )
+@pytest.mark.slow("nothing", "a second head", "a body")
 def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monkeypatch, sent):
     monkeypatch.setattr("service.web.slow_clients.HEAD_S", 0.8)
     url = httpx.URL(address)
@@ -207,6 +209,7 @@ def test_a_client_that_trickles_where_a_head_should_come_is_let_go(address, monk
             assert closed_after_s(connection) < GIVE_UP_S
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_refused_body_is_taken_off_slowly_and_to_its_end(address, monkeypatch):
     """Longer than a client may dawdle: it is not the client who does."""
     monkeypatch.setattr("service.web.slow_clients.HEAD_S", 2.0)

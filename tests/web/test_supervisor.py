@@ -30,6 +30,7 @@ def heard(tmp_path, monkeypatch):
         yield heard
 
 
+@pytest.mark.slow
 def test_it_reports_ready_then_signs_of_life_none_where_it_stands_and_that_it_stops(
     heard, tmp_path
 ):
@@ -52,6 +53,7 @@ def test_it_reports_ready_then_signs_of_life_none_where_it_stands_and_that_it_st
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+@pytest.mark.slow
 def test_a_service_beside_one_that_projects_is_ready(heard, database):
     engine = create_engine(database_url(database), poolclass=NullPool)
     with engine.connect() as other:

@@ -139,6 +139,7 @@ def test_the_command_says_the_same(app, found, capsys, tmp_path):
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
+@pytest.mark.slow
 def test_the_tables_fit_and_axe_finds_no_fault(address, posted, browser):
     for path in ("/spacecraft/XTE/period", f"/batches/{posted[15]}"):
         assert_fits(browser, f"{address}{path}?run={RUN}")

@@ -108,6 +108,7 @@ def asking(database):
     engine.dispose()
 
 
+@pytest.mark.slow
 def test_both_services_record_and_answer_and_the_second_takes_over(database, sky, missions):
     def post(service, path, content, **headers):
         return httpx.post(f"{service.url}{path}", content=content, headers=headers, timeout=60)
@@ -136,6 +137,7 @@ def test_both_services_record_and_answer_and_the_second_takes_over(database, sky
         assert (first.is_projecting(), second.is_projecting()) == (False, True)
 
 
+@pytest.mark.slow
 def test_the_services_are_restarted_one_after_the_other_and_no_post_fails(
     database, sky, missions, figures
 ):
@@ -158,6 +160,7 @@ def test_the_services_are_restarted_one_after_the_other_and_no_post_fails(
 
 
 @pytest.mark.torture
+@pytest.mark.slow
 def test_after_kills_nothing_acknowledged_is_lost_or_doubled_and_projections_are_whole(
     database, sky, missions, rng, figures
 ):

@@ -53,6 +53,7 @@ def killable(tmp_path, free_port):
 
 
 @pytest.mark.torture
+@pytest.mark.slow
 def test_all_events_arrive_at_a_receiver_that_is_killed(database, killable, rng, figures):
     events, kills = size(EVENTS, 30), size(KILLS)
     begun_s = time.monotonic()

@@ -6,6 +6,8 @@ import threading
 import time
 from functools import partial
 
+import pytest
+
 from service.errors import Busy
 from service.storage.recording import events
 from service.storage.webhooks import deliveries
@@ -18,6 +20,7 @@ def texts(receiver):
     return [json.loads(each.body)["data"]["text"] for each in receiver.requests]
 
 
+@pytest.mark.slow
 def test_events_that_are_recorded_while_others_are_queued_are_sent_once(
     service, receiver, monkeypatch
 ):
@@ -39,6 +42,7 @@ def test_events_that_are_recorded_while_others_are_queued_are_sent_once(
     assert texts(receiver) == [f"n{n}" for n in range(12)]
 
 
+@pytest.mark.slow
 def test_what_was_taken_is_not_sent_again_while_it_cannot_be_noted(service, receiver, monkeypatch):
     """The writer's queue is full under a bulk load, for longer than one try."""
     writer = service.app.store.writer

@@ -132,6 +132,7 @@ def test_of_several_who_write_the_same_file_the_first_one_s_stays(place):
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+@pytest.mark.slow("postgresql")
 def test_posts_meanwhile_are_recorded_or_archived_but_never_both(
     archived, opened, place, bodies, monkeypatch
 ):

@@ -289,6 +289,7 @@ def test_the_command_prints_a_table_and_writes_its_rows(tmp_path, seed):
 
 
 @pytest.mark.parametrize("table", some_in_a_sitting(range(2, 11)))
+@pytest.mark.slow("10")
 def test_the_rates_of_the_text_are_those_of_the_rows(table, tmp_path, seed):
     out, path = io.StringIO(), tmp_path / "rows.json"
     run_paper(table, 1, [seed], path, processes=1, out=out)

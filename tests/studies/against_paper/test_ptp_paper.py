@@ -59,6 +59,7 @@ class TestRivals:
             ("pyramid", 0.95),
         ],
     )
+    @pytest.mark.slow
     def test_each_names_most_fields_rightly_at_a_pixel(
         self, stars, algorithms, name, least_share, seed
     ):
@@ -135,6 +136,7 @@ class TestComparison:
         # All but the times.
         assert (one[:, :5] == two[:, :5]).all()
 
+    @pytest.mark.slow
     def test_ptp_is_where_the_paper_says_it_is(self, seed):
         """Between strict and checked lies what the paper prints for 0 and for 2 pixels."""
         cases = [Case("figure-12", ("PTP",), px) for px in (0.0, 2.0)]
@@ -217,6 +219,7 @@ class TestCommand:
             *("figure-10", "figure-12"),
         ],
     )
+    @pytest.mark.slow
     def test_the_rates_of_drawn_fields_are_those_of_the_text(self, name, tmp_path):
         out, path = io.StringIO(), tmp_path / "rows.json"
         run_ptp(name, 3, 1, path, processes=1, out=out)

@@ -18,6 +18,7 @@ def rows(request):
 
 
 @pytest.mark.parametrize("name", ROWS)
+@pytest.mark.slow("IM-1")
 def test_every_claim_of_a_row_is_within_its_bounds(name, rows):
     assert rows[name].name == name
     assert rows[name].claims
