@@ -147,24 +147,7 @@ def test_what_is_drawn_is_bounded_however_long_the_period(address):
     page = httpx.get(address + PAGE, params=SMOOTHED | {"range": "60min"}).text
     steps = max(path.count("l") for path in re.findall(r' d="([^"]*)"', page))
     assert 200 < steps < 1300
-    print(
-        "BYTES",
-        len(page),
-        {
-            i: len(figure(page, i))
-            for i in (
-                "direction",
-                "attitude",
-                "rate",
-                "sigma",
-                "difference",
-                "bias",
-                "innovation",
-                "chi-square",
-            )
-        },
-    )
-    assert len(page) < 300_000
+    assert len(page) < 128_000
     year = httpx.get(address + PAGE, params=SMOOTHED | {"range": "year"}).raise_for_status()
     assert 'class="bar-gyro"' in year.text
 
