@@ -100,7 +100,8 @@ def test_the_worst_of_the_sky_is_that_of_the_census(sky, missions):
 @pytest.mark.slow
 @pytest.mark.torture
 @pytest.mark.parametrize(
-    ("name", "cap_deg"), [("XTE", None), ("SWAS", None), ("SOHO", None), ("XTE", 6.0)]
+    ("name", "cap_deg"),
+    [("XTE", None), ("SWAS", None), ("SOHO", None), ("IMAGER", None), ("XTE", 6.0)],
 )
 def test_no_random_axis_has_a_poorer_or_richer_zone_than_the_extremes(
     sky, missions, rng, name, cap_deg, figures
