@@ -1,10 +1,10 @@
 """The identifier `ptp`: planar triangles found by their principal component, with no prior.
 
 Each observed star makes triangles with its nearest neighbours.  Their
-projections find guide triangles, their sides choose among these, stars that
-several triangles name alike are validated, and the attitude check has the last
-word (Zhou & Ye 2015; the check is ours: the paper's system takes a mirrored sky
-for the real one).
+projections find guide triangles, their sides choose among these, and their
+votes order the proposals (Zhou & Ye 2015, sections 2.1 and 2.2).  The attitude
+check decides.  It replaces the paper's validation by sharing stars (2.3), which
+accepts a mirrored sky; `Proposals.validated` gives that for comparison.
 
 The a priori attitude is not asked: observed vectors may be in any axes.
 Magnitudes are not used either.
