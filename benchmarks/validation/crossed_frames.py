@@ -243,7 +243,8 @@ The frames are those above with one difference: two wires each way, a tenth of
 the aperture wide, stand before the lens, and every star is a cross whose arms reach 90 pixels far.
 The mission's camera has `psf = "cross"` ([missions.md](missions.md#the-image-of-a-star)); its stars
 are taken off the frame one behind the other before the next ones are looked for, and each is placed
-by the shape of the cross, with the arms of all others as its background.
+by the shape of the cross, with the arms of all others as its background. All light is of one
+colour, which the camera assumes too; in broad light the errors of places are not known.
 
 A star counts as found, and an attitude as right, as above: within {FOUND_PX:g} pixels, and
 within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it.

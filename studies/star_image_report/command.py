@@ -52,9 +52,11 @@ a `--seed` of your choice; `--row IM-4` prints one row.
 _LEFT_OUT = """\
 ## Parts of the report that this project leaves out or does differently
 
-- 1.1, trade of field of view, optics and detection: no study joins them; `acquire simulate
-  frames`, `acquire frame` and `acquire simulate mission` give the error of a camera's places and
-  the rates of identification at a given error one after the other.
+- 1.1, kinds of trackers, a field of view that adapts, and the trade of field of view, optics and
+  detection: no study compares or joins them; `acquire simulate frames`, `acquire frame` and
+  `acquire simulate mission` give the error of a camera's places and the rates of identification at
+  a given error one after the other.
+- 2.5 to 2.7, plates and wedges: claims of IM-1; a camera has wires, and no other mask or plate.
 - 2.5, 7.1, colours: every star and its background have one spectrum, and the cameras' images
   `airy` and `cross` are of one colour, so that in broad light the errors of their places are not
   known.
