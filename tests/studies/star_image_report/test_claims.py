@@ -7,7 +7,7 @@ import pytest
 
 from service.errors import BadInput
 from studies.star_image_report.claims import Claim, Row, Study
-from studies.star_image_report.command import ROWS, run_imaging, table
+from studies.star_image_report.command import ROWS, as_json, run_imaging, table
 
 
 @pytest.fixture(scope="module")
@@ -24,6 +24,16 @@ def test_every_claim_of_a_row_is_within_its_bounds(name, rows):
     assert rows[name].claims
     for claim in rows[name].claims:
         assert claim.holds, f"{claim.says}: {claim.ours}"
+
+
+@pytest.mark.parametrize("name", ROWS)
+@pytest.mark.slow("IM-1")
+def test_the_claims_in_json_are_those_of_the_text(name, rows):
+    text, claims = table(rows[name]), json.loads(as_json([rows[name]]))
+    assert [claim["row"] for claim in claims] == [name] * len(rows[name].claims)
+    for claim in claims:
+        cells = (claim[key].replace("|", "\\|") for key in ("section", "report", "here"))
+        assert "| {} | {} | {} | ".format(*cells) in text
 
 
 def test_the_slips_of_the_report_are_told_as_corrected(rows):
