@@ -143,6 +143,22 @@ def test_a_what_if_answers_and_leaves_no_trace(post, batch, client):
     assert client.get(f"{URL}/{id}").json() == before
 
 
+def test_a_setting_that_changes_nothing_is_refused_by_name_and_shown_idle(post, batch, run, client):
+    id = post(batch | {"run": run}).json()["id"]
+    idle = {"tests": {"fov_rotation": True}, "tolerances": {"separation_deg": 1e-6}}
+    compared = {"spacecraft": batch["spacecraft"], "run": run, "b": idle}
+    answers = {
+        "options": what_if(client, id, options=idle),
+        "b": client.post("/api/v1/compare", json=compared),
+    }
+    for field, answer in answers.items():
+        assert answer.status_code == 422
+        for name in ("tests.fov_rotation", "tolerances.separation_deg"):
+            assert f"{field}.{name}" in answer.text
+        assert "is not used by the identifier verified" in answer.text
+    assert "is not used by the identifier verified" in client.get(f"/batches/{id}").text
+
+
 def test_a_recorded_what_if_stands_beside_the_first_result(post, batch, client):
     id = post(batch).json()["id"]
     answer = what_if(client, id, **OTHER, record=True)
