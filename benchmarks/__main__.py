@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.record import SERVICE, record_of
 from benchmarks.report import Report
 from benchmarks.speed import (
+    columns,
     exports,
     kernels,
     live_filter,
@@ -73,6 +74,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "imaging_claims": imaging_claims.run,
     "ptp": ptp.run,
     "kernels": kernels.run,
+    "columns": columns.run,
     "posts": posts.run,
     "live_filter": live_filter.run,
     "stored": stored.run,

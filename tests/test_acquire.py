@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.acquire import acquire, acquire_at_once
+from service.acquire import acquire
 from service.acquire.choices import choices_of
 from service.acquire.prewarm import prewarm_kernels, prewarm_zones
 from service.attitude.solution import NoAttitude
@@ -25,7 +25,13 @@ from service.storage.recording.answer import star_rows
 from service.times import parse_utc
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion, to_ra_dec
 from tests.reference import batches
-from tests.reference.compare import Judge, answer_as_json, answered, plain_view
+from tests.reference.compare import (
+    Judge,
+    answer_as_json,
+    answered,
+    plain_view,
+    zone_searched,
+)
 from tests.reference.plain_starid import PlainCatalog
 
 TIME = "2000-01-01T12:00:00.000Z"
@@ -245,7 +251,8 @@ def test_a_zone_of_another_run_catalog_is_never_used(sky, missions):
         alone = acquire(batch, its_mission, SkyModel(sky.catalog, LruCache(64 << 20)))
         found = acquire(batch, its_mission, shared)
         catalogs.add(found.provenance.run_catalog)
-        (zone,), (expected,) = ([each.zone for each in one.trackers] for one in (found, alone))
+        zone = zone_searched(found, shared)
+        expected = zone_searched(alone, SkyModel(sky.catalog, LruCache(64 << 20)))
         assert zone.run_catalog == found.provenance.run_catalog
         assert zone.direction.tolist() == expected.direction.tolist()
         assert without_clock(answer_as_json(found, id="1")) == without_clock(
@@ -335,13 +342,13 @@ def test_what_is_solved_at_once_is_what_takes_its_time_and_nothing_is_built_for_
     sent = [read(body | option) for body, option in zip(drawn, options, strict=True)]
     for batch in sent:
         with pytest.raises(NotAtHand):
-            acquire_at_once(batch, judge.mission, fresh)
+            acquire(batch, judge.mission, fresh, at_once=True)
     assert fresh.cache.state().entries == ()
     for number, batch in enumerate(sent):
         usual = acquire(batch, judge.mission, fresh)
         entries = fresh.cache.state().misses
         try:
-            at_once = acquire_at_once(batch, judge.mission, fresh)
+            at_once = acquire(batch, judge.mission, fresh, at_once=True)
         except NotAtHand:
             # Its stars are all real, and near the a priori attitude.
             assert number % 3 > 0

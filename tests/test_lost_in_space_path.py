@@ -9,7 +9,7 @@ import pytest
 from service.acquire import acquire
 from service.acquire.result import Path
 from service.attitude.solution import NoAttitude
-from service.identify.hypotheses.verified import _weigh
+from service.identify.hypotheses.verified import weigh_sightings
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
@@ -130,13 +130,13 @@ def test_without_magnitudes_it_is_found_as_well(drawn, missions, sky):
 def test_stars_found_without_their_magnitudes_are_weighed_by_the_same_kernel(drawn, missions, sky):
     """Another would be compiled in the way of the post, for a minute."""
     acquired(drawn[0].batch, missions["XTE"], sky)
-    known = set(_weigh.signatures)
+    known = set(weigh_sightings.signatures)
     body = json.loads(json.dumps({**drawn[0].batch, **LOST}))
     for star in body["observations"][0]["stars"]:
         star["magnitude"] += 5.0
     found = acquired(body, missions["XTE"], sky)
     assert any(text.startswith("magnitudes_not_used") for text in found.warnings)
-    assert set(_weigh.signatures) == known
+    assert set(weigh_sightings.signatures) == known
 
 
 @pytest.mark.parametrize("offset_mag", [0.0, 1.5, 2.0, 5.0, -17.5])

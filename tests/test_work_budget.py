@@ -14,6 +14,7 @@ from service.identify.voting.starid import identify_by_votes
 from service.missions.identifiers import IDENTIFIERS
 from service.observations.schema import submission_from_json
 from service.simulate.two_groups import MOMENT, Views
+from tests.reference.sightings import identified
 
 
 @pytest.fixture
@@ -88,6 +89,10 @@ def test_a_batch_of_stars_spends_a_hundredth_of_the_bound_at_most(views, mission
     assert 0 < max(spent()) < MAX_WORK / 100
 
 
+def by_votes(sighting):
+    return identified(identify_by_votes, sighting, weighs=False)
+
+
 @pytest.mark.parametrize("match_groups", [False, True])
 def test_votes_that_cannot_all_be_cast_are_not_counted(views, match_groups, monkeypatch):
     caught: list[Sighting] = []
@@ -95,9 +100,7 @@ def test_votes_that_cannot_all_be_cast_are_not_counted(views, match_groups, monk
     monkeypatch.setitem(
         IDENTIFIERS,
         "starid",
-        type(entry)(
-            "starid", lambda each: caught.append(each) or identify_by_votes(each), "caught"
-        ),
+        type(entry)("starid", lambda each: caught.append(each) or by_votes(each), "caught"),
     )
     drawn = views("XTE")
     tests = {"match_groups": match_groups}
@@ -106,7 +109,7 @@ def test_votes_that_cannot_all_be_cast_are_not_counted(views, match_groups, monk
     assert found.counts["unique"] == 5
     (sighting,) = caught
     sighting.budget.left = 0
-    cut = identify_by_votes(sighting)
+    cut = by_votes(sighting)
     assert cut.bounded
     assert cut.votes.tolist() == [0] * 5
     assert (cut.outcome == int(Outcome.UNMATCHED)).all()

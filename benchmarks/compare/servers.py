@@ -91,11 +91,14 @@ def served(tree: Path, folder: Path, missions: Path) -> Iterator[httpx.Client]:
 
 
 def _environment(**more: str) -> dict[str, str]:
-    """This process's own, without settings of the service and without other places of modules."""
+    """This process's own, without settings of the service and without other places of modules.
+
+    Nor of kernels: each version has its own.
+    """
     kept = {
         name: value
         for name, value in os.environ.items()
-        if not name.startswith("ACQUIRE_") and name != "PYTHONPATH"
+        if not name.startswith("ACQUIRE_") and name not in ("PYTHONPATH", "NUMBA_CACHE_DIR")
     }
     return kept | more
 

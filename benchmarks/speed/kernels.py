@@ -24,14 +24,17 @@ from service.attitude.kernels import QUEST, solve
 from service.attitude.solve import WORST_AXIS_DEG
 from service.compiled.jit import njit
 from service.identify.attitude_from_matches import attitude_of, match
+from service.identify.budget import MAX_WORK
+from service.identify.identification import room_for_identities
 from service.identify.sighting import SightedArrays, Sighting
-from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles
-from service.identify.voting.starid import (
-    ballots_for,
-    identify_by_votes,
-    tallies_for,
-    voting_arrays,
+from service.identify.voting.pair_tests import (
+    Rulebook,
+    cast_votes,
+    count_votes,
+    polar_angles,
+    tallies_of,
 )
+from service.identify.voting.starid import ballots_for, identify_by_votes
 from service.missions.mission import Band, Mission, load_missions
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
@@ -40,6 +43,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion, Zone, build_zone
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, unit
+from tests.reference.sightings import arrays_of, columns_of
 
 MOMENT = parse_utc("1996-01-10T12:00:00Z")
 STARS = (3, 5, 8, 12)
@@ -191,7 +195,7 @@ class Room(NamedTuple):
 def _room_for(n: int, stars: int) -> Room:
     return Room(
         ballots=ballots_for(n, stars),
-        tallies=tallies_for(n),
+        tallies=tallies_of(room_for_identities(1, n), 0, n),
         quaternions=np.empty((3, 4)),
         covariance=np.empty((3, 3)),
         squares=np.empty((2, n)),
@@ -278,7 +282,9 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[Boun
     count, n = views.magnitude.shape
     zone, region, limits = views.zone, views.region, mission.tolerances
     sightings = [_sighting(views, mission, k) for k in range(count)]
-    sighted, arrays_of_zone, of_region, rules = voting_arrays(sightings[0])
+    columns, one = [columns_of(each) for each in sightings], np.zeros(1, np.int64)
+    sighted, arrays_of_zone, of_region = arrays_of(sightings[0])
+    rules = Rulebook(mission.rules.limits, mission.rules.switches, MAX_WORK)
     sigma = sightings[0].sigma_rad
     star = {name: np.full((count, n), -1) for name in ("service", "bare")}
     q = {name: np.zeros((count, 4)) for name in star}
@@ -337,10 +343,12 @@ def compare(mission: Mission, views: Views) -> tuple[dict[str, float], list[Boun
         )
 
     def service_one_by_one() -> None:
-        for k, sighting in enumerate(sightings):
-            named = identify_by_votes(sighting).star
+        for k, seen in enumerate(columns):
+            found = room_for_identities(1, n)
+            identify_by_votes(one, seen, zone, mission.rules, found)
             attitude_of(
-                views.body[k], sigma, named, None, names, catalog_direction, still, 1.0, "quest"
+                *(views.body[k], sigma, found.star, None, names),
+                *(catalog_direction, still, 1.0, "quest"),
             )
 
     each = [

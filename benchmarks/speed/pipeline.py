@@ -31,7 +31,7 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from tests.reference import batches
-from tests.reference.compare import Judge
+from tests.reference.compare import Judge, zone_searched
 
 BATCHES, QUICK_BATCHES = 300, 30
 DEADLINE_S = {"cap": 4.0, "band": 600.0}
@@ -128,8 +128,7 @@ def measured(
         whole.append((time.perf_counter_ns() - started) / 1000)
         identify.append(found.timings_us["identify"])
         solve.append(found.timings_us["solve"])
-    zone = found.trackers[0].zone
-    assert zone is not None
+    zone = zone_searched(found, sky)
     empty_us = _empty_call_us(zone)
     begun = time.perf_counter()
     for body in drawn:

@@ -11,7 +11,6 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -19,22 +18,31 @@ from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.report import Report
-from service.acquire import acquire
+from service.acquire import Acquisition, acquire
 from service.compiled.jit import njit
 from service.identify.budget import MAX_WORK
 from service.identify.hypotheses.marginals import marginals
 from service.identify.hypotheses.scene import ObservedStars, ledger_for, scratch_for
 from service.identify.hypotheses.search import search
-from service.identify.hypotheses.verified import UNIQUE_PROBABILITY, posterior_for, scene_of
+from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
+from service.identify.identification import room_for_identities
 from service.identify.prior_attitude import prior_attitude
 from service.identify.sighting import SightedArrays, Sighting
-from service.identify.voting.pair_tests import cast_votes, count_votes, polar_angles
-from service.identify.voting.starid import ballots_for, tallies_for, voting_arrays
+from service.identify.voting.pair_tests import (
+    Rulebook,
+    cast_votes,
+    count_votes,
+    polar_angles,
+    tallies_of,
+)
+from service.identify.voting.starid import ballots_for
 from service.sky.model import SkyModel
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.paper_1994.experiments import open_sky
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
+from tests.reference.compare import zone_searched
+from tests.reference.sightings import arrays_of, posterior_for, scene_of
 
 Rows = npt.NDArray[np.int64]
 
@@ -97,16 +105,18 @@ def sightings(
         for view in draw_zone(world, number, mission, catalog, rng):
             if len(view.star) == STARS:
                 batch = batch_of(view, run, mission, "verified")
-                sighting = _sighting(acquire(batch, mission, sky))
+                sighting = _sighting(acquire(batch, mission, sky), sky)
                 several.append((sighting, np.searchsorted(sighting.zone.star, view.star)))
         drawn, number = drawn + len(several), number + 1
         if several:
             yield several
 
 
-def _sighting(acquired: Any) -> Sighting:
+def _sighting(acquired: Acquisition, sky: SkyModel) -> Sighting:
     """The input of the identifier, from what the pipeline keeps of it."""
     batch, mission, tracker = acquired.batch, acquired.mission, acquired.trackers[0]
+    assert batch.a_priori is not None
+    assert tracker.region is not None
     presumed = prior_attitude(batch.a_priori, batch.time, mission)
     return Sighting(
         direction=tracker.corrected.direction_body @ presumed.attitude,
@@ -116,7 +126,7 @@ def _sighting(acquired: Any) -> Sighting:
         velocity_c=np.zeros(3),
         boresight=mission.trackers[0].body_from_tracker[:, 2] @ presumed.attitude,
         region=tracker.region,
-        zone=tracker.zone,
+        zone=zone_searched(acquired, sky),
         rules=acquired.choices.rules,
     )
 
@@ -174,10 +184,12 @@ def _kernels(several: list[Sighting], named: dict[str, Rows]) -> dict[str, Calla
     shape = (len(several), STARS)
     star, probability = np.full(shape, -1), np.zeros(shape)
     posterior = posterior_for(STARS)
-    sighted, zone, bounds, rules = voting_arrays(several[0])
+    sighted, zone, bounds = arrays_of(several[0])
+    rules = Rulebook(several[0].rules.limits, several[0].rules.switches, MAX_WORK)
     count = len(several[0].zone.star)
     polar = polar_angles(zone.polar, count, bounds, rules)
-    ballots, tallies, rows = ballots_for(STARS, count), tallies_for(STARS), np.arange(count)
+    ballots, rows = ballots_for(STARS, count), np.arange(count)
+    tallies = tallies_of(room_for_identities(1, STARS), 0, STARS)
 
     def verified(name: str, exhaustive: bool) -> Callable[[], object]:
         def call() -> None:

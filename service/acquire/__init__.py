@@ -1,6 +1,14 @@
-"""From a batch to an acquisition: identification of the stars, then the attitude."""
+"""From batches to acquisitions: identification of the stars, then the attitude."""
 
-from service.acquire.pipeline import acquire, acquire_at_once
+from service.acquire.pipeline import ResultColumns, acquire, acquire_many, acquired
 from service.acquire.result import Acquisition
+from service.observations.columns import BatchColumns
 
-__all__ = ["Acquisition", "acquire", "acquire_at_once"]
+__all__ = [
+    "Acquisition",
+    "BatchColumns",
+    "ResultColumns",
+    "acquire",
+    "acquire_many",
+    "acquired",
+]

@@ -1,23 +1,34 @@
-"""The pipeline of one batch: calibrate, search for the stars, solve for the attitude.
+"""The pipeline: calibrate, search for the stars, solve for the attitude; of many batches at once.
 
-Single posts, bulk, replays, the simulator and what-if all use it.  It is pure: an
-answer depends on the batch, the mission and the catalog alone.  Not finding a
-star is a result; only bad input raises.
+What all batches need is done for them together in compiled loops: directions in body axes
+(`correct_columns`), then votes, hypotheses and attitudes in the zones about the a priori
+attitudes (`ZoneSearch`).  Batches that need more go on from there one by one (`find_groups`): those
+where the zone gave nothing good, or nothing was known beforehand, and those with stars left that
+may have an attitude of their own.
+
+An answer depends on the batch, the mission and the catalog alone, not on the batches that come
+with it.  Not finding a star is a result; only bad input raises.
 """
 
+from collections.abc import Sequence
+
+from msgspec import Struct
+from msgspec.structs import replace
+
 from service import __version__
-from service.acquire.choices import Choices, aberration_velocity, choices_of
+from service.acquire.choices import aberration_velocity, choices_of
 from service.acquire.measured import measured_solution
 from service.acquire.result import (
     Acquisition,
     Path,
     Provenance,
+    RivalAttitude,
     outcome_counts,
     tracker_results,
     unmatched_results,
 )
 from service.acquire.rivals import find_groups
-from service.acquire.search import Search, StepTimer
+from service.acquire.search import SearchResult
 from service.acquire.warnings import (
     WORK_BOUND_HIT,
     warning_of_rival,
@@ -26,13 +37,20 @@ from service.acquire.warnings import (
     warnings_of_trackers,
     warnings_of_tracking,
 )
+from service.acquire.zone_search import Search, StepTimer, ZoneSearch
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.errors import BadBatch, Fault, shown_value
-from service.identify.budget import WorkBudget
+from service.identify.budget import MAX_WORK, WorkBudget
 from service.identify.prior_attitude import prior_attitude
-from service.missions.mission import Mission
+from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch
-from service.observations.calibrate import correct
+from service.observations.calibrate import (
+    CorrectedColumns,
+    CorrectedObservations,
+    correct_columns,
+    trackers_of,
+)
+from service.observations.columns import BatchColumns
 from service.observations.scans.reduce import reduced
 from service.sky.cache import NotAtHand
 from service.sky.catalog.run_catalog import RunCatalog
@@ -43,53 +61,161 @@ SHORT_WORK = 100_000
 """The most units of work of what is solved at once: seven milliseconds."""
 
 
-def acquire_at_once(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
-    """`acquire` for who must not wait; raises `NotAtHand` where it would take long.
+class ResultColumns(Struct, frozen=True, eq=False, gc=False):
+    """What was found of n batches, row by row; see `CorrectedColumns` and `ZoneSearch`.
 
-    That is so where the whole sky is searched, a zone has to be built, or more work is counted
-    than `SHORT_WORK`.  The answer is the same.
+    `searches` has the settings of each row, `stars` the stars in body axes, and `zones` what was
+    found about the a priori attitudes, also of rows that went on from there.  `finished` has the
+    acquisitions of those that went on, and what kept a row from having one.
     """
-    budget = WorkBudget(SHORT_WORK)
-    acquisition = acquire(batch, mission, sky.at_hand(), budget)
-    if budget.was_hit:
-        raise NotAtHand
-    return acquisition
+
+    searches: dict[int, Search]
+    stars: CorrectedColumns
+    zones: ZoneSearch
+    finished: dict[int, Acquisition | Exception]
+
+    def acquisition(self, row: int) -> Acquisition:
+        """One row as the acquisition of its batch; raises what kept it from having one."""
+        acquired = self.acquisition_or_error(row)
+        if isinstance(acquired, Exception):
+            raise acquired
+        return acquired
+
+    def acquisition_or_error(self, row: int) -> Acquisition | Exception:
+        """One row as the acquisition of its batch, or what kept it from having one."""
+        if row in self.finished:
+            return self.finished[row]
+        in_zones = self.zones.result(row)
+        found = SearchResult(Path.ZONE, in_zones, None, list(in_zones.prior.warnings), ())
+        return _composed(self.searches[row], self.stars.of_batch(row), found, None)
 
 
 def acquire(
-    batch: ObservationBatch, mission: Mission, sky: SkyModel, budget: WorkBudget | None = None
+    batch: ObservationBatch, mission: Mission, sky: SkyModel, *, at_once: bool = False
 ) -> Acquisition:
-    """Identify a batch's stars and solve for the attitude.
+    """Identify a batch's stars and solve for the attitude: `acquire_many` of one batch.
 
     Without a priori knowledge, or where it leads to nothing good, the whole sky
     gives the attitude to search about.  Raises `BadInput` for what does not fit
     the mission: a tracker that it has not, a kind of a priori knowledge that its
     zone cannot use.
     """
+    columns = acquire_many(BatchColumns.of([batch]), mission, sky, at_once=at_once)
+    return columns.acquisition(0)
+
+
+def acquired(
+    batches: Sequence[ObservationBatch], mission: Mission, sky: SkyModel, *, at_once: bool = False
+) -> list[Acquisition | Exception]:
+    """The acquisition of each of some batches of one mission, or what keeps it from having one."""
+    columns = acquire_many(BatchColumns.of(batches), mission, sky, at_once=at_once)
+    return [columns.acquisition_or_error(row) for row in range(len(batches))]
+
+
+def acquire_many(
+    batches: BatchColumns, mission: Mission, sky: SkyModel, *, at_once: bool = False
+) -> ResultColumns:
+    """Identify the stars of many batches of one mission, and solve for their attitudes.
+
+    What is wrong with one keeps no other from its result.  `at_once` is for who must not wait:
+    rows have `NotAtHand` where the whole sky is searched, a zone has to be built, or more work is
+    counted than `SHORT_WORK`.  The answers of the others are the same.
+    """
+    sky = sky.at_hand() if at_once else sky
+    timer = StepTimer(len(batches.batches))
+    several: list[ObservationBatch] = []
+    trackers: list[Tracker | None] = []
+    searches: dict[int, Search] = {}
+    finished: dict[int, Acquisition | Exception] = {}
+    for row, batch in enumerate(batches.batches):
+        its_trackers: Sequence[Tracker | None] = [None] * len(batch.observations)
+        try:
+            batch = _reduced(batch, mission)
+            if batch.measurement is not None:
+                finished[row] = _measured(batch, mission, sky)
+            else:
+                its_trackers = trackers_of(batch, mission)
+                budget = WorkBudget(SHORT_WORK if at_once else MAX_WORK)
+                searches[row] = _search(batch, mission, sky, timer, budget)
+        except Exception as error:
+            # Whoever asks for this batch gets it; others have their results.
+            finished[row] = error
+        several.append(batch)
+        trackers += its_trackers
+    if any(one is not other for one, other in zip(several, batches.batches, strict=True)):
+        # Scans became angles.
+        batches = BatchColumns.of(several)
+    stars = correct_columns(batches, trackers)
+    timer.begin()
+    zones = ZoneSearch(stars)
+    for row, search in searches.items():
+        if search.prior is not None and search.identifier.uses_prior:
+            try:
+                zones.add(row, search, search.prior)
+            except Exception as error:
+                finished[row] = error
+    zones.run(timer)
+    finished |= zones.errors
+    final = set(zones.final_rows())
+    for row, search in searches.items():
+        if row not in finished and row not in final:
+            finished[row] = _continued(search, stars.of_batch(row), zones, row)
+        if at_once and search.budget.was_hit and isinstance(finished.get(row), Acquisition | None):
+            finished[row] = NotAtHand()
+    return ResultColumns(searches, stars, zones, finished)
+
+
+def _reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
+    """The batch with angles in the place of scans; raises what `reduced` does.
+
+    And `BadBatch` where the attitude to search about is still to be predicted.
+    """
     if batch.tracking is not None and not batch.tracking.resolved:
         told = "last needs the record of a service, which predicts the attitude from it"
         raise BadBatch(Fault("a_priori.from", told, shown_value("last")))
-    batch = reduced(batch, mission)
-    choices = choices_of(batch, mission)
-    if batch.measurement is not None:
-        return _measured(
-            batch, mission, choices, sky, measured_solution(batch.measurement, mission)
-        )
-    corrected = correct(batch, mission)
-    given = batch.a_priori
-    prior = None if given is None else prior_attitude(given, batch.time, mission, batch.position_km)
-    velocity_c = aberration_velocity(batch)
-    sun_au = sun_distance_au(batch.time)
+    return reduced(batch, mission)
 
-    timer = StepTimer()
-    run_catalog = sky.run_catalog(mission, batch.time)
-    search = Search(
-        *(batch, mission, choices, prior, velocity_c, sun_au, run_catalog, sky),
-        *(timer, budget or WorkBudget()),
+
+def _search(
+    batch: ObservationBatch, mission: Mission, sky: SkyModel, timer: StepTimer, budget: WorkBudget
+) -> Search:
+    """What holds for the searches for a batch's stars."""
+    time, given = batch.time, batch.a_priori
+    return Search(
+        batch=batch,
+        mission=mission,
+        choices=choices_of(batch, mission),
+        prior=None if given is None else prior_attitude(given, time, mission, batch.position_km),
+        velocity_c=aberration_velocity(batch),
+        sun_au=sun_distance_au(time),
+        run_catalog=sky.run_catalog(mission, time),
+        sky=sky,
+        timer=timer,
+        budget=budget,
     )
-    found, rival = find_groups(search, corrected)
-    in_zones = found.in_zones
 
+
+def _continued(
+    search: Search, corrected: tuple[CorrectedObservations, ...], zones: ZoneSearch, row: int
+) -> Acquisition | Exception:
+    """The acquisition of a batch that needs more than the zones about its a priori attitude."""
+    search = replace(search, timer=search.timer.of_one())
+    first = zones.result(row) if row in zones else None
+    try:
+        return _composed(search, corrected, *find_groups(search, corrected, first))
+    except Exception as error:
+        return error
+
+
+def _composed(
+    search: Search,
+    corrected: tuple[CorrectedObservations, ...],
+    found: SearchResult,
+    rival: RivalAttitude | None,
+) -> Acquisition:
+    """The acquisition of a batch from what was found of its stars, with its warnings."""
+    batch, mission, prior = search.batch, search.mission, search.prior
+    in_zones = found.in_zones
     solved = found.refusal if in_zones is None else in_zones.solved
     solution = solved if isinstance(solved, AttitudeSolution) else None
     warnings = found.warnings + warnings_of_batch(batch, mission)
@@ -109,40 +235,35 @@ def acquire(
     return Acquisition(
         batch=batch,
         mission=mission,
-        choices=choices,
+        choices=search.choices,
         prior=prior,
         path=found.path,
-        run_catalog=run_catalog,
+        run_catalog=search.run_catalog,
         trackers=trackers,
         counts=outcome_counts(trackers),
         solution=solution,
         rival=rival,
         reason=solved if isinstance(solved, NoAttitude) else None,
         warnings=tuple(warnings),
-        timings_us=timer.us,
-        provenance=_provenance(sky, run_catalog, mission),
+        timings_us=search.timer.us,
+        provenance=_provenance(search.sky, search.run_catalog, mission),
     )
 
 
-def _measured(
-    batch: ObservationBatch,
-    mission: Mission,
-    choices: Choices,
-    sky: SkyModel,
-    solution: AttitudeSolution,
-) -> Acquisition:
+def _measured(batch: ObservationBatch, mission: Mission, sky: SkyModel) -> Acquisition:
     """The acquisition of an attitude that a tracker measured itself."""
+    assert batch.measurement is not None
     run_catalog = sky.run_catalog(mission, batch.time)
     return Acquisition(
         batch=batch,
         mission=mission,
-        choices=choices,
+        choices=choices_of(batch, mission),
         prior=None,
         path=Path.MEASURED,
         run_catalog=run_catalog,
         trackers=(),
         counts=outcome_counts(()),
-        solution=solution,
+        solution=measured_solution(batch.measurement, mission),
         rival=None,
         reason=None,
         warnings=(),

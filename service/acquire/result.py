@@ -20,7 +20,7 @@ from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.zones import SearchRegion, Zone, counts_within
+from service.sky.zones import SearchRegion
 from service.vectors import Vector
 
 TrackingState = Literal["acquiring", "tracking", "lost"]
@@ -30,18 +30,29 @@ _COUNTED = [
 ]
 
 
+class Place(Struct, frozen=True, eq=False, gc=False):
+    """Where the stars of a tracker were searched for, and whether that zone was cached.
+
+    `stars` and `pairs` are those within the region, the paper's NCAP and NTOT; the zone, from the
+    cache, may hold more.
+    """
+
+    region: SearchRegion
+    cached: bool
+    stars: int
+    pairs: int
+
+
 class TrackerResult(Struct, frozen=True, eq=False, gc=False):
     """One tracker's part: where its stars were looked for, and what was found.
 
-    `stars` and `pairs` are those within the region, the paper's NCAP and NTOT;
-    `zone`, from the cache, may hold more.  Region and zone are None where the
-    whole sky gave no attitude to search about.  `residual_arcsec` is NaN for
+    `stars`, `pairs` and `zone_cached` are as in `Place`.  The region is None where
+    the whole sky gave no attitude to search about.  `residual_arcsec` is NaN for
     stars that are not unique and where there is no attitude.
     """
 
     corrected: CorrectedObservations
     region: SearchRegion | None
-    zone: Zone | None
     zone_cached: bool
     stars: int
     pairs: int
@@ -128,23 +139,19 @@ class Acquisition(Struct, frozen=True, eq=False, gc=False):
 
 def tracker_results(
     corrected: Sequence[CorrectedObservations],
-    places: Sequence[tuple[SearchRegion, Zone, bool]],
+    places: Sequence[Place],
     identifications: Sequence[Identification],
     solution: AttitudeSolution | None,
 ) -> tuple[TrackerResult, ...]:
     """The results of the trackers, whose zones and identifications are in the same order."""
     results = []
     first = 0
-    for each, (region, zone, cached), identification in zip(
-        corrected, places, identifications, strict=True
-    ):
+    for each, place, identification in zip(corrected, places, identifications, strict=True):
         n = len(each.magnitude_mag)
         residual = not_known(n) if solution is None else solution.residual_arcsec[first : first + n]
         first += n
-        stars, pairs = counts_within(zone, region)
-        results.append(
-            TrackerResult(each, region, zone, cached, stars, pairs, identification, residual)
-        )
+        where = place.region, place.cached, place.stars, place.pairs
+        results.append(TrackerResult(each, *where, identification, residual))
     return tuple(results)
 
 
@@ -152,7 +159,7 @@ def unmatched_results(corrected: Sequence[CorrectedObservations]) -> tuple[Track
     """The results of trackers whose stars could not be searched for: all are unmatched."""
     counts = [len(each.magnitude_mag) for each in corrected]
     return tuple(
-        TrackerResult(each, None, None, False, 0, 0, nothing_known(n), not_known(n))
+        TrackerResult(each, None, False, 0, 0, nothing_known(n), not_known(n))
         for each, n in zip(corrected, counts, strict=True)
     )
 

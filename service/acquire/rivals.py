@@ -11,7 +11,8 @@ import numpy as np
 from msgspec.structs import replace
 
 from service.acquire.result import RivalAttitude
-from service.acquire.search import Search, SearchResult
+from service.acquire.search import SearchResult, find
+from service.acquire.zone_search import Search, ZoneResult, ZoneSearch
 from service.attitude.solution import AttitudeSolution
 from service.identify.hypotheses.groups import (
     Mask,
@@ -22,8 +23,7 @@ from service.identify.hypotheses.groups import (
     part_of,
     shared,
 )
-from service.missions.identifiers import IDENTIFIERS
-from service.observations.calibrate import CorrectedObservations
+from service.observations.calibrate import CorrectedColumns, CorrectedObservations
 from service.vectors import attitude_error_arcsec, read_only
 
 FEWEST_NAMED = 2
@@ -33,18 +33,17 @@ DIFFERENT_CHI_SQUARE = 30.0
 
 
 def find_groups(
-    search: Search, corrected: tuple[CorrectedObservations, ...]
+    search: Search, corrected: tuple[CorrectedObservations, ...], first_found: ZoneResult | None
 ) -> tuple[SearchResult, RivalAttitude | None]:
     """Identify the stars; where two groups have each an attitude, the lighter is the rival.
 
     The stars that the answer leaves unexplained are acquired by themselves, the
     same way.  Where nothing good was found for all, so are those of the
     likeliest hypothesis: two groups of like weight leave every star ambiguous.
+    `first_found` is what was found of all about the a priori attitude, if that was searched.
     """
-    found = search.find(corrected)
-    if not IDENTIFIERS[search.choices.identifier].weighs_hypotheses or not any(
-        mask.any() for mask in found.explained
-    ):
+    found = find(search, corrected, first_found)
+    if not search.identifier.weighs_hypotheses or not any(mask.any() for mask in found.explained):
         return found, None
     other = _group(search, corrected, [~mask for mask in found.explained])
     if other is None:
@@ -82,7 +81,7 @@ def _group(
     """
     if not may_be_a_group(masks):
         return None
-    found = search.find(part_of(corrected, masks))
+    found = find(search, part_of(corrected, masks))
     if found.in_zones is None or not isinstance(found.in_zones.solved, AttitudeSolution):
         return None
     has_attitude = any(int(mask.sum()) >= FEWEST_NAMED for mask in found.unique)
@@ -127,12 +126,15 @@ def _log_weight(
     in_zones = found.in_zones
     assert in_zones is not None
     prior = in_zones.prior if search.prior is None else search.prior
+    regions = [place.region for place in in_zones.places]
+    zones = ZoneSearch(CorrectedColumns.of(corrected))
+    zones.add(0, search, prior, regions=regions)
     return sum(
         log_weight_of_group(
-            search.sighting(each, prior, region, zone), identification.star, search.run_catalog
+            zones.seen, s, search.zone(region)[0], identification.star, search.run_catalog
         )
-        for each, (region, zone, _), identification in zip(
-            corrected, in_zones.places, in_zones.identifications, strict=True
+        for s, (region, identification) in enumerate(
+            zip(regions, in_zones.identifications, strict=True)
         )
     )
 

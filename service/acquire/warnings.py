@@ -8,8 +8,8 @@ from service.acquire.choices import idle_options, impossible_tests
 from service.acquire.result import RivalAttitude, TrackerResult
 from service.attitude.solution import AttitudeSolution
 from service.attitude.solve import taste_bound
+from service.identify.identification import MAX_RIVALS
 from service.identify.prior_attitude import PriorAttitude
-from service.identify.voting.starid import MAX_RIVALS
 from service.missions.mission import Band, Mission
 from service.observations.batch import ObservationBatch
 from service.vectors import Matrix, attitude_error_arcsec, separation_deg, unit_of

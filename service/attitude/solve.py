@@ -10,6 +10,7 @@ from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
+from msgspec.structs import replace
 
 from service.attitude.kernels import QUEST, TASTE, TRIAD, FitWorkspace, fit_attitude
 from service.attitude.solution import AttitudeSolution, NoAttitude, TrackerFit
@@ -47,10 +48,11 @@ def solve_attitude(
     chosen = METHODS.index(method)
     if not fit_attitude(observed, reference, sigma_rad, WORST_AXIS_RAD, chosen, workspace):
         return NoAttitude.DEGENERATE_GEOMETRY
-    fits: tuple[TrackerFit, ...] = ()
+    solution = solution_of(workspace, n, method)
     if len(trackers) > 1:
-        fits = tracker_fits(observed, reference, sigma_rad, workspace, tracker_of, trackers)
-    return solution_of(workspace, n, method, fits)
+        fits = tracker_fits(observed, reference, sigma_rad, solution, tracker_of, trackers)
+        solution = replace(solution, trackers=fits)
+    return solution
 
 
 def fit_workspace(n: int) -> FitWorkspace:
@@ -64,9 +66,7 @@ def fit_workspace(n: int) -> FitWorkspace:
     )
 
 
-def solution_of(
-    workspace: FitWorkspace, matched: int, method: str, fits: tuple[TrackerFit, ...] = ()
-) -> AttitudeSolution:
+def solution_of(workspace: FitWorkspace, matched: int, method: str) -> AttitudeSolution:
     """The solution that `fit_attitude` wrote, of so many matched vectors; its arrays are locked."""
     rms_arcsec, predicted_arcsec, taste, apart_arcsec = workspace.figures.tolist()
     freedom = 2 * matched - 3
@@ -87,7 +87,7 @@ def solution_of(
         triad=quaternions[TRIAD],
         quest=quaternions[QUEST],
         triad_quest_angle_arcsec=apart_arcsec,
-        trackers=fits,
+        trackers=(),
     )
 
 
@@ -125,20 +125,16 @@ def tracker_fits(
     observed: Vector,
     reference: Vector,
     sigma_rad: Vector,
-    workspace: FitWorkspace,
+    solution: AttitudeSolution,
     tracker_of: npt.NDArray[np.int64],
     trackers: tuple[str, ...],
 ) -> tuple[TrackerFit, ...]:
-    """Each tracker's share of TASTE, and whether it is the one that does not agree.
-
-    The workspace is as `fit_attitude` wrote it.
-    """
-    quest = matrix_from_quaternion(workspace.quaternions[QUEST])
+    """Each tracker's share of TASTE, and whether it is the one that does not agree."""
+    quest = matrix_from_quaternion(solution.quest)
     weighted = np.sum((observed - reference @ quest.T) ** 2, axis=1) / sigma_rad**2
     stars = np.bincount(tracker_of, minlength=len(trackers))
     taste = np.bincount(tracker_of, weights=weighted, minlength=len(trackers))
-    suspect = float(workspace.figures[TASTE]) > taste_bound(2 * len(observed) - 3)
-    outlier = _outlier(observed, reference, sigma_rad, tracker_of) if suspect else -1
+    outlier = _outlier(observed, reference, sigma_rad, tracker_of) if solution.suspect else -1
     return tuple(
         TrackerFit(name, int(stars[i]), float(taste[i]), i == outlier)
         for i, name in enumerate(trackers)

@@ -1,16 +1,18 @@
 """From identified stars to what an attitude is solved from: pairs of vectors, in one pass."""
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
-from service.attitude.kernels import FitWorkspace, fit_attitude
+from service.attitude.kernels import TASTE, FitWorkspace, fit_attitude
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.attitude.solve import (
     METHODS,
     WORST_AXIS_RAD,
-    fit_workspace,
     solution_of,
+    taste_bound,
     tracker_fits,
 )
 from service.compiled.jit import njit, njit_no_refcount
@@ -38,23 +40,100 @@ def attitude_of(
     solution's residuals have one row an observed star, NaN for those without an
     identity.
     """
-    given = direction_body, sigma_rad, star, catalog_direction, velocity_c, sun_distance_au
-    workspace = fit_workspace(len(star))
-    matched = _match_and_fit(*given, WORST_AXIS_RAD, METHODS.index(method), workspace)
-    if matched < 0:
-        return NoAttitude.DEGENERATE_GEOMETRY
-    if matched < 2:
-        return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
-    if tracker_of is None:
-        return solution_of(workspace, matched, method)
-    observed, reference, sigma = matched_vectors(*given)
+    fits = room_for_fits(1, len(star))
+    fit_sightings(
+        *(
+            np.zeros(1, np.int64),
+            np.array((0, len(star))),
+            np.array(direction_body),
+            np.array(sigma_rad),
+        ),
+        *(np.array(star), catalog_direction, np.array((velocity_c,)), np.array((sun_distance_au,))),
+        *(WORST_AXIS_RAD, METHODS.index(method), fits),
+    )
+    found = fits.of_batch(0, 0, len(star), method)
+    if tracker_of is None or len(trackers) < 2 or isinstance(found, NoAttitude):
+        return found
+    seen = direction_body, sigma_rad, star, catalog_direction, velocity_c, sun_distance_au
+    return with_tracker_fits(found, *seen, tracker_of, trackers)
+
+
+def with_tracker_fits(
+    solution: AttitudeSolution,
+    direction_body: Vector,
+    sigma_rad: Vector,
+    star: Integers,
+    catalog_direction: Vector,
+    velocity_c: Vector,
+    sun_distance_au: float,
+    tracker_of: Integers,
+    trackers: tuple[str, ...],
+) -> AttitudeSolution:
+    """The solution of stars of several trackers, with how those of each agree with it."""
+    observed, reference, sigma = matched_vectors(
+        direction_body, sigma_rad, star, catalog_direction, velocity_c, sun_distance_au
+    )
     used = tracker_of[star >= 0]
-    fits = tracker_fits(observed, reference, sigma, workspace, used, trackers)
-    return solution_of(workspace, matched, method, fits)
+    fits = tracker_fits(observed, reference, sigma, solution, used, trackers)
+    return replace(solution, trackers=fits)
+
+
+class FitColumns(NamedTuple):
+    """The attitudes of n batches with m stars in all, as kernels write them.
+
+    `matched` (n,) is how many stars of a batch have an identity, or -1 where they are enough and
+    yet give no attitude.  The others are those of `FitWorkspace`, by batch (n, ...) and by star,
+    and hold nothing where there is no attitude: `residual_arcsec` (m,) is NaN for stars without
+    an identity.
+    """
+
+    matched: Any
+    quaternions: Any
+    attitude: Any
+    covariance_arcsec2: Any
+    residual_arcsec: Any
+    figures: Any
+
+    def is_good(self, row: int) -> bool:
+        """Whether a batch has an attitude that its residuals do not speak against."""
+        matched = int(self.matched[row])
+        return matched >= 2 and bool(self.figures[row, TASTE] <= taste_bound(2 * matched - 3))
+
+    def of_batch(
+        self, row: int, first: int, last: int, method: str
+    ) -> AttitudeSolution | NoAttitude:
+        """The attitude of a batch, whose stars are rows from `first` to before `last`."""
+        matched = int(self.matched[row])
+        if matched < 0:
+            return NoAttitude.DEGENERATE_GEOMETRY
+        if matched < 2:
+            return NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS
+        of_one = FitWorkspace(
+            self.quaternions[row],
+            self.attitude[row],
+            self.covariance_arcsec2[row],
+            self.residual_arcsec[first:last],
+            self.figures[row],
+        )
+        return solution_of(of_one, matched, method)
+
+
+def room_for_fits(batches: int, stars: int) -> FitColumns:
+    """Columns for the attitudes of so many batches and stars."""
+    return FitColumns(
+        matched=np.zeros(batches, np.int64),
+        quaternions=np.empty((batches, 3, 4)),
+        attitude=np.empty((batches, 3, 3)),
+        covariance_arcsec2=np.empty((batches, 3, 3)),
+        residual_arcsec=np.empty(stars),
+        figures=np.empty((batches, 4)),
+    )
 
 
 @njit(error_model="numpy")
-def _match_and_fit(  # type: ignore[no-untyped-def]
+def fit_sightings(  # type: ignore[no-untyped-def]
+    which,
+    offsets,
     direction_body,
     sigma_rad,
     star,
@@ -63,31 +142,43 @@ def _match_and_fit(  # type: ignore[no-untyped-def]
     sun_distance_au,
     worst_rad,
     chosen,
-    workspace,
+    fits,
 ):
-    """How many stars are matched, or -1 where they are enough and yet give no attitude."""
-    observed, reference, sigma = matched_vectors(
-        direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
-    )
-    count = len(sigma)
-    if count < 2:
-        return count
-    of_matched = FitWorkspace(
-        workspace.quaternions,
-        workspace.attitude,
-        workspace.covariance_arcsec2,
-        np.empty(count),
-        workspace.figures,
-    )
-    if not fit_attitude(observed, reference, sigma, worst_rad, chosen, of_matched):
-        return -1
-    at = 0
-    for k in range(len(star)):
-        workspace.residual_arcsec[k] = math.nan
-        if star[k] >= 0:
-            workspace.residual_arcsec[k] = of_matched.residual_arcsec[at]
-            at += 1
-    return count
+    """The attitudes of those of n batches that `which` names, from the stars of all trackers.
+
+    The stars of batch i are rows from `offsets[i]` to before `offsets[i + 1]`; `velocity` (n, 3)
+    and `sun_distance_au` (n,) are by batch.  It keeps the interpreter's lock: where others wait
+    for that, it takes longer to get it back than to solve for some attitudes.
+    """
+    for i in which:
+        first, last = offsets[i], offsets[i + 1]
+        observed, reference, sigma = matched_vectors(
+            direction_body[first:last],
+            sigma_rad[first:last],
+            star[first:last],
+            catalog_direction,
+            velocity[i],
+            sun_distance_au[i],
+        )
+        fits.matched[i] = len(sigma)
+        if len(sigma) < 2:
+            continue
+        of_matched = FitWorkspace(
+            fits.quaternions[i],
+            fits.attitude[i],
+            fits.covariance_arcsec2[i],
+            np.empty(len(sigma)),
+            fits.figures[i],
+        )
+        if not fit_attitude(observed, reference, sigma, worst_rad, chosen, of_matched):
+            fits.matched[i] = -1
+            continue
+        at = 0
+        for k in range(first, last):
+            fits.residual_arcsec[k] = math.nan
+            if star[k] >= 0:
+                fits.residual_arcsec[k] = of_matched.residual_arcsec[at]
+                at += 1
 
 
 @njit(error_model="numpy")

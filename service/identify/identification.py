@@ -2,6 +2,7 @@
 
 from enum import IntEnum
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -10,6 +11,9 @@ from msgspec import Struct
 from service.vectors import Vector, read_only
 
 Integers = npt.NDArray[np.int64]
+
+MAX_RIVALS = 20
+"""The most rivals listed for a star; the identifiers look for one more, to tell a cut list."""
 
 
 class Outcome(IntEnum):
@@ -84,3 +88,74 @@ def nothing_known(n: int) -> Identification:
         rivals=((),) * n,
         probability=not_known(n),
     )
+
+
+class IdentifiedColumns(NamedTuple):
+    """The identifications of k sightings with m stars in all, as kernels write them.
+
+    Of each star, as in `Identification`: `outcome`, `star`, `votes`, `runner_up`, `probability`
+    and `hypothesis` (m,), and `rivals` and `rival_probability` (m, MAX_RIVALS + 1), whose rows
+    end with -1 in the place of a star.  Of each sighting: `bounded`, `mirrored`, `rivals_cut` and
+    `explained` (k,), how many stars the hypothesis explains.  Votes alone leave `probability`,
+    `rival_probability`, `hypothesis` and `explained` as they were.
+    """
+
+    outcome: Any
+    star: Any
+    votes: Any
+    runner_up: Any
+    probability: Any
+    hypothesis: Any
+    rivals: Any
+    rival_probability: Any
+    bounded: Any
+    mirrored: Any
+    rivals_cut: Any
+    explained: Any
+
+    def of_sighting(self, s: int, first: int, last: int, weighs: bool) -> Identification:
+        """The identification of a sighting, whose stars are rows from `first` to before `last`.
+
+        `weighs`: by hypotheses, not by votes.
+        """
+        n = last - first
+        rivals = _none(n)
+        likely: tuple[tuple[float, ...], ...] = _none(n) if weighs else ()
+        listed = self.rivals[first:last]
+        if (listed[:, 0] >= 0).any():
+            listed = listed[:, :MAX_RIVALS].tolist()
+            rivals = tuple(tuple(row for row in names if row >= 0) for names in listed)
+            if weighs:
+                chances = self.rival_probability[first:last].tolist()
+                likely = tuple(
+                    tuple(each[: len(names)]) for each, names in zip(chances, rivals, strict=True)
+                )
+        return Identification(
+            outcome=self.outcome[first:last],
+            star=self.star[first:last],
+            votes=self.votes[first:last],
+            runner_up=self.runner_up[first:last],
+            rivals=rivals,
+            probability=self.probability[first:last] if weighs else not_known(n),
+            rival_probability=likely,
+            rivals_cut=int(self.rivals_cut[s]),
+            bounded=bool(self.bounded[s]),
+            hypothesis=self.hypothesis[first:last] if weighs else None,
+            mirrored=bool(self.mirrored[s]),
+        )
+
+
+def room_for_identities(sightings: int, stars: int) -> IdentifiedColumns:
+    """Columns for so many sightings and stars."""
+    integers, counts = np.empty((5, stars), np.int64), np.zeros((2, sightings), np.int64)
+    outcome, star, votes, runner_up, hypothesis = integers
+    return IdentifiedColumns(
+        *(outcome, star, votes, runner_up, np.empty(stars), hypothesis),
+        *(np.empty((stars, MAX_RIVALS + 1), np.int64), np.empty((stars, MAX_RIVALS + 1))),
+        *(*np.zeros((2, sightings), np.bool_), *counts),
+    )
+
+
+@lru_cache(maxsize=256)
+def _none(n: int) -> tuple[tuple[Any, ...], ...]:
+    return ((),) * n

@@ -1,16 +1,20 @@
 """What an identifier is given: one tracker's stars, and where to search for them."""
 
 import math
-from functools import cached_property
 from typing import Any, NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 from msgspec import Struct, field
 
+from service.compiled.jit import njit
 from service.identify.budget import WorkBudget
 from service.missions.mission import Rules
 from service.sky.whole_sky.guide import Guide
 from service.sky.zones import SearchRegion, Zone
 from service.vectors import Vector, separation_deg
+
+Integers = npt.NDArray[np.int64]
 
 PRIOR_ROTATION, PRIOR_DIRECTION = 0, 1
 """Kinds of a priori knowledge: the whole attitude, or one direction with the roll unknown."""
@@ -50,7 +54,7 @@ class RegionBounds(NamedTuple):
     is_band: Any
 
 
-class Sighting(Struct, frozen=True, eq=False, dict=True):
+class Sighting(Struct, frozen=True, eq=False, gc=False):
     """One tracker's stars and where to search for them.
 
     `direction` (n, 3) is inertial through the presumed attitude; magnitudes may
@@ -74,34 +78,91 @@ class Sighting(Struct, frozen=True, eq=False, dict=True):
     guide: Guide | None = None
     budget: WorkBudget = field(default_factory=WorkBudget)
 
-    @cached_property
-    def arrays(self) -> SightedArrays:
-        """The stars as kernels take them."""
-        axis = self.known_axis
-        return SightedArrays(
-            self.direction,
-            self.magnitude_mag,
-            self.sigma_rad,
-            self.boresight,
-            self.velocity_c,
-            PRIOR_ROTATION if axis is None else PRIOR_DIRECTION,
-            self.region.axis if axis is None else axis,
-        )
 
-    @cached_property
-    def bounds(self) -> RegionBounds:
-        """The region as kernels take it."""
-        region, zone = self.region, self.zone
-        all_inside, is_band = zone.serves_exactly(region), region.kind == "band"
+class SightingColumns(NamedTuple):
+    """Many sightings of one mission, one after another: k with m stars in all.
+
+    | column | shape | |
+    |---|---|---|
+    | `offsets` | (k + 1,) | the stars of sighting s: from `offsets[s]` to before `offsets[s + 1]` |
+    | `direction` | (m, 3) | as in `SightedArrays`, and so the following |
+    | `magnitude`, `sigma_rad` | (m,) | |
+    | `boresight`, `velocity`, `prior_axis` | (k, 3) | |
+    | `prior_kind` | (k,) | |
+    | `axis` | (k, 3) | as in `RegionBounds`, and so the following |
+    | `least`, `most`, `off_axis`, `all_inside`, `is_band` | (k,) | |
+    | `left` | (k,) | units of work that are left; kernels subtract what they spend |
+    """
+
+    offsets: Any
+    direction: Any
+    magnitude: Any
+    sigma_rad: Any
+    boresight: Any
+    velocity: Any
+    prior_kind: Any
+    prior_axis: Any
+    axis: Any
+    least: Any
+    most: Any
+    off_axis: Any
+    all_inside: Any
+    is_band: Any
+    left: Any
+
+    def set_region(self, s: int, region: SearchRegion) -> None:
+        """Fill in the region of a sighting; how it lies in its zone is filled in by `set_zone`."""
+        self.axis[s], self.is_band[s] = region.axis, region.kind == "band"
+        self.least[s] = math.radians(region.least_deg)
+        self.most[s] = math.radians(region.most_deg)
+
+    def set_zone(self, s: int, region: SearchRegion, zone: Zone) -> None:
+        """Fill in how the region of a sighting lies in the zone that serves it."""
+        self.all_inside[s] = zone.serves_exactly(region)
         # Angles to the axis are kept in bands alone.
-        off_axis_deg = 0.0
-        if is_band and not all_inside:
-            off_axis_deg = separation_deg(zone.region.axis, region.axis)
-        return RegionBounds(
-            region.axis,
-            math.radians(region.least_deg),
-            math.radians(region.most_deg),
-            math.radians(off_axis_deg),
-            all_inside,
-            is_band,
-        )
+        if self.is_band[s] and not self.all_inside[s]:
+            self.off_axis[s] = math.radians(separation_deg(zone.region.axis, region.axis))
+
+
+def room_for_sightings(
+    offsets: Integers, sigma_rad: Vector, magnitude_mag: Vector
+) -> SightingColumns:
+    """Columns for the sightings of these stars; what is not given is to be filled in."""
+    k, m = len(offsets) - 1, len(sigma_rad)
+    boresight, velocity, prior_axis, axis = np.zeros((4, k, 3))
+    least, most, off_axis = np.zeros((3, k))
+    all_inside, is_band = np.zeros((2, k), np.bool_)
+    prior_kind, left = np.zeros((2, k), np.int64)
+    return SightingColumns(
+        *(offsets, np.empty((m, 3)), magnitude_mag, sigma_rad),
+        *(boresight, velocity, prior_kind, prior_axis),
+        *(axis, least, most, off_axis, all_inside, is_band, left),
+    )
+
+
+@njit(nogil=True)
+def sighted_at(columns, s):  # type: ignore[no-untyped-def]
+    """The stars of one of many sightings."""
+    first, last = columns.offsets[s], columns.offsets[s + 1]
+    return SightedArrays(
+        columns.direction[first:last],
+        columns.magnitude[first:last],
+        columns.sigma_rad[first:last],
+        columns.boresight[s],
+        columns.velocity[s],
+        columns.prior_kind[s],
+        columns.prior_axis[s],
+    )
+
+
+@njit(nogil=True)
+def bounds_at(columns, s):  # type: ignore[no-untyped-def]
+    """The region of one of many sightings."""
+    return RegionBounds(
+        columns.axis[s],
+        columns.least[s],
+        columns.most[s],
+        columns.off_axis[s],
+        columns.all_inside[s],
+        columns.is_band[s],
+    )

@@ -49,11 +49,7 @@ Require = Callable[[], object]
 
 def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
     """The results of some lines, computed in a worker."""
-    return line_results(
-        lines,
-        lambda fresh: [solver.solve_one_of_many(each) for each in fresh],
-        solver.asks_for_last,
-    )
+    return line_results(lines, solver.solve_many, solver.asks_for_last)
 
 
 INTERACTIVE_WINDOW_S = 0.5

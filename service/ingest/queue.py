@@ -91,16 +91,19 @@ class IngestQueue:
     def __init__(
         self,
         look_up: Callable[[Sequence[PendingBatch]], Sequence[Found]],
-        solve: Callable[[PendingBatch, bool], UnsavedResult],
+        solve: Callable[[PendingBatch], UnsavedResult],
+        solve_at_once: Callable[[Sequence[PendingBatch]], Sequence[UnsavedResult | Exception]],
         recorded: Callable[[UnsavedResult, WriteOutcome], object],
         writer: Writer,
         pool: SolverPool,
     ) -> None:
         """`look_up` answers what is recorded; `recorded` is told of each outcome of a write.
 
-        `solve` is told, too, whether it may wait; if not it raises `NotAtHand` for what takes long.
+        `solve_at_once` gives the error where a batch has no result, `NotAtHand` of one that takes
+        long.
         """
-        self._look_up, self._solve, self._told = look_up, solve, recorded
+        self._look_up, self._told = look_up, recorded
+        self._solve, self._solve_at_once = solve, solve_at_once
         self._writer, self._pool = writer, pool
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
@@ -178,10 +181,11 @@ class IngestQueue:
                 job.change = each
                 to_write.append(job)
         self._settle(known)
-        return [job for job in to_write if job.change is not None or self._is_computed(job)]
+        self._compute([job for job in to_write if job.change is None and self._is_for_now(job)])
+        return [job for job in to_write if job.change is not None or job.unsaved_results]
 
-    def _is_computed(self, job: QueuedJob) -> bool:
-        """Whether the result is there now; otherwise it comes later, or the batch is answered."""
+    def _is_for_now(self, job: QueuedJob) -> bool:
+        """Whether a batch is to be computed now; otherwise later, or one like it is already."""
         pending: PendingBatch = job.post
         with self._lock:
             repeats = self._in_flight.get(pending.identity)
@@ -195,17 +199,26 @@ class IngestQueue:
         if pending.is_long or sequence is not None:
             self._start(pending)
             return False
+        return True
+
+    def _compute(self, jobs: Sequence[QueuedJob]) -> None:
+        """Compute batches together; those that take long go to the pool."""
+        several: Sequence[UnsavedResult | Exception]
         try:
-            pending.unsaved = self._solve(pending, False)
-        except NotAtHand:
-            self._start(pending)
+            several = self._solve_at_once([job.post for job in jobs])
         except Exception as error:
-            # It concerns this batch alone, and its client gets it.
-            self._finish([(pending, error)])
-        else:
-            job.unsaved_results = [pending.unsaved]
-            return True
-        return False
+            log.exception("batches that waited together failed")
+            several = [error] * len(jobs)
+        for job, found in zip(jobs, several, strict=True):
+            pending: PendingBatch = job.post
+            if isinstance(found, NotAtHand):
+                self._start(pending)
+            elif isinstance(found, Exception):
+                # It concerns this batch alone, and its client gets it.
+                self._finish([(pending, found)])
+            else:
+                pending.unsaved = found
+                job.unsaved_results = [found]
 
     def _start(self, pending: PendingBatch) -> None:
         """Queue a batch for the pool."""
@@ -223,7 +236,7 @@ class IngestQueue:
 
     def _solve_and_record(self, pending: PendingBatch) -> None:
         try:
-            pending.unsaved = self._solve(pending, True)
+            pending.unsaved = self._solve(pending)
             settle = partial(self._note_written, pending)
             self._writer.put(QueuedJob(settle, [pending.unsaved]))
         except BeingBuilt:

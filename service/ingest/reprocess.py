@@ -287,7 +287,16 @@ class _WorkerTask:
 
 def process_again(solver: Solver, part: _WorkerTask) -> list[UnsavedResult | RefusedBatch]:
     """The unsaved results of stored batches in a run, with what cannot be taken."""
-    return [_again(solver, part.run, *each) for each in part.stored]
+    submissions = [submission_again(*each, part.run) for each in part.stored]
+    received = utc_now()
+    found: list[UnsavedResult | RefusedBatch] = []
+    several = solver.acquired([each.batch for each in submissions])
+    for submission, acquired in zip(submissions, several, strict=True):
+        try:
+            found.append(solver.unsaved(submission, acquired, received))
+        except AcquisitionError as error:
+            found.append(RefusedBatch(submission.batch.batch, str(error)))
+    return found
 
 
 def submission_again(input: str, options: str, run: str) -> Submission:
@@ -296,14 +305,6 @@ def submission_again(input: str, options: str, run: str) -> Submission:
         update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
     )
     return submission_from_model(model)
-
-
-def _again(solver: Solver, run: str, input: str, options: str) -> UnsavedResult | RefusedBatch:
-    submission = submission_again(input, options, run)
-    try:
-        return solver.solve(submission)
-    except AcquisitionError as error:
-        return RefusedBatch(submission.batch.batch, str(error))
 
 
 class _ChunkSolver:

@@ -5,12 +5,12 @@ import os
 import threading
 import time
 from collections import OrderedDict, deque
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
-from service.acquire import Acquisition, acquire, acquire_at_once
+from service.acquire import Acquisition, acquire, acquired
 from service.errors import (
     AcquisitionError,
     BadBatch,
@@ -51,15 +51,32 @@ class Solver:
         self.sky = sky
         self.ids = Ulids()
 
-    def acquire(
-        self, batch: ObservationBatch, mission: Mission | None = None, *, may_wait: bool = True
-    ) -> Acquisition:
-        """The acquisition of a batch, with other settings than its mission's where given.
-
-        Where it may not wait it raises `NotAtHand` for what takes long.
-        """
+    def acquire(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
+        """The acquisition of a batch, with other settings than its mission's where given."""
         mission = mission or mission_in_input(self.missions, batch.spacecraft)
-        return (acquire if may_wait else acquire_at_once)(batch, mission, self.sky)
+        return acquire(batch, mission, self.sky)
+
+    def acquired(
+        self, batches: Sequence[ObservationBatch], *, at_once: bool = False
+    ) -> list[Acquisition | Exception]:
+        """The acquisition of each of some batches, or what keeps that one from having one.
+
+        `at_once`: what takes long has `NotAtHand`.
+        """
+        found: dict[int, Acquisition | Exception] = {}
+        together: dict[str, list[int]] = {}
+        for place, batch in enumerate(batches):
+            together.setdefault(batch.spacecraft, []).append(place)
+        for spacecraft, places in together.items():
+            try:
+                mission = mission_in_input(self.missions, spacecraft)
+            except BadBatch as error:
+                found |= dict.fromkeys(places, error)
+                continue
+            own = [batches[place] for place in places]
+            several = acquired(own, mission, self.sky, at_once=at_once)
+            found |= dict(zip(places, several, strict=True))
+        return [found[place] for place in range(len(batches))]
 
     def asks_for_last(self, batch: ObservationBatch) -> bool:
         """Whether the attitude of a batch is to be predicted from the record first.
@@ -73,23 +90,43 @@ class Solver:
         submission: Submission,
         received: Utc | None = None,
         key: OwnKey | None = None,
-        *,
-        may_wait: bool = True,
     ) -> UnsavedResult:
-        """The result of a submission; raises `BadBatch` for what does not fit its mission.
-
-        Where it may not wait it raises `NotAtHand`, see `acquire`.
-        """
+        """The result of a submission; raises `BadBatch` for what does not fit its mission."""
         received = received or utc_now()
-        acquisition = self.acquire(submission.batch, may_wait=may_wait)
-        return unsaved_submission(
-            submission, acquisition, id=self.ids.new(), received=received, key=key
-        )
+        return self.unsaved(submission, self.acquire(submission.batch), received, key)
+
+    def unsaved(
+        self,
+        submission: Submission,
+        found: Acquisition | Exception,
+        received: Utc,
+        key: OwnKey | None = None,
+    ) -> UnsavedResult:
+        """The result of a submission of which this was found; raises what kept it from that."""
+        if isinstance(found, Exception):
+            raise found
+        return unsaved_submission(submission, found, id=self.ids.new(), received=received, key=key)
+
+    def solve_many(
+        self, submissions: Sequence[Submission]
+    ) -> list[UnsavedResult | AcquisitionError]:
+        """The result of each submission, or what is wrong with that one alone."""
+        received = utc_now()
+        several = self.acquired([each.batch for each in submissions])
+        return [
+            self._one_of_many(submission, partial(self.unsaved, submission, found, received))
+            for submission, found in zip(submissions, several, strict=True)
+        ]
 
     def solve_one_of_many(self, submission: Submission) -> UnsavedResult | AcquisitionError:
         """The result of a submission, or what is wrong with that one alone."""
+        return self._one_of_many(submission, partial(self.solve, submission))
+
+    def _one_of_many(
+        self, submission: Submission, solve: Callable[[], UnsavedResult]
+    ) -> UnsavedResult | AcquisitionError:
         try:
-            return self.solve(submission)
+            return solve()
         except Busy:
             # Nothing is decided about the batch: the whole chunk may come again.
             raise

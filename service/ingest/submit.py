@@ -71,7 +71,8 @@ class SubmissionService:
         self.solver = Solver(missions, replace(sky, builder=self.pool.builder))
         self._store = store
         self._queue = IngestQueue(
-            self._recorded_before, self._solve, self._tell, store.writer, self.pool
+            *(self._recorded_before, self._solve, self._solve_at_once, self._tell),
+            *(store.writer, self.pool),
         )
         self._single_s = -float("inf")
         self.observers: list[Observer] = []
@@ -314,7 +315,28 @@ class SubmissionService:
 
     # ---- steps of the queue ------------------------------------------------------------------
 
-    def _solve(self, pending: PendingBatch, may_wait: bool) -> UnsavedResult:
+    def _solve_at_once(self, group: Sequence[PendingBatch]) -> list[UnsavedResult | Exception]:
+        """The results of batches that wait together; `NotAtHand` of one that takes long."""
+        found: dict[int, UnsavedResult | Exception] = {}
+        submissions: dict[int, Submission] = {}
+        for place, pending in enumerate(group):
+            try:
+                submissions[place] = pending.make()
+            except Exception as error:
+                found[place] = error
+        several = self.solver.acquired([e.batch for e in submissions.values()], at_once=True)
+        for (place, submission), acquired in zip(submissions.items(), several, strict=True):
+            pending = group[place]
+            try:
+                unsaved = self.solver.unsaved(submission, acquired, pending.received, pending.key)
+            except Exception as error:
+                found[place] = error
+            else:
+                note_handed_over([unsaved])
+                found[place] = unsaved
+        return [found[place] for place in range(len(group))]
+
+    def _solve(self, pending: PendingBatch) -> UnsavedResult:
         submission = pending.make()
         is_outdated: Callable[[Connection], bool] | None = None
         if self.solver.asks_for_last(batch := submission.batch):
@@ -328,7 +350,7 @@ class SubmissionService:
                     def is_outdated(connection: Connection) -> bool:
                         return last_results(connection, batch, mission) != last
 
-        unsaved = self.solver.solve(submission, pending.received, pending.key, may_wait=may_wait)
+        unsaved = self.solver.solve(submission, pending.received, pending.key)
         unsaved.is_outdated = is_outdated
         note_handed_over([unsaved])
         return unsaved

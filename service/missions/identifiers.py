@@ -17,12 +17,14 @@ from typing import Any
 class IdentifierEntry:
     """One identifier: its name, its function, and what the pipeline needs to know of it.
 
-    `function` takes a `Sighting` and returns an `Identification`.
+    `function` takes a `Sighting` and returns an `Identification`; with `by_columns` it takes many
+    sightings, and writes what it finds, as `identify_by_votes` does.
     """
 
     name: str
-    function: str | Callable[[Any], Any]
+    function: str | Callable[..., Any]
     description: str
+    by_columns: bool = False
     weighs_hypotheses: bool = False
     """It tells the likeliest hypothesis, so that two groups of stars can be told apart."""
     uses_prior: bool = True
@@ -38,7 +40,7 @@ class IdentifierEntry:
     """
 
     @cached_property
-    def identify(self) -> Callable[[Any], Any]:
+    def identify(self) -> Callable[..., Any]:
         """The function itself."""
         function = self.function
         return resolve_name(function) if isinstance(function, str) else function
@@ -68,6 +70,7 @@ register(
         "starid",
         "service.identify.voting.starid:identify_by_votes",
         "the votes of star pairs, Fink & Shoup's steps 1 to 10",
+        by_columns=True,
     )
 )
 register(
@@ -75,6 +78,7 @@ register(
         "verified",
         "service.identify.hypotheses.verified:identify_verified",
         "a probability for every star, from weighed hypotheses of all of them",
+        by_columns=True,
         weighs_hypotheses=True,
         falls_back=True,
         uses=frozenset({"pair_separation_max_deg"}),
@@ -94,6 +98,7 @@ register(
         "lost_in_space",
         "service.identify.hypotheses.verified:identify_verified",
         "as verified, about an attitude that is found in the whole sky",
+        by_columns=True,
         weighs_hypotheses=True,
         uses_prior=False,
         uses=frozenset({"pair_separation_max_deg"}),

@@ -6,18 +6,20 @@ touched here: observed vectors are never changed for it.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from service.compiled.jit import njit
+from service.compiled.jit import njit, njit_no_refcount
 from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission, Tracker
-from service.observations.batch import ObservationBatch, TrackerStars
+from service.observations.batch import ObservationBatch
+from service.observations.columns import BatchColumns, Integers, joined, offsets_of
 from service.observations.focal_plane import tracker_vectors
 from service.observations.scans.reduce import reduced
-from service.vectors import ARCSEC_PER_RADIAN, Vector, locked, read_only
+from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 
 
 class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
@@ -36,6 +38,58 @@ class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
     outside_field_of_view: npt.NDArray[np.bool_]
 
 
+class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
+    """The stars of n batches of t trackers as `CorrectedObservations` has those of one tracker.
+
+    Offsets are those of `BatchColumns`; `trackers` (t,) is None where the stars are not filled in.
+    The other columns, by star, are the fields of `CorrectedObservations`.
+    """
+
+    tracker_offsets: Integers
+    trackers: Sequence[Tracker | None]
+    star_offsets: Integers
+    direction_body: Vector
+    magnitude_mag: Vector
+    sigma_arcsec: Vector
+    sigma_rad: Vector
+    outside_field_of_view: npt.NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, corrected: Sequence[CorrectedObservations]) -> "CorrectedColumns":
+        """The columns of one batch."""
+        return cls(
+            tracker_offsets=np.array((0, len(corrected))),
+            trackers=[each.tracker for each in corrected],
+            star_offsets=offsets_of([len(each.sigma_rad) for each in corrected]),
+            direction_body=joined([each.direction_body for each in corrected], 3),
+            magnitude_mag=joined([each.magnitude_mag for each in corrected]),
+            sigma_arcsec=joined([each.sigma_arcsec for each in corrected]),
+            sigma_rad=joined([each.sigma_rad for each in corrected]),
+            outside_field_of_view=np.concatenate([e.outside_field_of_view for e in corrected]),
+        )
+
+    def trackers_of(self, row: int) -> range:
+        """The rows of a batch's trackers."""
+        return range(*self.tracker_offsets[row : row + 2].tolist())
+
+    def of_batch(self, row: int) -> tuple[CorrectedObservations, ...]:
+        """The stars of each tracker of a batch."""
+        return tuple(self._of_tracker(t) for t in self.trackers_of(row))
+
+    def _of_tracker(self, t: int) -> CorrectedObservations:
+        first, last = self.star_offsets[t : t + 2].tolist()
+        tracker = self.trackers[t]
+        assert tracker is not None
+        return CorrectedObservations(
+            tracker,
+            read_only(self.direction_body[first:last]),
+            read_only(self.magnitude_mag[first:last]),
+            read_only(self.sigma_arcsec[first:last]),
+            self.sigma_rad[first:last],
+            self.outside_field_of_view[first:last],
+        )
+
+
 def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObservations, ...]:
     """Every tracker's stars as body vectors at the epoch.
 
@@ -43,106 +97,128 @@ def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObserva
     `reduced` does.
     """
     batch = reduced(batch, mission)
-    return tuple(
-        _corrected(
-            stars,
-            mission.tracker(stars.tracker, f"observations.{index}.tracker"),
-            batch.body_rates_deg_per_s,
+    return correct_columns(BatchColumns.of([batch]), trackers_of(batch, mission)).of_batch(0)
+
+
+def trackers_of(batch: ObservationBatch, mission: Mission) -> list[Tracker]:
+    """The trackers of a batch; raises `BadInput` naming a field whose tracker there is not."""
+    return [
+        mission.tracker(each.tracker, f"observations.{index}.tracker")
+        for index, each in enumerate(batch.observations)
+    ]
+
+
+def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -> CorrectedColumns:
+    """The stars of many batches as body vectors at the epochs of the batches.
+
+    `trackers` are those of `batches.tracker`; the stars of a tracker that is None are left out.
+    """
+    m = len(batches.magnitude_mag)
+    found = CorrectedColumns(
+        tracker_offsets=batches.tracker_offsets,
+        trackers=trackers,
+        star_offsets=batches.star_offsets,
+        direction_body=np.empty((m, 3)),
+        magnitude_mag=np.empty(m),
+        sigma_arcsec=np.empty(m),
+        sigma_rad=np.empty(m),
+        outside_field_of_view=np.empty(m, np.bool_),
+    )
+    different = {each.name: each for each in trackers if each is not None}
+    place_of = {name: place for place, name in enumerate(different)}
+    places = np.array([-1 if each is None else place_of[each.name] for each in trackers])
+    direction = batches.vector
+    for place, tracker in enumerate(different.values()):
+        rows = place, places, batches.tracker_offsets, batches.star_offsets
+        settings = (
+            tracker.body_from_tracker,
+            tracker.least_cosine,
+            tracker.sigma_arcsec,
+            tracker.magnitudes.zero_mag,
+            tracker.magnitudes.scale,
         )
-        for index, stars in enumerate(batch.observations)
-    )
-
-
-def _corrected(
-    stars: TrackerStars, tracker: Tracker, rates_deg_per_s: Vector
-) -> CorrectedObservations:
-    n = len(stars.vector)
-    body, sigma, outside = np.empty((n, 3)), np.empty((2, n)), np.empty(n, np.bool_)
-    # The same for every tracker and batch, so that they are compiled once.
-    given = (
-        tracker.body_from_tracker,
-        tracker.least_cosine,
-        tracker.sigma_arcsec,
-        rates_deg_per_s,
-        stars.time_offset_s,
-        stars.sigma_arcsec,
-        body,
-        sigma,
-        outside,
-    )
-    if not _to_body(stars.vector, *given):
-        from_angles = tracker_vectors(stars.angles_deg, tracker.calibration)
-        direction = np.where(np.isnan(stars.vector), from_angles, stars.vector)
-        _to_body(read_only(direction), *given)
-    return CorrectedObservations(
-        tracker,
-        read_only(body),
-        true_magnitudes(stars.magnitude_mag, tracker.magnitudes),
-        read_only(sigma[0]),
-        sigma[1],
-        outside,
-    )
+        observed = (
+            batches.rates_deg_per_s,
+            batches.time_offset_s,
+            batches.sigma_arcsec,
+            batches.magnitude_mag,
+        )
+        written = (
+            found.direction_body,
+            found.magnitude_mag,
+            found.sigma_arcsec,
+            found.sigma_rad,
+            found.outside_field_of_view,
+        )
+        given = rows, settings, observed, written
+        if not _to_body(direction, *given):
+            unknown = np.isnan(direction)
+            if len(different) > 1:
+                unknown &= (places == place).repeat(np.diff(batches.star_offsets))[:, None]
+            from_angles = tracker_vectors(batches.angles_deg, tracker.calibration)
+            direction = np.where(unknown, from_angles, direction)
+            _to_body(direction, *given)
+    return found
 
 
 @njit
-def _to_body(  # type: ignore[no-untyped-def]
-    direction,  # (n, 3) in tracker axes
-    body_from_tracker,
-    least_cosine,  # of the angle to the boresight within the field of view
-    default_sigma,
-    rates_deg_per_s,
-    time_offset_s,
-    sigma,
-    body,  # (n, 3) in body axes
-    sigmas,  # (2, n) in arcsec and in radians
-    outside,  # (n,) of the field of view
-):
-    """Whether every direction is known; if so `body`, `sigmas` and `outside` are written.
+def _to_body(direction, rows, settings, observed, written):  # type: ignore[no-untyped-def]
+    """Whether every direction of a tracker's stars is known; if so they are carried to the body.
 
-    v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.
+    v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.  `direction` (m, 3) is
+    in tracker axes.
     """
-    rate = math.radians(
-        math.sqrt(rates_deg_per_s[0] ** 2 + rates_deg_per_s[1] ** 2 + rates_deg_per_s[2] ** 2)
-    )
-    x = y = z = 0.0
-    if rate > 0.0:
-        x, y, z = (
-            math.radians(rates_deg_per_s[0]) / rate,
-            math.radians(rates_deg_per_s[1]) / rate,
-            math.radians(rates_deg_per_s[2]) / rate,
-        )
-    for k in range(len(direction)):
-        if math.isnan(direction[k, 0]):
-            return False
-        outside[k] = direction[k, 2] < least_cosine
-        sigmas[0, k] = default_sigma if math.isnan(sigma[k]) else sigma[k]
-        sigmas[1, k] = sigmas[0, k] / ARCSEC_PER_RADIAN
-        for i in range(3):
-            body[k, i] = (
-                direction[k, 0] * body_from_tracker[i, 0]
-                + direction[k, 1] * body_from_tracker[i, 1]
-                + direction[k, 2] * body_from_tracker[i, 2]
+    # `place` is that of the tracker among `places` (t,).
+    place, places, tracker_offsets, star_offsets = rows
+    # `least_cosine` is of the angle to the boresight within the field of view.
+    body_from_tracker, least_cosine, default_sigma, zero_mag, magnitude_scale = settings
+    rates_deg_per_s, time_offset_s, sigma, magnitude = observed
+    # The true magnitude is as it would be if the tracker were as the run catalog assumes.
+    body, true_magnitude, sigma_arcsec, sigma_rad, outside = written
+    for i in range(len(tracker_offsets) - 1):
+        rates = rates_deg_per_s[i]
+        rate = math.radians(math.sqrt(rates[0] ** 2 + rates[1] ** 2 + rates[2] ** 2))
+        x = y = z = 0.0
+        if rate > 0.0:
+            x, y, z = (
+                math.radians(rates[0]) / rate,
+                math.radians(rates[1]) / rate,
+                math.radians(rates[2]) / rate,
             )
-        angle = rate * time_offset_s[k]
-        if angle == 0.0:
-            continue
-        u, v, w = body[k, 0], body[k, 1], body[k, 2]
-        once0, once1, once2 = y * w - z * v, z * u - x * w, x * v - y * u
-        half = math.sin(0.5 * angle)
-        sine, versine = math.sin(angle), 2.0 * half * half
-        body[k, 0] += sine * once0 + versine * (y * once2 - z * once1)
-        body[k, 1] += sine * once1 + versine * (z * once0 - x * once2)
-        body[k, 2] += sine * once2 + versine * (x * once1 - y * once0)
+        for s in range(tracker_offsets[i], tracker_offsets[i + 1]):
+            if places[s] != place:
+                continue
+            for k in range(star_offsets[s], star_offsets[s + 1]):
+                if math.isnan(direction[k, 0]):
+                    return False
+                outside[k] = direction[k, 2] < least_cosine
+                true_magnitude[k] = zero_mag + magnitude_scale * magnitude[k]
+                sigma_arcsec[k] = default_sigma if math.isnan(sigma[k]) else sigma[k]
+                sigma_rad[k] = sigma_arcsec[k] / ARCSEC_PER_RADIAN
+                for j in range(3):
+                    body[k, j] = (
+                        direction[k, 0] * body_from_tracker[j, 0]
+                        + direction[k, 1] * body_from_tracker[j, 1]
+                        + direction[k, 2] * body_from_tracker[j, 2]
+                    )
+                _turn(body[k], x, y, z, rate * time_offset_s[k])
     return True
 
 
-def true_magnitudes(measured_mag: Vector, settings: Magnitudes) -> Vector:
-    """The magnitudes (n,) that a tracker would measure if it were as the run catalog assumes."""
-    if settings.zero_mag == 0.0 and settings.scale == 1.0:
-        return locked(measured_mag)
-    return read_only(settings.zero_mag + settings.scale * measured_mag)
+@njit_no_refcount
+def _turn(vector, x, y, z, angle):  # type: ignore[no-untyped-def]
+    """Turn a vector (3,) about an axis of length one, in place."""
+    if angle == 0.0:
+        return
+    u, v, w = vector[0], vector[1], vector[2]
+    once0, once1, once2 = y * w - z * v, z * u - x * w, x * v - y * u
+    half = math.sin(0.5 * angle)
+    sine, versine = math.sin(angle), 2.0 * half * half
+    vector[0] += sine * once0 + versine * (y * once2 - z * once1)
+    vector[1] += sine * once1 + versine * (z * once0 - x * once2)
+    vector[2] += sine * once2 + versine * (x * once1 - y * once0)
 
 
 def measured_magnitudes(true_mag: Vector, settings: Magnitudes) -> Vector:
-    """`true_magnitudes` undone."""
+    """The magnitudes that a tracker measures of stars of these; `correct` undoes it."""
     return np.asarray((true_mag - settings.zero_mag) / settings.scale)

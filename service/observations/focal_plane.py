@@ -12,13 +12,11 @@ def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
     The direction is that of (tan h, tan v, 1), h and v being the true angles.
     """
     h, v = angles_deg[:, 0], angles_deg[:, 1]
-    true_h, true_v = (
-        calibration.scale * (measured + sum(c * h**i * v**j for i, j, c in terms))
-        for measured, terms in ((h, calibration.h_terms), (v, calibration.v_terms))
-    )
-    plane = np.stack(
-        [np.tan(np.radians(true_h)), np.tan(np.radians(true_v)), np.ones_like(h)], axis=1
-    )
+    plane = np.ones((len(h), 3))
+    for axis, terms in enumerate((calibration.h_terms, calibration.v_terms)):
+        bent = sum(c * h**i * v**j for i, j, c in terms)
+        true = calibration.scale * (angles_deg[:, axis] + bent)
+        plane[:, axis] = np.tan(np.radians(true))
     return unit(plane)
 
 

@@ -221,35 +221,50 @@ def _polar_angles(direction, axis, brighter, dimmer, polar, difference):  # type
 
 def counts_within(zone: Zone, region: SearchRegion) -> tuple[int, int]:
     """How many of a zone's stars and pairs lie within a region that it serves."""
-    if zone.grid_deg == 0.0:
-        return len(zone.star), zone.pairs.count
-    stars, pairs = _counts_within(
-        zone.direction,
-        region.axis,
-        math.radians(region.least_deg),
-        math.radians(region.most_deg),
-        zone.pairs.rows,
-    )
+    one, found = np.zeros(1, np.int64), np.empty((1, 2), np.int64)
+    least, most = math.radians(region.least_deg), math.radians(region.most_deg)
+    count_within(zone, one, np.array((region.axis,)), np.array((least,)), np.array((most,)), found)
+    stars, pairs = found[0].tolist()
     return stars, pairs
+
+
+def count_within(
+    zone: Zone,
+    which: npt.NDArray[np.int64],
+    axis: Vector,
+    least: Vector,
+    most: Vector,
+    found: npt.NDArray[np.int64],
+) -> None:
+    """`counts_within` for those of k regions that `which` names, into its rows of `found` (k, 2).
+
+    A region reaches from `least` to `most` (k,) radians from its `axis` (k, 3).
+    """
+    if zone.grid_deg == 0.0:
+        found[which] = len(zone.star), zone.pairs.count
+    else:
+        _count_within(which, axis, least, most, zone.direction, zone.pairs.rows, found)
 
 
 @njit
-def _counts_within(direction, axis, least, most, pair_rows):  # type: ignore[no-untyped-def]
+def _count_within(which, axes, leasts, mosts, direction, pair_rows, found):  # type: ignore[no-untyped-def]
     inside = np.empty(len(direction), np.uint8)
-    inner, outer = math.cos(least) if least > 0.0 else 2.0, math.cos(most)
-    stars = pairs = 0
-    for row in range(len(direction)):
-        r = direction[row]
-        cosine = r[0] * axis[0] + r[1] * axis[1] + r[2] * axis[2]
-        inside[row] = outer < cosine < inner
-        # The accurate angle decides about those near a bound alone.
-        if min(abs(cosine - inner), abs(cosine - outer)) <= _CLEAR:
-            inside[row] = least <= separation_rad(r, axis) <= most
-        stars += inside[row]
-    for k in range(pair_rows.shape[1]):
-        # Unsigned: a row that might be counted from the end takes as long to look at again.
-        pairs += inside[np.uint64(pair_rows[0, k])] & inside[np.uint64(pair_rows[1, k])]
-    return stars, pairs
+    for s in which:
+        axis, least, most = axes[s], leasts[s], mosts[s]
+        inner, outer = math.cos(least) if least > 0.0 else 2.0, math.cos(most)
+        stars = pairs = 0
+        for row in range(len(direction)):
+            r = direction[row]
+            cosine = r[0] * axis[0] + r[1] * axis[1] + r[2] * axis[2]
+            inside[row] = outer < cosine < inner
+            # The accurate angle decides about those near a bound alone.
+            if min(abs(cosine - inner), abs(cosine - outer)) <= _CLEAR:
+                inside[row] = least <= separation_rad(r, axis) <= most
+            stars += inside[row]
+        for k in range(pair_rows.shape[1]):
+            # Unsigned: a row that might be counted from the end takes as long to look at again.
+            pairs += inside[np.uint64(pair_rows[0, k])] & inside[np.uint64(pair_rows[1, k])]
+        found[s, 0], found[s, 1] = stars, pairs
 
 
 def zone_for(
@@ -264,9 +279,29 @@ def zone_for(
 ) -> tuple[Zone, bool]:
     """The zone that serves a search region, cached or built, and whether it was cached.
 
+    Without `wait` it is not built: raises `NotAtHand`.
+    """
+    key = zone_key(mission, run_catalog, region, separation_max_deg, grid_deg)
+
+    def build() -> Zone:
+        wide = SearchRegion(key.kind, np.array(key.axis), key.least_deg, key.most_deg)
+        served = wide if grid_deg > 0.0 else region
+        return build_zone(mission, run_catalog, served, separation_max_deg, grid_deg)
+
+    return cache.get(key, build, wait=wait)
+
+
+def zone_key(
+    mission: str,
+    run_catalog: RunCatalog,
+    region: SearchRegion,
+    separation_max_deg: float,
+    grid_deg: float,
+) -> ZoneKey:
+    """The key of the zone that serves a search region.
+
     With a grid the zone's axis is the nearest grid point and its bounds are
     grown by half the diagonal of a grid cell; grid 0 is the exact zone.
-    Without `wait` it is not built: raises `NotAtHand`.
     """
     x, y, z = region.axis.tolist()
     least_deg, most_deg = region.least_deg, region.most_deg
@@ -275,7 +310,7 @@ def zone_for(
         grown_by_deg = grid_deg / math.sqrt(2.0) + _ROUNDING_DEG
         least_deg = max(0.0, least_deg - grown_by_deg)
         most_deg = min(180.0, most_deg + grown_by_deg)
-    key = ZoneKey(
+    return ZoneKey(
         mission,
         run_catalog.digest,
         region.kind,
@@ -284,16 +319,6 @@ def zone_for(
         most_deg,
         separation_max_deg,
     )
-
-    def build() -> Zone:
-        wide = (
-            SearchRegion(region.kind, np.array([x, y, z]), least_deg, most_deg)
-            if grid_deg > 0.0
-            else region
-        )
-        return build_zone(mission, run_catalog, wide, separation_max_deg, grid_deg)
-
-    return cache.get(key, build, wait=wait)
 
 
 def snapped(x: float, y: float, z: float, grid_deg: float) -> tuple[float, float, float]:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
-from service.acquire import acquire
+from service.acquire import BatchColumns, acquire_many
 from service.acquire.kernel_build import exit_after_parent
 from service.advice.intervals import Interval, share_of
 from service.identify.identification import Identification, Outcome
@@ -122,13 +122,16 @@ def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
     """What became of one zone's stars: counts (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
-        for view in _views(plan, number, off_axis_deg, sky):
-            for place, setting in enumerate(plan.settings):
-                if setting.errors.off_axis_deg == off_axis_deg:
-                    run, mission = _run(setting.errors), setting.mission
-                    batch = batch_of(view, run, mission, plan.identifier)
-                    found = acquire(batch, mission, sky).trackers[0].identification
-                    counts[place] += _counted(found, view)
+        views = list(_views(plan, number, off_axis_deg, sky))
+        for place, setting in enumerate(plan.settings):
+            if setting.errors.off_axis_deg == off_axis_deg:
+                run, mission = _run(setting.errors), setting.mission
+                batches = [batch_of(view, run, mission, plan.identifier) for view in views]
+                found = acquire_many(BatchColumns.of(batches), mission, sky)
+                for row, view in enumerate(views):
+                    counts[place] += _counted(
+                        found.acquisition(row).trackers[0].identification, view
+                    )
     return counts
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from service.acquire import acquire
+from service.acquire import BatchColumns, acquire_many
 from service.acquire.kernel_build import exit_after_parent
 from service.identify.identification import Outcome
 from service.missions.mission import Identifier
@@ -107,13 +107,15 @@ def perform(task: Task, sky: SkyModel) -> Integers:
     counts = np.zeros((len(task.identifiers), len(task.runs), world.zones, 4), np.int64)
     for zone in range(world.zones):
         number = task.number * world.zones + zone
-        for view in draw_zone(world, number, mission, catalog, rng):
-            for i, identifier in enumerate(task.identifiers):
-                for j, run in enumerate(task.runs):
-                    if len(view.star):
-                        batch = batch_of(view, run, mission, identifier)
-                        found = acquire(batch, mission, sky).trackers[0].identification
-                        counts[i, j, zone] += _counted(found.outcome, found.star, view.star)
+        drawn = draw_zone(world, number, mission, catalog, rng)
+        views = [view for view in drawn if len(view.star)]
+        for i, identifier in enumerate(task.identifiers):
+            for j, run in enumerate(task.runs):
+                batches = [batch_of(view, run, mission, identifier) for view in views]
+                columns = acquire_many(BatchColumns.of(batches), mission, sky)
+                for row, view in enumerate(views):
+                    found = columns.acquisition(row).trackers[0].identification
+                    counts[i, j, zone] += _counted(found.outcome, found.star, view.star)
     return counts
 
 

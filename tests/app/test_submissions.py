@@ -289,15 +289,18 @@ def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
     app, make, monkeypatch
 ):
     solver = app.submissions.ingest.solver
-    acquire = solver.acquire
     begun = []
 
-    def slow(*asked, **how):
-        begun.append(utc_now().tai_ns)
-        time.sleep(0.02)
-        return acquire(*asked, **how)
+    def slowed(acquire):
+        def slow(*asked, **how):
+            begun.append(utc_now().tai_ns)
+            time.sleep(0.02)
+            return acquire(*asked, **how)
 
-    monkeypatch.setattr(solver, "acquire", slow)
+        return slow
+
+    monkeypatch.setattr(solver, "acquire", slowed(solver.acquire))
+    monkeypatch.setattr(solver, "acquired", slowed(solver.acquired))
     made = [solver.solve(make("alone"))]
     made += [solver.solve_one_of_many(make(name)) for name in ("one", "other")]
     app.submissions.submit(make("in the queue"))

@@ -14,8 +14,7 @@ from service.identify.attitude_from_matches import aberrate
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import fit_match, weigh, weigh_without
 from service.identify.hypotheses.scene import ObservedStars, ZoneStars, scratch_for
-from service.identify.hypotheses.verified import identify_verified, posterior_of
-from service.identify.hypotheses.verified import scene_of as scene_of_sighting
+from service.identify.hypotheses.verified import identify_verified
 from service.identify.identification import Outcome
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
@@ -25,6 +24,9 @@ from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from tests.chance import at_least, at_most
+from tests.reference.compare import zone_searched
+from tests.reference.sightings import identified as identified_alone
+from tests.reference.sightings import scene_of as scene_of_sighting
 from tests.scale import draws
 
 VIEWS = draws(40, 60)
@@ -87,15 +89,19 @@ def test_stopping_early_names_what_the_exhaustive_search_names(sky, rng, table, 
 
     def both(sighting):
         sightings.append(sighting)
-        return identify_verified(sighting)
+        return identified_alone(identify_verified, sighting, weighs=True)
 
-    monkeypatch.setitem(IDENTIFIERS, "verified", replace(IDENTIFIERS["verified"], function=both))
+    entry = replace(IDENTIFIERS["verified"], function=both, by_columns=False)
+    monkeypatch.setitem(IDENTIFIERS, "verified", entry)
     identified(sky, rng, table, run, views=30)
     same = 0
     for sighting in sightings:
-        early, whole = posterior_of(sighting), posterior_of(sighting, exhaustive=True)
-        sure = (early.stars.probability >= 0.999) & (whole.stars.probability >= 0.999)
-        assert np.array_equal(early.stars.star[sure], whole.stars.star[sure])
+        early, whole = (
+            identified_alone(identify_verified, sighting, weighs=True, exhaustive=exhaustive)
+            for exhaustive in (False, True)
+        )
+        sure = early.unique & whole.unique
+        assert np.array_equal(early.star[sure], whole.star[sure])
         same += sure.mean()
     assert same / len(sightings) > 0.97
 
@@ -107,9 +113,9 @@ def test_leaving_a_star_out_of_a_fit_is_fitting_without_it(sky, rng, monkeypatch
 
     def caught_by(sighting):
         caught.append(sighting)
-        return identify_verified(sighting)
+        return identified_alone(identify_verified, sighting, weighs=True)
 
-    entry = replace(IDENTIFIERS["verified"], function=caught_by)
+    entry = replace(IDENTIFIERS["verified"], function=caught_by, by_columns=False)
     monkeypatch.setitem(IDENTIFIERS, "verified", entry)
     found = identified(sky, rng, 8, "nominal", views=5)
     for sighting, (identification, _) in zip(caught[-5:], found[-5:], strict=True):
@@ -148,7 +154,7 @@ def test_two_hundred_and_fifty_stars_are_named_within_the_bound(sky, rng):
     identification = found.trackers[0].identification
     assert not identification.bounded
     right = identification.star == near
-    inside = np.isin(near, found.trackers[0].zone.star)
+    inside = np.isin(near, zone_searched(found, sky).star)
     assert right[inside].mean() > 0.9
     assert not (identification.unique & ~right).any()
 

@@ -38,15 +38,16 @@ class Held:
                 assert self.go_on.wait(PATIENCE_S)
             return acquire(batch, mission, sky)
 
-        def at_once(batch, *rest):
-            if batch.batch in names:
-                raise NotAtHand
-            self.computed.append(batch.batch)
-            return acquire_at_once(batch, *rest)
+        def together(batches, *rest, at_once):
+            assert at_once
+            short = [batch for batch in batches if batch.batch not in names]
+            self.computed += [batch.batch for batch in short]
+            found = iter(acquired(short, *rest, at_once=True) if short else ())
+            return [next(found) if batch in short else NotAtHand() for batch in batches]
 
-        acquire_at_once = pools.acquire_at_once
+        acquired = pools.acquired
         monkeypatch.setattr(pools, "acquire", holding)
-        monkeypatch.setattr(pools, "acquire_at_once", at_once)
+        monkeypatch.setattr(pools, "acquired", together)
 
 
 @pytest.fixture

@@ -9,10 +9,11 @@ import msgspec
 import numpy as np
 
 from service.acquire import Acquisition, acquire
-from service.identify.voting.starid import MAX_RIVALS
+from service.identify.identification import MAX_RIVALS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
 from service.sky.model import SkyModel
+from service.sky.zones import Zone
 from service.storage.recording.answer import answer_of
 from service.times import parse_utc
 from tests.reference import batches
@@ -119,3 +120,17 @@ class Judge:
                 batches.draw_batch(rng, self.toml, self.catalog(time), attitude, number, **drawn)
             )
         return self.comparison
+
+
+def zone_searched(found: Acquisition, sky: SkyModel) -> Zone:
+    """The zone that the stars of an acquisition's first tracker were searched in."""
+    region, choices = found.trackers[0].region, found.choices
+    assert region is not None
+    zone, _ = sky.zone(
+        found.mission,
+        found.run_catalog,
+        region,
+        choices.tolerances.pair_separation_max_deg,
+        choices.zone_grid_deg,
+    )
+    return zone

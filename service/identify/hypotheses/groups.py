@@ -26,9 +26,10 @@ from service.identify.hypotheses.scene import (
 )
 from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
 from service.identify.identification import Identification, Integers, Outcome
-from service.identify.sighting import Sighting
+from service.identify.sighting import SightingColumns, sighted_at
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.zones import Zone
 from service.vectors import read_only
 
 Mask = npt.NDArray[np.bool_]
@@ -149,21 +150,22 @@ def first_share(log_weight: float, other_log_weight: float, stars: int) -> float
     return 1.0 / (1.0 + math.exp(min(-told, 700.0)))
 
 
-def log_weight_of_group(sighting: Sighting, star: Integers, run_catalog: RunCatalog) -> float:
-    """How much all stars of a tracker weigh where those with a row (n,) are these stars.
+def log_weight_of_group(
+    seen: SightingColumns, s: int, zone: Zone, star: Integers, run_catalog: RunCatalog
+) -> float:
+    """How much all stars of a sighting weigh where those with a row (n,) are these stars.
 
     The same measure as that of hypotheses (see `evidence`), with the others clutter.
     """
     if not len(star):
         return 0.0
-    bounds = sighting.bounds
     return float(
         _log_weight_of(
-            sighting.arrays,
+            sighted_at(seen, s),
             run_catalog.direction[star],
             run_catalog.magnitude_mag[star],
             star,
-            log_density(sighting.zone.direction, bounds.axis, bounds.least, bounds.most),
+            log_density(zone.direction, seen.axis[s], seen.least[s], seen.most[s]),
         )
     )
 

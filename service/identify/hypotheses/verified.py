@@ -6,11 +6,9 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 """
 
 import numpy as np
-import numpy.typing as npt
-from msgspec import Struct
 
 from service.compiled.copying import copy_rows
-from service.compiled.jit import njit
+from service.compiled.jit import njit, njit_no_refcount
 from service.identify.hypotheses.evidence import log_sum
 from service.identify.hypotheses.marginals import StarPosterior, marginals
 from service.identify.hypotheses.mirror import (
@@ -20,119 +18,93 @@ from service.identify.hypotheses.mirror import (
     reflect,
     weigh_in_a_mirror,
 )
-from service.identify.hypotheses.scene import (
-    ObservedStars,
-    ZonePairs,
-    ZoneStars,
-    ledger_for,
-    scene_in,
-    scratch_for,
-)
+from service.identify.hypotheses.scene import ledger_for, scene_in, scratch_for
 from service.identify.hypotheses.search import search
-from service.identify.identification import Identification, Integers, Outcome
-from service.identify.sighting import Sighting
-from service.identify.voting.starid import MAX_RIVALS, identify_by_votes
+from service.identify.identification import IdentifiedColumns, Integers, Outcome
+from service.identify.sighting import SightingColumns, bounds_at, sighted_at
+from service.identify.voting.starid import identify_by_votes
+from service.missions.mission import Rules
+from service.sky.zones import Zone
 
 UNIQUE_PROBABILITY = 0.999
 
 _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
 
-class Posterior(Struct, frozen=True, eq=False, gc=False):
-    """What the hypotheses say of each star of a sighting.
+def identify_verified(
+    which: Integers,
+    seen: SightingColumns,
+    zone: Zone,
+    rules: Rules,
+    found: IdentifiedColumns,
+    exhaustive: bool = False,
+) -> None:
+    """Identify stars by the posterior of hypotheses.
 
-    `bounded`: the search ended at the most work that was left.  `mirrored`: a mirror
-    image of the field fits better.
+    Of many sightings, `which` names the rows of those that the zone serves.  `exhaustive`: go on
+    after a hypothesis that outweighs chance.
     """
-
-    stars: StarPosterior
-    bounded: bool
-    mirrored: bool
-
-
-def posterior_of(sighting: Sighting, exhaustive: bool = False) -> Posterior:
-    """Weigh the hypotheses of a sighting; `exhaustive`: go on after one that outweighs chance."""
-    stars = posterior_for(len(sighting.direction))
-    arrays = sighting.arrays, sighting.zone.arrays, sighting.bounds
-    bounded, mirrored, work = _weigh(*arrays, exhaustive, sighting.budget.left, stars)
-    sighting.budget.spend(work)
-    return Posterior(stars, bounded, mirrored)
-
-
-def posterior_for(n: int) -> StarPosterior:
-    """Room for the posterior of n stars, and one rival more than an answer lists."""
-    return StarPosterior(
-        star=np.empty(n, np.int64),
-        probability=np.empty(n),
-        none=np.empty(n),
-        rivals=np.empty((n, MAX_RIVALS + 1), np.int64),
-        rival_probability=np.empty((n, MAX_RIVALS + 1)),
-        hypothesis=np.empty(n, np.int64),
-    )
-
-
-def identify_verified(sighting: Sighting) -> Identification:
-    """Identify the stars of one tracker by the posterior of hypotheses."""
-    star_of = sighting.zone.star
     # The votes first, which cost least.
-    votes, posterior = identify_by_votes(sighting), posterior_of(sighting)
-    found = posterior.stars
-    n = len(found.star)
-    outcome, star = np.empty(n, np.int64), np.full(n, -1)
-    probability = np.empty(n)
-    rivals: list[tuple[int, ...]] = [()] * n
-    likely: list[tuple[float, ...]] = [()] * n
-    rivals_cut = 0
-    columns = zip(found.star.tolist(), found.probability.tolist(), found.none.tolist(), strict=True)
-    for k, (row, chance, none) in enumerate(columns):
-        if chance >= UNIQUE_PROBABILITY:
-            # Of a unique star the others are too unlikely to matter.
-            outcome[k], star[k], probability[k] = _UNIQUE, star_of[row], chance
-            continue
-        unmatched = none >= chance
-        outcome[k] = _UNMATCHED if unmatched else _AMBIGUOUS
-        probability[k] = none if unmatched else chance
-        in_question = found.rivals[k] >= 0
-        rivals_cut += int(in_question[MAX_RIVALS])
-        in_question[MAX_RIVALS] = False
-        rivals[k] = tuple(star_of[found.rivals[k][in_question]].tolist())
-        likely[k] = tuple(found.rival_probability[k][in_question].tolist())
-    return Identification(
-        outcome=outcome,
-        star=star,
-        votes=votes.votes,
-        runner_up=votes.runner_up,
-        rivals=tuple(rivals),
-        rival_probability=tuple(likely),
-        probability=probability,
-        rivals_cut=rivals_cut,
-        bounded=posterior.bounded or votes.bounded,
-        hypothesis=_named(found.hypothesis, star_of),
-        mirrored=posterior.mirrored,
-    )
+    identify_by_votes(which, seen, zone, rules, found)
+    weigh_sightings(which, seen, zone.arrays, zone.star, exhaustive, found)
 
 
-def _named(rows: Integers, star_of: npt.NDArray[np.int32]) -> Integers:
-    """The stars of zone rows (n,), -1 where there is no row; a zone may have no stars."""
-    star = np.full(len(rows), -1)
-    star[rows >= 0] = star_of[rows[rows >= 0]]
-    return star
+@njit(nogil=True)
+def weigh_sightings(which, seen, zone, star_of, exhaustive, found):  # type: ignore[no-untyped-def]
+    """Weigh the hypotheses of those of many sightings that a zone serves, after their votes.
+
+    `which` are their rows in the columns `seen` and `found`.
+    """
+    for s in which:
+        first, last = seen.offsets[s], seen.offsets[s + 1]
+        n = last - first
+        posterior = StarPosterior(
+            star=np.full(n, -1),
+            probability=np.zeros(n),
+            none=np.ones(n),
+            rivals=found.rivals[first:last],
+            rival_probability=found.rival_probability[first:last],
+            hypothesis=found.hypothesis[first:last],
+        )
+        posterior.rivals[:], posterior.rival_probability[:], posterior.hypothesis[:] = -1, 0.0, -1
+        found.rivals_cut[s] = 0
+        found.explained[s] = 0
+        if n >= 2 and len(zone.direction) >= 2:
+            max_work = max(seen.left[s], 0)
+            bounded, mirrored, work = _weigh(
+                sighted_at(seen, s), zone, bounds_at(seen, s), exhaustive, max_work, posterior
+            )
+            found.bounded[s], found.mirrored[s] = found.bounded[s] or bounded, mirrored
+            seen.left[s] -= work
+        for k in range(n):
+            found.rivals_cut[s] += _name(k, first + k, posterior, star_of, found)
+            found.explained[s] += found.hypothesis[first + k] >= 0
 
 
-def scene_of(sighting: Sighting) -> tuple[ObservedStars, ZoneStars, ZonePairs]:
-    """The sighting as the search takes it."""
-    scene = scene_in(sighting.arrays, sighting.zone.arrays, sighting.bounds)
-    return scene  # type: ignore[no-any-return]
+@njit_no_refcount
+def _name(k, at, posterior, star_of, found):  # type: ignore[no-untyped-def]
+    """Name star k of a posterior, which is row `at` of the columns; whether its rivals are cut."""
+    row, chance, none = posterior.star[k], posterior.probability[k], posterior.none[k]
+    rivals, explained = found.rivals[at], found.hypothesis[at]
+    found.hypothesis[at] = star_of[explained] if explained >= 0 else -1
+    if chance >= UNIQUE_PROBABILITY:
+        # Of a unique star the others are too unlikely to matter.
+        found.outcome[at], found.star[at], found.probability[at] = _UNIQUE, star_of[row], chance
+        rivals[:] = -1
+        return False
+    unmatched = none >= chance
+    found.outcome[at], found.star[at] = _UNMATCHED if unmatched else _AMBIGUOUS, -1
+    found.probability[at] = none if unmatched else chance
+    for place in range(len(rivals)):
+        if rivals[place] >= 0:
+            rivals[place] = star_of[rivals[place]]
+    return rivals[len(rivals) - 1] >= 0
 
 
 @njit(nogil=True)
 def _weigh(sighted, zone, bounds, exhaustive, max_work, posterior):  # type: ignore[no-untyped-def]
     """Search and marginals of a scene; whether it was bounded, whether mirrored, and the work."""
     n = len(sighted.direction)
-    posterior.star[:], posterior.probability[:], posterior.none[:] = -1, 0.0, 1.0
-    posterior.rivals[:], posterior.rival_probability[:], posterior.hypothesis[:] = -1, 0.0, -1
-    if n < 2 or len(zone.direction) < 2:
-        return False, False, 0
     observed, stars, pairs = scene_in(sighted, zone, bounds)
     scratch, ledger = scratch_for(n), ledger_for(n)
     progress, bounded = search(observed, stars, pairs, exhaustive, max_work, scratch, ledger)

@@ -12,7 +12,9 @@ import numpy as np
 
 from service.compiled.copying import copy_rows
 from service.compiled.jit import njit, njit_inlined, njit_no_refcount
+from service.identify.budget import COMPARISONS_PER_UNIT
 from service.identify.identification import Outcome
+from service.identify.sighting import bounds_at, sighted_at
 from service.identify.voting.fov_rotation import rotation_rad
 from service.sky.geometry.pairs import separation_rad
 
@@ -56,7 +58,7 @@ class Tallies(NamedTuple):
     """What the votes come to, for each of n observed stars.
 
     The `outcome`, the winner's `star` (-1: none) and the `highest` and `second`
-    tally, all (n,); `rivals` (R, n) those who share an ambiguous star's highest
+    tally, all (n,); `rivals` (n, R) those who share an ambiguous star's highest
     tally, the brightest first, then -1.
     """
 
@@ -291,29 +293,52 @@ def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
     ballots.votes[i, row] += 1
 
 
-@njit
-def tally(sighted, zone, bounds, rules, star_of, tallies):  # type: ignore[no-untyped-def]
-    """`cast_votes`, `count_votes` and, where a star is ambiguous, `name_rivals` in one call.
-
-    Whether any star is ambiguous, and how many pairs were compared.  It keeps the
-    interpreter's lock: where others wait for that, it takes longer to get it back than
-    to count a few votes.
-    """
-    n, stars = len(sighted.direction), len(zone.direction)
-    polar = polar_angles(zone.polar, stars, bounds, rules)
-    ballots = Ballots(
-        votes=np.zeros((n, stars), np.int32),
-        voted=np.empty((n, stars), np.int32),
-        counts=np.zeros(n, np.int32),
-        edges=np.empty((0, 4), np.int32),
+@njit(nogil=True)
+def tallies_of(found, first, last):  # type: ignore[no-untyped-def]
+    """Where the tallies of the stars from `first` to before `last` stand in `IdentifiedColumns`."""
+    return Tallies(
+        outcome=found.outcome[first:last],
+        star=found.star[first:last],
+        highest=found.votes[first:last],
+        second=found.runner_up[first:last],
+        rivals=found.rivals[first:last],
     )
-    compared = cast_votes(sighted, zone, polar, bounds, rules, ballots)
-    if compared > rules.max_comparisons:
-        discard_votes(ballots)
-    any_tie = count_votes(ballots, star_of, tallies)
-    if any_tie:
-        name_rivals(ballots.votes, star_of, tallies)
-    return any_tie, compared
+
+
+@njit(nogil=True)
+def tally(which, seen, zone, star_of, limits, switches, found):  # type: ignore[no-untyped-def]
+    """Cast and count the votes of those of many sightings that a zone serves.
+
+    `which` are their rows in the columns `seen` and `found`.
+    """
+    stars, most = len(zone.direction), 0
+    for s in which:
+        most = max(most, seen.offsets[s + 1] - seen.offsets[s])
+    votes, voted = np.zeros((most, stars), np.int32), np.empty((most, stars), np.int32)
+    counts, edges = np.zeros(most, np.int32), np.empty((0, 4), np.int32)
+    for s in which:
+        first, last = seen.offsets[s], seen.offsets[s + 1]
+        n = last - first
+        bounds = bounds_at(seen, s)
+        rules = Rulebook(limits, switches, COMPARISONS_PER_UNIT * max(seen.left[s], 0))
+        ballots = Ballots(votes=votes[:n], voted=voted[:n], counts=counts[:n], edges=edges)
+        tallies = tallies_of(found, first, last)
+        polar = polar_angles(zone.polar, stars, bounds, rules)
+        compared = cast_votes(sighted_at(seen, s), zone, polar, bounds, rules, ballots)
+        seen.left[s] -= compared // COMPARISONS_PER_UNIT
+        found.bounded[s] = compared > rules.max_comparisons
+        if found.bounded[s]:
+            discard_votes(ballots)
+        if count_votes(ballots, star_of, tallies):
+            name_rivals(ballots.votes, star_of, tallies)
+        else:
+            tallies.rivals[:, 0] = -1
+        for k in range(n):
+            if tallies.rivals[k, 0] >= 0:
+                found.rivals_cut[s] += tallies.rivals[k, tallies.rivals.shape[1] - 1] >= 0
+            for place in range(counts[k]):
+                votes[k, voted[k, place]] = 0
+            counts[k] = 0
 
 
 @njit(nogil=True)
@@ -373,8 +398,8 @@ def name_rivals(votes, star_of, tallies):  # type: ignore[no-untyped-def]
             continue
         place = 0
         for row in range(votes.shape[1]):
-            if place == len(rivals):
+            if place == rivals.shape[1]:
                 break
             if votes[i, row] == tallies.highest[i]:
-                rivals[place, i] = star_of[row]
+                rivals[i, place] = star_of[row]
                 place += 1

@@ -41,6 +41,8 @@ from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")
 """What a task reads of its source."""
+AT_ONCE = 1_000
+"""Batches that go through the core together."""
 _DIGITS = 24
 """Of a digest in the name of a file."""
 
@@ -110,14 +112,18 @@ def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResu
     """Do a task, and write its file unless that is there."""
     found: list[UnsavedResult] = []
     refused: list[RefusedBatch] = []
-    for row in _stored(task):
-        if row["batch"] in task.left_out:
-            continue
-        submission = submission_again(row["input"], row["options"], task.run)
-        try:
-            found.append(_solve(solver, submission, row))
-        except AcquisitionError as error:
-            refused.append(RefusedBatch(row["batch"], str(error)))
+    stored = [row for row in _stored(task) if row["batch"] not in task.left_out]
+    for start in range(0, len(stored), AT_ONCE):
+        some = stored[start : start + AT_ONCE]
+        submissions = [submission_again(each["input"], each["options"], task.run) for each in some]
+        several = solver.acquired([each.batch for each in submissions])
+        for row, submission, acquired in zip(some, submissions, several, strict=True):
+            if isinstance(acquired, AcquisitionError):
+                refused.append(RefusedBatch(row["batch"], str(acquired)))
+            elif isinstance(acquired, Exception):
+                raise acquired
+            else:
+                found.append(_unsaved(solver, submission, row, acquired))
     if not found:
         return [PartitionResult(None, refused)]
     rows = _rows_of(found)
@@ -141,16 +147,16 @@ def _stored(task: PartitionTask) -> list[dict[str, str]]:
     return found
 
 
-def _solve(solver: Solver, submission: Submission, row: dict[str, str]) -> UnsavedResult:
+def _unsaved(
+    solver: Solver, submission: Submission, row: dict[str, str], acquired: Acquisition
+) -> UnsavedResult:
     batch = submission.batch
     mission = mission_in_input(solver.missions, batch.spacecraft)
     # Of the first result, where the source's current one is an adopted what-if.
     first = row["batch_id"] or row["id"]
     id = derived_ulid(first, batch.run, mission.digest, solver.sky.catalog.digest)
     received = recorded_utc(row["received"] or row["created"])
-    return unsaved_submission(
-        submission, _repeatable(solver.acquire(batch, mission)), id=id, received=received
-    )
+    return unsaved_submission(submission, _repeatable(acquired), id=id, received=received)
 
 
 def _repeatable(acquisition: Acquisition) -> Acquisition:

@@ -1,0 +1,345 @@
+"""The search in the zones about presumed attitudes, of many batches at once.
+
+Trackers are grouped by the zone that serves them, so that each zone is fetched once; its
+stars are identified, and then the attitudes solved for, in compiled loops.
+"""
+
+from collections.abc import Hashable, Sequence
+from time import perf_counter_ns
+
+import numpy as np
+from msgspec import Struct
+
+from service.acquire.choices import Choices
+from service.acquire.result import Place
+from service.attitude.solution import AttitudeSolution, NoAttitude
+from service.attitude.solve import METHODS, WORST_AXIS_RAD
+from service.identify.attitude_from_matches import fit_sightings, room_for_fits, with_tracker_fits
+from service.identify.budget import WorkBudget
+from service.identify.hypotheses.ledger import LEAST_GROUP
+from service.identify.identification import Identification, room_for_identities
+from service.identify.prior_attitude import PriorAttitude, search_region
+from service.identify.sighting import (
+    PRIOR_DIRECTION,
+    PRIOR_ROTATION,
+    Sighting,
+    room_for_sightings,
+)
+from service.identify.voting.starid import refuse_endless
+from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
+from service.missions.mission import Mission, SolverName, Tracker
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import CorrectedColumns
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion, Zone, count_within, zone_key
+from service.vectors import Vector
+
+
+class StepTimer:
+    """Time spent in each step, summed where a step is taken again, of one batch or of several."""
+
+    def __init__(self, batches: int = 1) -> None:
+        self.ns = dict.fromkeys(("zone", "identify", "solve"), 0)
+        self._batches = max(batches, 1)
+        self.begin()
+
+    def begin(self) -> None:
+        """Leave out the time until now."""
+        self._last = perf_counter_ns()
+
+    def end(self, step: str) -> None:
+        """Add the time since the last call to a step."""
+        now = perf_counter_ns()
+        self.ns[step] += now - self._last
+        self._last = now
+
+    def of_one(self) -> "StepTimer":
+        """A timer that goes on for one of the batches, from its equal part of the time."""
+        timer = StepTimer()
+        timer.ns = {step: ns // self._batches for step, ns in self.ns.items()}
+        return timer
+
+    @property
+    def us(self) -> dict[str, int]:
+        """Whole microseconds of each step, the same part for each batch."""
+        return {step: ns // 1000 // self._batches for step, ns in self.ns.items()}
+
+
+class Search(Struct, frozen=True, eq=False, gc=False):
+    """What holds for every search for the stars of one batch, all of them or a part."""
+
+    batch: ObservationBatch
+    mission: Mission
+    choices: Choices
+    prior: PriorAttitude | None
+    velocity_c: Vector
+    sun_au: float
+    run_catalog: RunCatalog
+    sky: SkyModel
+    timer: StepTimer
+    budget: WorkBudget
+
+    @property
+    def identifier(self) -> IdentifierEntry:
+        """The identifier of the batch."""
+        return IDENTIFIERS[self.choices.identifier]
+
+    @property
+    def catalog_direction(self) -> Vector:
+        """Unit vectors (N, 3) of the run catalog's stars on the day of the batch."""
+        return self.run_catalog.direction_at(self.batch.time)
+
+    @property
+    def zone_choices(self) -> tuple[float, float]:
+        """The widest pair of a zone, and the grid of its axes."""
+        return self.choices.tolerances.pair_separation_max_deg, self.choices.zone_grid_deg
+
+    def zone(self, region: SearchRegion) -> tuple[Zone, bool]:
+        """The zone that serves a region, and whether it was cached."""
+        return self.sky.zone(self.mission, self.run_catalog, region, *self.zone_choices)
+
+
+class ZoneResult(Struct, frozen=True, eq=False, gc=False):
+    """What was found in the zones about one presumed attitude.
+
+    `places` are those of the trackers.
+    """
+
+    prior: PriorAttitude
+    places: list[Place]
+    identifications: list[Identification]
+    solved: AttitudeSolution | NoAttitude
+
+    @property
+    def good(self) -> bool:
+        """Whether there is an attitude that its own residuals do not speak against."""
+        return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
+
+
+class _Asked(Struct, frozen=True, eq=False, gc=False):
+    """One row of a `ZoneSearch`: about what to search, and what that may cost."""
+
+    search: Search
+    prior: PriorAttitude
+    trackers: Sequence[Tracker]
+    regions: Sequence[SearchRegion]
+    budget: WorkBudget
+
+
+class ZoneSearch:
+    """Searches for the stars of batches, each about a presumed attitude of its own.
+
+    | column | shape | |
+    |---|---|---|
+    | `stars` | | the batches' stars in body axes: `CorrectedColumns` of n batches, t trackers |
+    | `seen` | by tracker, and by star | the same about the presumed attitudes |
+    | `found` | by tracker, and by star | outcome, star, votes, probability, rivals |
+    | `fits` | by batch, and residuals by star | quaternions, covariance, figures |
+    | `cached` | (t,) | whether the zone was in the cache |
+    | `within` | (t, 2) | stars and pairs within the region searched |
+
+    `add` says what to search for a row, `run` searches, and then `errors` has what kept a row
+    from a result, by row.
+    """
+
+    def __init__(self, stars: CorrectedColumns) -> None:
+        n, t, m = len(stars.tracker_offsets) - 1, len(stars.trackers), len(stars.sigma_rad)
+        self.stars = stars
+        self.seen = room_for_sightings(stars.star_offsets, stars.sigma_rad, stars.magnitude_mag)
+        self.found = room_for_identities(t, m)
+        self.fits = room_for_fits(n, m)
+        self.cached, self.within = np.zeros(t, np.bool_), np.zeros((t, 2), np.int64)
+        self.errors: dict[int, Exception] = {}
+        self._asked: dict[int, _Asked] = {}
+        self._by_itself: dict[int, Identification] = {}
+        """By tracker: of identifiers that take one sighting at a time."""
+        self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
+        """Rows and trackers by place in the batch, identifier, rules and zone."""
+
+    def __contains__(self, row: int) -> bool:
+        return row in self._asked
+
+    def add(
+        self,
+        row: int,
+        search: Search,
+        prior: PriorAttitude,
+        budget: WorkBudget | None = None,
+        regions: Sequence[SearchRegion] | None = None,
+    ) -> None:
+        """Search for the stars of a row about a presumed attitude, within this budget.
+
+        By default within three quarters of the batch's: the rest is for the whole sky, and for
+        the stars that the answer leaves.  `regions` are those of the trackers where not the
+        prior's.  Raises `BadBatch` as `search_region` does.
+        """
+        stars, seen, rows = self.stars, self.seen, self.stars.trackers_of(row)
+        trackers = [each for each in stars.trackers[rows.start : rows.stop] if each is not None]
+        if regions is None:
+            regions = [
+                search_region(tracker, prior, search.mission, f"observations.{index}.tracker")
+                for index, tracker in enumerate(trackers)
+            ]
+        offsets, known = stars.star_offsets[rows.start : rows.stop + 1].tolist(), prior.known_axis
+        rules = search.choices.rules
+        same_rules = rules.limits, rules.switches, rules.tests.match_groups
+        for index, (t, region, tracker) in enumerate(zip(rows, regions, trackers, strict=True)):
+            first, last = offsets[index : index + 2]
+            seen.direction[first:last] = np.dot(stars.direction_body[first:last], prior.attitude)
+            # A cap is searched about the boresight itself.
+            is_cap = region.kind == "cap"
+            seen.boresight[t] = (
+                region.axis if is_cap else np.dot(tracker.boresight_body, prior.attitude)
+            )
+            seen.velocity[t] = search.velocity_c
+            seen.prior_kind[t] = PRIOR_ROTATION if known is None else PRIOR_DIRECTION
+            seen.prior_axis[t] = region.axis if known is None else known
+            seen.set_region(t, region)
+            zone = zone_key(search.mission.name, search.run_catalog, region, *search.zone_choices)
+            # Trackers of one batch share its budget, one after the other.
+            key = index, search.choices.identifier, *same_rules, zone
+            self._zones.setdefault(key, []).append((row, t))
+        budget = budget or search.budget.share(3, 4)
+        self._asked[row] = _Asked(search, prior, trackers, regions, budget)
+
+    def run(self, timer: StepTimer) -> None:
+        """Identify the stars, zone by zone, and solve for the attitudes."""
+        for (index, *_), sightings in sorted(self._zones.items(), key=lambda each: each[0][0]):
+            sightings = [each for each in sightings if each[0] not in self.errors]
+            if not sightings:
+                continue
+            first = self._asked[sightings[0][0]]
+            try:
+                zone, cached = first.search.zone(first.regions[index])
+            except Exception as error:
+                self.errors |= dict.fromkeys((row for row, _ in sightings), error)
+                continue
+            timer.end("zone")
+            self._identify(zone, index, sightings)
+            # For the others it was there.
+            self.cached[sightings[0][1]] = cached
+            timer.end("identify")
+        self._solve()
+        timer.end("solve")
+
+    def _identify(self, zone: Zone, index: int, sightings: list[tuple[int, int]]) -> None:
+        """Identify the stars of those trackers (row, tracker) that a zone serves."""
+        seen, offsets = self.seen, self.stars.star_offsets
+        first = self._asked[sightings[0][0]].search
+        identifier, rules = first.identifier, first.choices.rules
+        which = np.array([t for _, t in sightings])
+        budgets: dict[int, WorkBudget] = {}
+        for row, t in sightings:
+            asked = self._asked[row]
+            self.cached[t] = True
+            seen.set_zone(t, asked.regions[index], zone)
+            budget = asked.budget.share(1, len(asked.regions) - index)
+            stars = slice(offsets[t], offsets[t + 1])
+            try:
+                if identifier.by_columns:
+                    refuse_endless(seen.direction[stars], zone, rules)
+                    budgets[t], seen.left[t] = budget, budget.left
+                else:
+                    alone = identifier.identify(self._sighting(t, asked, index, zone, budget))
+                    self._by_itself[t], self.found.star[stars] = alone, alone.star
+            except Exception as error:
+                # What is wrong with one keeps no other from its result.
+                self.errors[row] = error
+        count_within(zone, which, seen.axis, seen.least, seen.most, self.within)
+        if budgets:
+            if len(budgets) < len(which):
+                which = np.array(list(budgets))
+            identifier.identify(which, seen, zone, rules, self.found)
+        for t, budget in budgets.items():
+            budget.spend(budget.left - int(seen.left[t]))
+
+    def _sighting(
+        self, t: int, asked: _Asked, index: int, zone: Zone, budget: WorkBudget
+    ) -> Sighting:
+        """What an identifier is given that takes one sighting at a time."""
+        seen, search, guide = self.seen, asked.search, None
+        first, last = seen.offsets[t : t + 2]
+        if search.identifier.needs_guide:
+            search.sky.require_whole_sky()
+            radius_deg = asked.trackers[index].field_of_view_radius_deg
+            guide = search.sky.guide(search.run_catalog, radius_deg)
+        return Sighting(
+            direction=seen.direction[first:last],
+            magnitude_mag=seen.magnitude[first:last],
+            sigma_rad=seen.sigma_rad[first:last],
+            known_axis=None if asked.prior.known_axis is None else seen.prior_axis[t],
+            velocity_c=search.velocity_c,
+            boresight=seen.boresight[t],
+            region=asked.regions[index],
+            zone=zone,
+            rules=search.choices.rules,
+            guide=guide,
+            budget=budget,
+        )
+
+    def _solve(self) -> None:
+        """The attitudes, of all that have the same catalog, day and solver in one call."""
+        together: dict[Hashable, tuple[Vector, SolverName, list[int]]] = {}
+        n = len(self.stars.tracker_offsets) - 1
+        velocity_c, sun_au = np.empty((n, 3)), np.empty(n)
+        for row, asked in self._asked.items():
+            if row not in self.errors:
+                search = asked.search
+                velocity_c[row], sun_au[row] = search.velocity_c, search.sun_au
+                directions, solver = search.catalog_direction, search.choices.solver
+                key = id(directions), solver
+                together.setdefault(key, (directions, solver, []))[2].append(row)
+        offsets = self.stars.star_offsets[self.stars.tracker_offsets]
+        for directions, solver, rows in together.values():
+            fit_sightings(
+                *(np.array(rows), offsets, self.stars.direction_body, self.stars.sigma_rad),
+                *(self.found.star, directions, velocity_c, sun_au, WORST_AXIS_RAD),
+                *(METHODS.index(solver), self.fits),
+            )
+
+    # ---- results -----------------------------------------------------------------------------
+
+    def final_rows(self) -> list[int]:
+        """The rows of batches that need no other search.
+
+        They have a good attitude, or an identifier that never searches the whole sky instead, and
+        too few stars left for a second group.  What was found may contradict a prediction.
+        """
+        offsets, trackers = self.stars.star_offsets.tolist(), self.stars.tracker_offsets.tolist()
+        explained, final = self.found.explained.tolist(), []
+        for row, asked in self._asked.items():
+            identifier = asked.search.identifier
+            may_be_a_group = identifier.weighs_hypotheses and any(
+                offsets[t + 1] - offsets[t] - explained[t] >= LEAST_GROUP
+                for t in range(trackers[row], trackers[row + 1])
+            )
+            is_enough = self.fits.is_good(row) or not identifier.falls_back
+            if is_enough and not may_be_a_group and asked.prior.predicted is None:
+                final.append(row)
+        return final
+
+    def result(self, row: int) -> ZoneResult:
+        """What was found for a row."""
+        asked, stars, trackers = self._asked[row], self.stars, self.stars.trackers_of(row)
+        search = asked.search
+        offsets = stars.star_offsets[trackers.start : trackers.stop + 1].tolist()
+        places, identifications = [], []
+        for index, t in enumerate(trackers):
+            within = self.within[t].tolist()
+            places.append(Place(asked.regions[index], bool(self.cached[t]), *within))
+            first, last = offsets[index : index + 2]
+            identifications.append(
+                self._by_itself.get(t)
+                or self.found.of_sighting(t, first, last, search.identifier.weighs_hypotheses)
+            )
+        solved = self.fits.of_batch(row, offsets[0], offsets[-1], search.choices.solver)
+        if len(places) > 1 and isinstance(solved, AttitudeSolution):
+            own = slice(offsets[0], offsets[-1])
+            solved = with_tracker_fits(
+                *(solved, stars.direction_body[own], stars.sigma_rad[own], self.found.star[own]),
+                *(search.catalog_direction, search.velocity_c, search.sun_au),
+                np.repeat(np.arange(len(places)), np.diff(offsets)),
+                tuple(each.name for each in asked.trackers),
+            )
+        return ZoneResult(asked.prior, places, identifications, solved)
