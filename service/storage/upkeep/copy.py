@@ -162,8 +162,9 @@ def _copy(reading: Connection, writing: Connection, step: Step) -> int:
         with writing.begin():
             if _digest(reading, table) != _digest(writing, table):
                 raise BadConfiguration(
-                    f"TO: the rows of {table.name} are not those of the source, which was changed "
-                    "since the copy began: start again with an empty database"
+                    f"TO: the rows of {table.name} are not those of the source: it is another "
+                    "record, or the source was changed since the copy began: start again with an "
+                    "empty database"
                 )
         done += counts[table.name]
         step("comparing", done, total)
