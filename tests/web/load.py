@@ -74,7 +74,8 @@ class Load:
                 time.sleep(0.1)
                 continue
             self._count(answer.status)
-            if answer.status == 503:
+            # 502 and 504 are a balancer's.
+            if answer.status in (502, 503, 504):
                 server.close()
                 server.port = next(ports)
                 self._again.append(name)

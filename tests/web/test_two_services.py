@@ -6,11 +6,13 @@ import socket
 import subprocess
 import sys
 import time
+import uuid
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import httpx
 import pytest
-from sqlalchemy import create_engine, select, text
+from sqlalchemy import create_engine, make_url, select, text
 
 from service.app.factory import open_app
 from service.storage.sql.engines import database_url
@@ -21,10 +23,12 @@ from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.whole import assert_whole
 from tests.waiting import wait_until
 from tests.web.load import Load
-from tests.web.serving import in_process_settings
+from tests.web.serving import free_port, in_process_settings
+from tests.web.test_behind_proxy import NGINX
 
 KILLS, TERMINATED = 100, 12
 ACKNOWLEDGED_A_ROUND = 1_000
+BALANCER = Path(__file__).parents[2] / "docker" / "balanced" / "nginx.conf"
 BUSY_S = 2.0
 """By so much a look at a service takes longer while other tests run."""
 
@@ -33,6 +37,10 @@ pytestmark = pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 HOLDS_LOCK = """
     SELECT pid FROM pg_locks
     WHERE locktype = 'advisory' AND objid = 'event_counter'::regclass AND granted
+"""
+SESSIONS = """
+    SELECT pid FROM pg_stat_activity
+    WHERE application_name = current_setting('application_name') AND pid != pg_backend_pid()
 """
 NOTE_PROJECTORS = f"""
     CREATE TABLE projectors (number serial, pid int, holds_lock boolean);
@@ -193,15 +201,85 @@ def test_a_projector_that_loses_its_session_projects_nothing_until_it_has_the_lo
     _under_load(database, sky, missions, rng, figures, times, terminate, recover)
 
 
-def _under_load(database, sky, missions, rng, figures, times, disturb, recover):
-    """Disturb two services so many times while clients post to whichever takes their batches."""
+@pytest.mark.torture
+@pytest.mark.slow
+@pytest.mark.skipif(NGINX is None, reason="there is no nginx on this machine")
+def test_behind_a_balancer_kills_and_ended_sessions_lose_and_double_nothing(
+    database, sky, missions, rng, figures, tmp_path
+):
+    """One post after the other goes through the configuration of nginx that is shipped."""
+
+    def disturb(services, at_database):
+        if rng.random() < 0.5:
+            killed = services[rng.integers(len(services))]
+            killed.kill()
+            return [killed]
+        # All that a database server closes when it is restarted, or one of them.
+        ended = "" if rng.random() < 0.5 else "ORDER BY random() LIMIT 1"
+        at_database.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({SESSIONS} {ended}) s"))
+        return []
+
+    def recover(killed):
+        for service in killed:
+            service.start()
+            service.wait_until_ready()
+
+    # Other tests have sessions on the same server.
+    own = make_url(database).update_query_dict({"application_name": uuid.uuid4().hex})
+    database = own.render_as_string(hide_password=False)
+    with ExitStack() as stack:
+
+        def balanced(services):
+            return (stack.enter_context(balancer(services, tmp_path)),)
+
+        _under_load(database, sky, missions, rng, figures, size(KILLS), disturb, recover, balanced)
+
+
+@contextmanager
+def balancer(services, folder):
+    """The port of nginx before the services."""
+    port, shipped = free_port(), BALANCER.read_text(encoding="utf-8")
+    for name, service in zip(("one:8000", "two:8000"), services, strict=True):
+        assert name in shipped
+        shipped = shipped.replace(name, f"127.0.0.1:{service.port}")
+    shipped = shipped.replace("listen 8000", f"listen 127.0.0.1:{port}")
+    paths = "".join(
+        f"{kind}_temp_path {folder}/{kind};"
+        for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
+    )
+    shipped = shipped.replace("access_log off;", f"access_log off; {paths}")
+    log = folder / "error.log"
+    own = f"daemon off; pid {folder}/pid; error_log {log}; worker_processes 1;\n"
+    (folder / "nginx.conf").write_text(own + shipped)
+    process = subprocess.Popen([NGINX, "-e", log, "-c", folder / "nginx.conf"])
+
+    def is_up():
+        try:
+            return httpx.get(f"http://127.0.0.1:{port}/livez").is_success
+        except httpx.TransportError:
+            return False
+
+    try:
+        wait_until(is_up, 30.0)
+        yield port
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def _under_load(database, sky, missions, rng, figures, times, disturb, recover, balanced=None):
+    """Disturb two services so many times while clients post to whichever takes their batches.
+
+    `balanced` gives the ports that clients use in the place of the services' own.
+    """
     template = samples.batch(sky, missions, "NAME")
     assert json.loads(template)["batch"] == "NAME"
     a_round = size(ACKNOWLEDGED_A_ROUND, 50)
     pauses_s = []
     with asking(database) as at_database, two_services(database) as services:
         at_database.exec_driver_sql(NOTE_PROJECTORS)
-        load = Load(tuple(each.port for each in services), template)
+        ports = balanced(services) if balanced else tuple(each.port for each in services)
+        load = Load(ports, template)
         try:
             for _ in range(times):
                 _wait_for(load, a_round, seconds=120.0)

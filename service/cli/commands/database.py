@@ -1,7 +1,7 @@
 """`acquire database`: the records as a whole."""
 
 from argparse import Namespace
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -76,6 +76,15 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
     add_database(parser)
+    _add_verify(group)
+    _add_copy(group)
+    _add_rebuild(group)
+    _add_split_trackers(group)
+    _add_prune(group)
+    add_forget(group)
+
+
+def _add_verify(group: Any) -> None:
     parser = add_command(
         group,
         "verify",
@@ -90,10 +99,24 @@ def add(commands: Any) -> None:
     )
     add_json(parser, "the faults")
     add_database(parser)
-    _add_rebuild(group)
-    _add_split_trackers(group)
-    _add_prune(group)
-    add_forget(group)
+
+
+def _add_copy(group: Any) -> None:
+    parser = add_command(
+        group,
+        "copy",
+        "Copy the whole record to another database, SQLite to PostgreSQL or back, compare every "
+        "row of the two, and verify the copy.  Stop the services on both first.  FROM stays as it "
+        "is; TO must be empty, and an SQLite file is made if it is missing.  You can stop the "
+        "command at any time: it continues when you start it again.",
+        """
+        acquire database copy sqlite:///acquire.db postgresql://user@host/attitudes
+        acquire database copy postgresql://user@host/attitudes sqlite:///acquire.db
+        """,
+        copy,
+    )
+    parser.add_argument("source", metavar="FROM", help="URL of the database to copy")
+    parser.add_argument("target", metavar="TO", help="URL of the empty database")
 
 
 def _add_rebuild(group: Any) -> None:
@@ -226,10 +249,7 @@ def verify(parsed: Namespace) -> int:
     if parsed.json:
         print_json({"batches": seen, "faults": problems})
         return 1 if problems else 0
-    for problem in problems[:MAX_PROBLEMS]:
-        print(problem)
-    if len(problems) > MAX_PROBLEMS:
-        print(f"and {len(problems) - MAX_PROBLEMS} more")
+    _print_problems(problems)
     if problems:
         return 1
     print(f"nothing is wrong with {seen} batches")
@@ -238,6 +258,35 @@ def verify(parsed: Namespace) -> int:
         print(f"{later} results got their digest at an upgrade: changes before it are not found")
     if without:
         print(f"{without} results have no digest yet: the service makes them while it runs")
+    return 0
+
+
+def _print_problems(problems: Sequence[str]) -> None:
+    for problem in problems[:MAX_PROBLEMS]:
+        print(problem)
+    if len(problems) > MAX_PROBLEMS:
+        print(f"and {len(problems) - MAX_PROBLEMS} more")
+
+
+def copy(parsed: Namespace) -> int:
+    """Copy the record to another database."""
+    from tqdm import tqdm
+
+    from service.storage.upkeep.copy import copy_record
+
+    with tqdm(total=None, disable=None, leave=False) as bar:
+
+        def step(what: str, done: int, total: int) -> None:
+            bar.total = total
+            bar.set_description(what, refresh=False)
+            bar.update(done - bar.n)
+
+        rows, problems = copy_record(parsed.source, parsed.target, step)
+    _print_problems(problems)
+    if problems:
+        print(f"the copy equals its source in {rows} rows; both have these faults")
+        return 1
+    print(f"{rows} rows were copied and compared; nothing is wrong with the copy")
     return 0
 
 

@@ -12,7 +12,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import URL, Connection, Engine, inspect
+from sqlalchemy import URL, Connection, Engine, Table, inspect
 from sqlalchemy.exc import SQLAlchemyError
 
 from service import __version__
@@ -36,6 +36,8 @@ log = logging.getLogger(__name__)
 
 HEAD = "0017"
 """The latest revision of `migrations/`."""
+UNFINISHED = "copy:"
+"""How the revision of a database begins that `upkeep.copy` has not copied to its end."""
 
 
 def upgrade(database: str) -> None:
@@ -45,7 +47,7 @@ def upgrade(database: str) -> None:
     or was written by a newer version.
     """
     url = database_url(database)
-    with writing_alone(database_file(url)), _disposed(writing_engine(url)) as engine:
+    with writing_alone(database_file(url)), disposed(writing_engine(url)) as engine:
         bring_up_to_date(engine)
 
 
@@ -79,8 +81,8 @@ def revision_of(database: str) -> str | None:
     """The revision of a database's schema; None where it holds no records of the service."""
     require_there(database)
     url = database_url(database)
-    with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
-        return _revision(connection)
+    with disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+        return revision_in(connection)
 
 
 def check(database: str) -> list[str]:
@@ -91,27 +93,33 @@ def check(database: str) -> list[str]:
     """
     require_there(database)
     url = database_url(database)
-    with _disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+    with disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
         differs = _difference(connection)
         if differs is not None:
             return [differs]
         from alembic.autogenerate import compare_metadata
         from alembic.runtime.migration import MigrationContext
 
-        # Every table must be known to the metadata.
-        from service.storage.sql import (  # noqa: F401
-            access_tables,
-            alarm_tables,
-            archive_tables,
-            calibration_tables,
-            grade_tables,
-            gyro_tables,
-            tables,
-            webhook_tables,
-        )
-
+        all_tables()
         context = MigrationContext.configure(connection, opts={"compare_type": True})
         return [_in_words(difference) for difference in compare_metadata(context, metadata)]
+
+
+def all_tables() -> list[Table]:
+    """All tables of the code, each after those that it refers to."""
+    # A table is known to the metadata when its module is loaded.
+    from service.storage.sql import (  # noqa: F401
+        access_tables,
+        alarm_tables,
+        archive_tables,
+        calibration_tables,
+        grade_tables,
+        gyro_tables,
+        tables,
+        webhook_tables,
+    )
+
+    return metadata.sorted_tables
 
 
 def check_fresh() -> list[str]:
@@ -125,7 +133,7 @@ def check_fresh() -> list[str]:
 def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None) -> None:
     """Run the migrations that are missing, in one transaction; `before` is called first of all."""
     with reported(engine.url), engine.begin() as connection:
-        found = _revision(connection)
+        found = revision_in(connection)
         if found == HEAD:
             return
         before()
@@ -155,7 +163,7 @@ def require_up_to_date(engine: Engine) -> None:
 
 def require_revision(database: str) -> None:
     """`require_up_to_date` of a database that is only read."""
-    with _disposed(reading_engine(database_url(database))) as engine:
+    with disposed(reading_engine(database_url(database))) as engine:
         require_up_to_date(engine)
 
 
@@ -170,7 +178,8 @@ def reported(url: URL) -> Iterator[None]:
 
 
 @contextmanager
-def _disposed(engine: Engine) -> Iterator[Engine]:
+def disposed(engine: Engine) -> Iterator[Engine]:
+    """An engine whose connections are closed at the end."""
     try:
         yield engine
     finally:
@@ -186,7 +195,8 @@ def _config() -> "Config":
     return config
 
 
-def _revision(connection: Connection) -> str | None:
+def revision_in(connection: Connection) -> str | None:
+    """`revision_of` the database of a connection."""
     if not inspect(connection).has_table("alembic_version"):
         return None
     revisions = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalars()
@@ -195,11 +205,16 @@ def _revision(connection: Connection) -> str | None:
 
 def _difference(connection: Connection) -> str | None:
     """How the revision of the schema differs from this version's, and what to do; None: not."""
-    found = _revision(connection)
+    found = revision_in(connection)
     if found == HEAD:
         return None
     if found is None:
         return "holds no tables of this service: run `acquire database upgrade` to make them"
+    if found.startswith(UNFINISHED):
+        return (
+            "is an unfinished copy: run the same `acquire database copy` again, which goes on, or "
+            "name another database"
+        )
     if found < HEAD:
         return (
             f"its schema is at {found}, this version needs {HEAD}: run `acquire database upgrade`"

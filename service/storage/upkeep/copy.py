@@ -1,0 +1,283 @@
+"""Copies a whole record to another database, from SQLite to PostgreSQL or back.
+
+Every table is copied row by row, those of projections too.  A table is read in the order of its
+primary key, and each transaction of the copy takes the next rows: the number of rows that the
+copy has is how far it came, and an interrupted copy goes on from there.
+
+Until it is whole, the schema of the copy has a revision that no service opens.  The revision
+names the source by its numbers of rows.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from hashlib import blake2b
+from typing import Any
+
+import msgspec
+from sqlalchemy import (
+    Column,
+    Connection,
+    Double,
+    LargeBinary,
+    Row,
+    Select,
+    Table,
+    bindparam,
+    delete,
+    func,
+    select,
+    text,
+    update,
+)
+from sqlalchemy.exc import SQLAlchemyError
+
+from service.errors import BadConfiguration
+from service.storage.sql.engines import (
+    database_file,
+    database_url,
+    reading_engine,
+    shown_url,
+    writing_engine,
+)
+from service.storage.sql.file_lock import writing_alone
+from service.storage.sql.migrations import (
+    HEAD,
+    UNFINISHED,
+    all_tables,
+    bring_up_to_date,
+    disposed,
+    reported,
+    require_records,
+    require_up_to_date,
+    revision_in,
+)
+from service.storage.sql.projector_lock import ProjectorLock
+from service.storage.sql.statements import insert_all
+from service.storage.sql.tables import event_counter, projector
+from service.storage.sql.webhook_tables import webhook_sender
+from service.storage.upkeep.verify import verify
+
+FIRST_ROWS = (event_counter, projector, webhook_sender)
+"""The tables that have a row in a new database."""
+ROWS_AT_ONCE, LARGE_ROWS_AT_ONCE = 2_000, 20
+"""The second for tables with packed samples and pictures, of up to a megabyte a row."""
+
+Step = Callable[[str, int, int], object]
+"""Called with what is being done, the rows or batches that are done, and all of them."""
+Counts = dict[str, int]
+
+
+def copy_record(
+    source: str, target: str, step: Step = lambda what, done, total: None
+) -> tuple[int, list[str]]:
+    """Copy a database to another one: its number of rows, and what `verify` finds in the copy.
+
+    The target must be missing, empty, or an unfinished copy of the same source; SQLite's file
+    and the tables of either are made.  Nothing else may write to the two meanwhile.
+    Raises `BadConfiguration` with what to do, also if the copy is not equal to its source.
+    """
+    with _source(source) as reading, _target(target) as writing:
+        try:
+            total = _copy(reading, writing, step)
+        except SQLAlchemyError as error:
+            reason = str(getattr(error, "orig", None) or error).strip()
+            raise BadConfiguration(
+                f"the copy stopped: {reason}; run the same command again to go on"
+            ) from error
+    return total, verify(target, partial(step, "verifying"))
+
+
+@contextmanager
+def _source(database: str) -> Iterator[Connection]:
+    """A connection that sees the source as of one moment, while no service writes to it."""
+    with _named("FROM"):
+        require_records(database)
+        url = database_url(database)
+    file = database_file(url)
+    # Nothing can write to a read-only file, and its lock cannot be taken.
+    locked = writing_alone(None if file is None or file.is_read_only else file)
+    with _named("FROM"), locked, disposed(reading_engine(url)) as engine:
+        require_up_to_date(engine)
+        with reported(url), engine.connect() as connection:
+            _take_lock(connection)
+            with connection.begin():
+                yield connection
+
+
+@contextmanager
+def _target(database: str) -> Iterator[Connection]:
+    """A connection that writes to the target, which has tables and no service."""
+    with _named("TO"):
+        url = database_url(database)
+    with _named("TO"), writing_alone(database_file(url)), disposed(writing_engine(url)) as engine:
+        with reported(url), engine.begin() as connection:
+            is_new = revision_in(connection) is None
+        if is_new:
+            bring_up_to_date(engine)
+        with reported(url), engine.connect() as connection:
+            _take_lock(connection)
+            yield connection
+
+
+@contextmanager
+def _named(argument: str) -> Iterator[None]:
+    """Let a message name the argument of the command in the place of the setting."""
+    try:
+        yield
+    except BadConfiguration as error:
+        message = str(error).replace("ACQUIRE_DATABASE", argument)
+        raise BadConfiguration(message) from error
+
+
+def _take_lock(connection: Connection) -> None:
+    """Hold the projector's lock of PostgreSQL until the session ends."""
+    if connection.dialect.name != "postgresql":
+        return
+    if ProjectorLock().take(connection) != "taken":
+        raise BadConfiguration(
+            f"ACQUIRE_DATABASE: {shown_url(connection.engine.url)}: a service or another copy is "
+            "using it: stop it first"
+        )
+    connection.rollback()
+
+
+def _copy(reading: Connection, writing: Connection, step: Step) -> int:
+    """Copy what is missing, and compare all of it; returns the number of rows."""
+    tables = all_tables()
+    counts = _counted(reading, tables)
+    total = sum(counts.values())
+    if _begin(writing, tables, counts):
+        with writing.begin():
+            present = _counted(writing, tables)
+        done = sum(present.values())
+        step("copying", done, total)
+        for table in tables:
+            for copied in _copy_rows(reading, writing, table, present[table.name]):
+                done += copied
+                step("copying", done, total)
+            _refer_to_own(reading, writing, table)
+    done = 0
+    for table in tables:
+        with writing.begin():
+            if _digest(reading, table) != _digest(writing, table):
+                raise BadConfiguration(
+                    f"TO: the rows of {table.name} are not those of the source: it is another "
+                    "record, or the source was changed since the copy began: start again with an "
+                    "empty database"
+                )
+        done += counts[table.name]
+        step("comparing", done, total)
+    with writing.begin():
+        _set_sequences(writing, tables)
+        _set_revision(writing, HEAD)
+    return total
+
+
+def _counted(connection: Connection, tables: Sequence[Table]) -> Counts:
+    return {
+        table.name: int(connection.scalar(select(func.count()).select_from(table)) or 0)
+        for table in tables
+    }
+
+
+def _begin(connection: Connection, tables: Sequence[Table], counts: Counts) -> bool:
+    """Mark a new database as an unfinished copy; False if it has as many rows as the source."""
+    marked = UNFINISHED + blake2b(msgspec.json.encode(counts), digest_size=12).hexdigest()
+    with connection.begin():
+        revision = revision_in(connection)
+        if revision == marked:
+            return True
+        if revision == HEAD:
+            present = _counted(connection, tables)
+            if not any(present[table.name] for table in tables if table not in FIRST_ROWS):
+                for table in FIRST_ROWS:
+                    connection.execute(delete(table))
+                _set_revision(connection, marked)
+                return True
+            if present == counts:
+                return False
+    if revision == HEAD:
+        reason = "it holds a record already"
+    elif revision is not None and revision.startswith(UNFINISHED):
+        reason = "it is an unfinished copy of another database, or of an earlier state of this one"
+    else:
+        reason = f"its schema is at {revision}, this version needs {HEAD}"
+    raise BadConfiguration(
+        f"TO: {shown_url(connection.engine.url)}: {reason}: name an empty database"
+    )
+
+
+def _set_revision(connection: Connection, revision: str) -> None:
+    connection.execute(text("UPDATE alembic_version SET version_num = :it"), {"it": revision})
+
+
+def _chunks(
+    connection: Connection, query: Select[Any], table: Table
+) -> Iterator[Sequence[Row[Any]]]:
+    """The rows of a query on a table, as many at a time as memory allows."""
+    has_large = any(isinstance(column.type, LargeBinary) for column in table.columns)
+    at_once = LARGE_ROWS_AT_ONCE if has_large else ROWS_AT_ONCE
+    yield from connection.execute(query, execution_options={"yield_per": at_once}).partitions()
+
+
+def _copy_rows(
+    reading: Connection, writing: Connection, table: Table, present: int
+) -> Iterator[int]:
+    """Copy the rows after those that are there; yields how many each transaction took."""
+    query = select(table).order_by(*table.primary_key).offset(present)
+    later = dict.fromkeys(column.name for column in _own_references(table))
+    for chunk in _chunks(reading, query, table):
+        with writing.begin():
+            insert_all(writing, table, [dict(row._mapping) | later for row in chunk])
+        yield len(chunk)
+
+
+def _own_references(table: Table) -> list[Column[Any]]:
+    """The columns that refer to rows of the same table, which may come later."""
+    return [key.parent for key in table.foreign_keys if key.column.table is table]
+
+
+def _refer_to_own(reading: Connection, writing: Connection, table: Table) -> None:
+    for column in _own_references(table):
+        (key,) = table.primary_key
+        query = select(key.label("own"), column.label("other")).where(column.is_not(None))
+        change = update(table).where(key == bindparam("own")).values({column: bindparam("other")})
+        for chunk in _chunks(reading, query, table):
+            with writing.begin():
+                writing.execute(change, [dict(row._mapping) for row in chunk])
+
+
+def _digest(connection: Connection, table: Table) -> int:
+    """The sum of the digests of a table's rows, which does not depend on their order."""
+    is_double = [isinstance(column.type, Double) for column in table.columns]
+    total = 0
+    for chunk in _chunks(connection, select(table), table):
+        for row in chunk:
+            # SQLite has no minus zero.
+            content = [
+                value + 0.0 if double and value is not None else value
+                for value, double in zip(row, is_double, strict=True)
+            ]
+            digest = blake2b(msgspec.json.encode(content), digest_size=16).digest()
+            total += int.from_bytes(digest, "big")
+    return total
+
+
+def _set_sequences(connection: Connection, tables: Sequence[Table]) -> None:
+    """Let PostgreSQL's next numbers come after those that were copied; SQLite looks for itself."""
+    if connection.dialect.name != "postgresql":
+        return
+    after = "coalesce(max({0}), 0) + 1, false) FROM {1}"
+    connection.execute(
+        text(
+            "SELECT setval('results_seq', 1 + greatest((SELECT max(seq) FROM results), "
+            "(SELECT seq FROM projector)), false)"
+        )
+    )
+    for table in tables:
+        column = table.autoincrement_column
+        if column is not None:
+            of = f"pg_get_serial_sequence('{table.name}', '{column.name}')"
+            connection.execute(text(f"SELECT setval({of}, {after.format(column.name, table.name)}"))
+        connection.execute(text(f'ANALYZE "{table.name}"'))
