@@ -3,7 +3,7 @@
 A fault replaces one expression within a function: another comparison, `and` for `or`, `+` for `-`,
 another number or truth value, a condition or a sign the other way round, `max` for `min`, a
 function that returns None, a call that is left out.  Texts, annotations, default values, logging,
-assertions and what a module or a class holds stay as they are.
+assertions, the `strict` of `zip` and what a module or a class holds stay as they are.
 """
 
 import ast
@@ -154,7 +154,7 @@ class _Finder(ast.NodeVisitor):
         elif isinstance(node, ast.match_case):
             for each in [*([node.guard] if node.guard else []), *node.body]:
                 self.visit(each)
-        elif not (isinstance(node, ast.JoinedStr | ast.Assert) or _is_logging(node)):
+        elif not _stays(node):
             if self._functions:
                 for expression, new in faulty(node):
                     self._add(expression, new)
@@ -218,8 +218,11 @@ def _is_none(node: ast.expr) -> bool:
     return isinstance(node, ast.Constant) and node.value is None
 
 
-def _is_logging(node: ast.AST) -> bool:
+def _stays(node: ast.AST) -> bool:
+    """Whether it is a text, an assertion (as `strict` of `zip` is one), or a line of the log."""
     match node:
+        case ast.JoinedStr() | ast.Assert() | ast.keyword(arg="strict"):
+            return True
         case ast.Expr(value=ast.Call(func=ast.Attribute(value=ast.Name(id=name)))):
             return name in LOGGERS
     return False

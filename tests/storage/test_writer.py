@@ -1,6 +1,7 @@
 """The writer: shared commits, and failures that reach those they concern."""
 
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
@@ -88,6 +89,25 @@ def test_what_has_time_lets_others_pass_for_one_transaction(store):
     for each in chunks:
         each.result(30)
     assert done == ["a post", "chunk 1", "a post that came meanwhile", "chunk 2"]
+
+
+def test_results_that_waited_too_long_are_refused_and_what_waits_with_them_is_written(
+    app, make, monkeypatch
+):
+    writer = app.store.writer
+    monkeypatch.setattr(writer, "_wait_s", 0.05)
+    unsaved = app.submissions.ingest.solver.solve(make("late"))
+    go_on = held_up(writer)
+    late, change = writer.record([unsaved]), writer.change(new_run("kept"))
+    in_bulk = writer.record([unsaved], low_priority=True)
+    time.sleep(0.1)
+    go_on.set()
+    with pytest.raises(Busy, match="not written yet"):
+        late.result(30)
+    change.result(30)
+    assert names(app.store) == ["kept"]
+    (outcome,) = in_bulk.result(30)
+    assert not outcome.replayed
 
 
 def test_an_answer_comes_after_its_commit(store):

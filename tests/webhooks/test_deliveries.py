@@ -144,6 +144,8 @@ def test_after_a_day_an_event_is_a_dead_letter_and_is_sent_again_on_request(
     assert letter["spacecraft"] == "XTE"
     assert letter["last_fault"] == "status 500"
     assert letter["attempts"] >= 1
+    labels = f'{{name="test",webhook="{hook["id"]}"}}'
+    assert f"starid_webhook_dead_letters{labels} 1.0" in service.client.get("/metrics").text
     receiver.answer.refused.clear()
     assert service.ask(hook, "retry", events=[letter["event"] + 1]).status_code == 422
     assert service.ask(hook, "retry", events=[letter["event"]]).json() == {"queued": 1}
