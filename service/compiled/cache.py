@@ -22,6 +22,7 @@ SOURCES = (
     "service/missions",
     "service/observations/batch.py",
     "service/observations/calibrate.py",
+    "service/observations/columns.py",
     "service/observations/focal_plane.py",
     "service/observations/scans",
     "service/simulate/scenes.py",
