@@ -37,7 +37,7 @@ from service.acquire.warnings import (
     warnings_of_trackers,
     warnings_of_tracking,
 )
-from service.acquire.zone_search import Search, StepTimer, ZoneSearch
+from service.acquire.zone_search import Search, StepTimer, ZoneSearch, kept
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.errors import BadBatch, Fault, shown_value
 from service.identify.budget import MAX_WORK, WorkBudget
@@ -61,7 +61,7 @@ SHORT_WORK = 100_000
 """The most units of work of what is solved at once: seven milliseconds."""
 
 
-class ResultColumns(Struct, frozen=True, eq=False, gc=False):
+class ResultColumns(Struct, frozen=True, eq=False):
     """What was found of n batches, row by row; see `CorrectedColumns` and `ZoneSearch`.
 
     `searches` has the settings of each row, `stars` the stars in body axes, and `zones` what was
@@ -139,7 +139,7 @@ def acquire_many(
                 searches[row] = _search(batch, mission, sky, timer, budget)
         except Exception as error:
             # Whoever asks for this batch gets it; others have their results.
-            finished[row] = error
+            finished[row] = kept(error)
         several.append(batch)
         trackers += its_trackers
     if any(one is not other for one, other in zip(several, batches.batches, strict=True)):
@@ -153,7 +153,7 @@ def acquire_many(
             try:
                 zones.add(row, search, search.prior)
             except Exception as error:
-                finished[row] = error
+                finished[row] = kept(error)
     zones.run(timer)
     finished |= zones.errors
     final = set(zones.final_rows())
@@ -204,7 +204,7 @@ def _continued(
     try:
         return _composed(search, corrected, *find_groups(search, corrected, first))
     except Exception as error:
-        return error
+        return kept(error)
 
 
 def _composed(

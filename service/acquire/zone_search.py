@@ -14,6 +14,7 @@ from service.acquire.choices import Choices
 from service.acquire.result import Place
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.attitude.solve import METHODS, WORST_AXIS_RAD
+from service.errors import AcquisitionError
 from service.identify.attitude_from_matches import fit_sightings, room_for_fits, with_tracker_fits
 from service.identify.budget import WorkBudget
 from service.identify.hypotheses.ledger import LEAST_GROUP
@@ -30,10 +31,20 @@ from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
 from service.missions.mission import Mission, SolverName, Tracker
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedColumns
+from service.sky.cache import NotAtHand
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion, Zone, count_within, zone_key
 from service.vectors import Vector
+
+
+def kept(error: Exception) -> Exception:
+    """An error as the result of a row: without its traceback, which holds all columns, if expected.
+
+    A batch that has to wait is one.
+    """
+    is_expected = isinstance(error, AcquisitionError | NotAtHand)
+    return error.with_traceback(None) if is_expected else error
 
 
 class StepTimer:
@@ -66,7 +77,7 @@ class StepTimer:
         return {step: ns // 1000 // self._batches for step, ns in self.ns.items()}
 
 
-class Search(Struct, frozen=True, eq=False, gc=False):
+class Search(Struct, frozen=True, eq=False):
     """What holds for every search for the stars of one batch, all of them or a part."""
 
     batch: ObservationBatch
@@ -100,7 +111,7 @@ class Search(Struct, frozen=True, eq=False, gc=False):
         return self.sky.zone(self.mission, self.run_catalog, region, *self.zone_choices)
 
 
-class ZoneResult(Struct, frozen=True, eq=False, gc=False):
+class ZoneResult(Struct, frozen=True, eq=False):
     """What was found in the zones about one presumed attitude.
 
     `places` are those of the trackers.
@@ -117,7 +128,7 @@ class ZoneResult(Struct, frozen=True, eq=False, gc=False):
         return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
 
 
-class _Asked(Struct, frozen=True, eq=False, gc=False):
+class _Asked(Struct, frozen=True, eq=False):
     """One row of a `ZoneSearch`: about what to search, and what that may cost."""
 
     search: Search
@@ -213,7 +224,7 @@ class ZoneSearch:
             try:
                 zone, cached = first.search.zone(first.regions[index])
             except Exception as error:
-                self.errors |= dict.fromkeys((row for row, _ in sightings), error)
+                self.errors |= dict.fromkeys((row for row, _ in sightings), kept(error))
                 continue
             timer.end("zone")
             self._identify(zone, index, sightings)
@@ -245,7 +256,7 @@ class ZoneSearch:
                     self._by_itself[t], self.found.star[stars] = alone, alone.star
             except Exception as error:
                 # What is wrong with one keeps no other from its result.
-                self.errors[row] = error
+                self.errors[row] = kept(error)
         count_within(zone, which, seen.axis, seen.least, seen.most, self.within)
         if budgets:
             if len(budgets) < len(which):

@@ -1,6 +1,7 @@
 """Many batches through the compiled loops: the answers of one by one, however they are grouped."""
 
 import copy
+import gc
 import json
 
 import msgspec
@@ -10,6 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from service.acquire import BatchColumns, acquire, acquire_many, acquired
+from service.acquire.zone_search import ZoneSearch
 from service.errors import AcquisitionError, BadInput
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
@@ -145,3 +147,17 @@ def test_rows_that_would_take_long_are_not_at_hand_and_others_are(cases, sky):
 def test_no_batches_have_no_rows(cases, sky):
     mission, _, _ = cases["XTE"]
     assert acquired([], mission, sky) == []
+
+
+def test_what_keeps_a_row_from_a_result_is_freed_at_once(cases, sky):
+    """An error's traceback would hold the columns that hold the error."""
+    mission, several, _ = cases["XTE"]
+    fresh = SkyModel(sky.catalog, LruCache(64 << 20))
+    gc.collect()
+    gc.disable()
+    try:
+        found = [acquired([each], mission, fresh, at_once=True)[0] for each in several]
+        assert all(isinstance(each, BadInput | NotAtHand) for each in found)
+        assert not any(isinstance(each, ZoneSearch) for each in gc.get_objects())
+    finally:
+        gc.enable()
