@@ -554,6 +554,8 @@ def test_a_change_and_its_note_are_stored_together_or_not_at_all(chosen_database
             listed = client.get("/api/v1/audit").json()["items"]
             return len(history), [each["status"] for each in listed if each["status"] < 400]
 
+        # A start tries a write of its own.
+        wait_until(lambda: client.get("/readyz").status_code == 200)
         rename(broken, "elsewhere")
         assert client.put(limit, json=body).status_code >= 500
         rename("elsewhere", broken)
