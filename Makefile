@@ -11,8 +11,8 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?=
 # Of `make torture`: an expression as pytest -k has it, e.g. "kills and sqlite"; empty: all
 PARTS ?=
-# Processes that share the tests between them, a file to each at a time, of 1 to 1.5 GB; 0 for one
-# after another.  Three for two cores: many tests wait for a process of their own.
+# Processes that share the tests between them, a file to each at a time, of 2 GB; 0 for one after
+# another.  Three for two cores: many tests wait for a process of their own.
 WORKERS ?= $(shell echo $$(($$(getconf _NPROCESSORS_ONLN) * 3 / 2)))
 BENCH_ARGS ?=
 # Of `make mutants`: e.g. "--seed 2 --suite sitting"; --help says more

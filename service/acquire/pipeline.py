@@ -62,7 +62,7 @@ SHORT_WORK = 100_000
 
 
 class ResultColumns(Struct, frozen=True, eq=False):
-    """What was found of n batches, row by row; see `CorrectedColumns` and `ZoneSearch`.
+    """The results of n batches, a row for each; see `CorrectedColumns` and `ZoneSearch`.
 
     `searches` has the settings of each row, `stars` the stars in body axes, and `zones` what was
     found about the a priori attitudes, also of rows that went on from there.  `finished` has the
@@ -117,9 +117,9 @@ def acquire_many(
 ) -> ResultColumns:
     """Identify the stars of many batches of one mission, and solve for their attitudes.
 
-    What is wrong with one keeps no other from its result.  `at_once` is for who must not wait:
-    rows have `NotAtHand` where the whole sky is searched, a zone has to be built, or more work is
-    counted than `SHORT_WORK`.  The answers of the others are the same.
+    A faulty batch gets its error, the others their results.  `at_once` is for callers that must
+    not wait: a row has `NotAtHand` where the whole sky is searched, a zone has to be built, or
+    more work is counted than `SHORT_WORK`.  The answers of the others are the same.
     """
     sky = sky.at_hand() if at_once else sky
     timer = StepTimer(len(batches.batches))
@@ -138,7 +138,7 @@ def acquire_many(
                 budget = WorkBudget(SHORT_WORK if at_once else MAX_WORK)
                 searches[row] = _search(batch, mission, sky, timer, budget)
         except Exception as error:
-            # Whoever asks for this batch gets it; others have their results.
+            # Whatever fails for one batch is its result: the others go on.
             finished[row] = kept(error)
         several.append(batch)
         trackers += its_trackers
@@ -153,6 +153,7 @@ def acquire_many(
             try:
                 zones.add(row, search, search.prior)
             except Exception as error:
+                # As above: the others go on.
                 finished[row] = kept(error)
     zones.run(timer)
     finished |= zones.errors
@@ -204,6 +205,7 @@ def _continued(
     try:
         return _composed(search, corrected, *find_groups(search, corrected, first))
     except Exception as error:
+        # The row's own result, as the callers of `acquire_many` expect.
         return kept(error)
 
 

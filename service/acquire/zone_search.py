@@ -112,7 +112,7 @@ class Search(Struct, frozen=True, eq=False):
 
 
 class ZoneResult(Struct, frozen=True, eq=False):
-    """What was found in the zones about one presumed attitude.
+    """The result of a search in the zones about one presumed attitude.
 
     `places` are those of the trackers.
     """
@@ -224,6 +224,7 @@ class ZoneSearch:
             try:
                 zone, cached = first.search.zone(first.regions[index])
             except Exception as error:
+                # The batches of this zone fail; those of other zones go on.
                 self.errors |= dict.fromkeys((row for row, _ in sightings), kept(error))
                 continue
             timer.end("zone")
@@ -255,7 +256,7 @@ class ZoneSearch:
                     alone = identifier.identify(self._sighting(t, asked, index, zone, budget))
                     self._by_itself[t], self.found.star[stars] = alone, alone.star
             except Exception as error:
-                # What is wrong with one keeps no other from its result.
+                # This batch fails; the others of the zone go on.
                 self.errors[row] = kept(error)
         count_within(zone, which, seen.axis, seen.least, seen.most, self.within)
         if budgets:
@@ -315,7 +316,8 @@ class ZoneSearch:
         """The rows of batches that need no other search.
 
         They have a good attitude, or an identifier that never searches the whole sky instead, and
-        too few stars left for a second group.  What was found may contradict a prediction.
+        too few stars left for a second group.  A batch with a prediction is never among them:
+        its attitude may contradict the prediction.
         """
         offsets, trackers = self.stars.star_offsets.tolist(), self.stars.tracker_offsets.tolist()
         explained, final = self.found.explained.tolist(), []
@@ -331,7 +333,7 @@ class ZoneSearch:
         return final
 
     def result(self, row: int) -> ZoneResult:
-        """What was found for a row."""
+        """The stars and the attitude that the search found for a row."""
         asked, stars, trackers = self._asked[row], self.stars, self.stars.trackers_of(row)
         search = asked.search
         offsets = stars.star_offsets[trackers.start : trackers.stop + 1].tolist()
