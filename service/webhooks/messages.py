@@ -1,6 +1,7 @@
-"""Which events a webhook wants, and the messages that they become."""
+"""Which events a webhook wants, the messages that they become, and what comes of sending them."""
 
 import hashlib
+from dataclasses import dataclass
 
 import msgspec
 
@@ -10,6 +11,9 @@ from service.storage.sql.columns import Row
 from service.storage.webhooks.registered import Registered
 
 TEST_KIND = "test"
+TOTAL_S = 10.0
+"""From the look-up of the name to the end of the answer."""
+GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
 
 
 class _AlarmData(msgspec.Struct):
@@ -27,6 +31,24 @@ class _Message(msgspec.Struct):
     run: str | None
     spacecraft: str | None
     data: msgspec.Raw
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What came of an attempt: a status, or the fault that kept the answer away.
+
+    `retry_after_s` is what the receiver asked for, in seconds.
+    """
+
+    status: int | None
+    fault: str | None
+    retry_after_s: float | None = None
+    duration_s: float = 0.0
+
+    @property
+    def delivered(self) -> bool:
+        """Whether the receiver has the event."""
+        return self.fault is None
 
 
 def wants(webhook: Registered, event: Event) -> bool:

@@ -3,7 +3,6 @@
 import asyncio
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from email.utils import parsedate_to_datetime
 
 import httpx
@@ -11,31 +10,11 @@ import httpx
 from service import __version__
 from service.settings import Network
 from service.webhooks.addresses import Refused, reachable_addresses
+from service.webhooks.messages import TOTAL_S, Outcome
 
-TOTAL_S = 10.0
-"""From the look-up of the name to the end of the answer."""
 MAX_ANSWER_BYTES = 64 << 10
 MAX_FAULT = 300
 PORTS = {"http": 80, "https": 443}
-GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """What came of an attempt: a status, or the fault that kept the answer away.
-
-    `retry_after_s` is what the receiver asked for, in seconds.
-    """
-
-    status: int | None
-    fault: str | None
-    retry_after_s: float | None = None
-    duration_s: float = 0.0
-
-    @property
-    def delivered(self) -> bool:
-        """Whether the receiver has the event."""
-        return self.fault is None
 
 
 class CheckedTransport(httpx.AsyncBaseTransport):
