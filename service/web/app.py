@@ -57,7 +57,7 @@ from service.web.warm_request import warm_request
 log = logging.getLogger(__name__)
 
 WORKER_THREADS = 64
-"""Handlers run in threads, and those of concurrent repeats wait there for the first."""
+"""Handlers run in threads; those of repeated frames wait there for the first."""
 
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
@@ -125,7 +125,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
     web_app.state.body_budget = BodyBudget(limits)
     web_app.state.metrics = Metrics(app)
     web_app.state.live = Live(app)
-    # The last that is added is the first that is asked: it passes the direct routes by these two.
+    # Added last, so outermost: the direct routes skip the two below.
     web_app.add_middleware(ConditionalAnswers)
     web_app.add_middleware(
         GZipMiddleware,
