@@ -9,7 +9,6 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.alarms.causes import CAUSES
 from service.alarms.limits import Severity
 from service.alarms.quantities import quantity_named, trend_names
 from service.alarms.subjects import limited_trackers
@@ -229,7 +228,7 @@ def alarm_page(
         alarm=alarm,
         line=AlarmLine(alarm, times),
         is_retired=is_retired,
-        cause=CAUSES.get(alarm.quantity),
+        cause=quantity_named(alarm.quantity).cause,
         related=_related(context, alarm),
         trend=_trend(context, alarm),
         around=around,
