@@ -29,6 +29,9 @@ def test_without_its_database():
 """
 
 
+OF_ITS_OWN = {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": ""}
+
+
 @pytest.fixture
 def run(tmp_path):
     """Run the parts, or some of them; what pytest printed and all results so far."""
@@ -41,7 +44,9 @@ def run(tmp_path):
         done = subprocess.run(
             [*command, *arguments, parts],
             cwd=CHECKOUT,
-            env=os.environ | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"} | environment,
+            env=os.environ
+            | {"PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1", "PYTEST_ADDOPTS": ""}
+            | environment,
             capture_output=True,
             text=True,
             check=False,

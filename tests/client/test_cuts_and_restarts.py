@@ -132,8 +132,8 @@ def test_a_stream_that_is_cut_and_a_service_that_is_killed_lose_and_double_nothi
         app.close()
     assert [(each.id, each.kind) for each in follower.events] == recorded
     told = [event.data for event in follower.events if event.kind == "batches"]
-    assert sum(each["batches"] for each in told) == wanted
+    assert sum(each.batches for each in told) == wanted
     # One event may stand for several batches, where the projector came late.
-    latest = [int(each["latest"]["batch"].removeprefix("b-")) for each in told]
-    assert latest == (np.cumsum([each["batches"] for each in told]) - 1).tolist()
+    latest = [int(each.latest.batch.removeprefix("b-")) for each in told]
+    assert latest == (np.cumsum([each.batches for each in told]) - 1).tolist()
     assert sorted(held) == sorted(f"b-{n}" for n in range(wanted))

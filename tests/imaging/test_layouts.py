@@ -287,7 +287,8 @@ def test_a_jpeg_with_a_changed_bit_is_refused_or_ends_in_its_place(rng, name):
     values = np.kron(rng.integers(90, 160, (9, 12)), np.ones((8, 8))) + rng.normal(0, 6, (72, 96))
     data = jpeg(values.astype(np.uint8), **JPEGS[name])
     truth, scan, refused, moved = read(data).counts, data.find(b"\xff\xda") + 10, 0, 0
-    for at in rng.integers(scan, len(data) - 8, draws(100, 1_000)):
+    tries = draws(100, 1_000)
+    for at in rng.integers(scan, len(data) - 8, tries):
         damaged = bytearray(data)
         damaged[at] ^= 1 << rng.integers(8)
         try:
@@ -299,7 +300,7 @@ def test_a_jpeg_with_a_changed_bit_is_refused_or_ends_in_its_place(rng, name):
         change = (frame.counts - truth)[-8:, 48:]
         moved += np.ptp(change) > 60
     assert refused > 5
-    assert moved <= 3
+    assert moved <= 0.03 * tries
 
 
 def test_a_jpeg_with_a_byte_more_or_less_is_refused_where_pillow_reads_it(rng):

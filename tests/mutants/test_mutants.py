@@ -144,6 +144,7 @@ def toy(tmp_path, monkeypatch):
         (tmp_path / "toy" / name).write_text(text, "utf-8")
     subprocess.run(["git", "init", "-q"], cwd=tmp_path / "toy", check=True)
     monkeypatch.setenv("PYTEST_DISABLE_PLUGIN_AUTOLOAD", "1")
+    monkeypatch.delenv("PYTEST_ADDOPTS", raising=False)
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     return tmp_path / "toy"
 

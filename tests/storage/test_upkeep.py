@@ -250,6 +250,7 @@ def test_any_changed_value_of_the_record_is_found_and_named(
     assert verify(database) == []
 
 
+@pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_byte_changed_in_the_file_is_found_or_touches_no_content(
     filled, database, tmp_path, seed, figures
 ):

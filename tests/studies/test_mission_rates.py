@@ -79,7 +79,7 @@ class TestRates:
         assert alone == shared
 
     def test_every_setting_sees_the_same_stars(self, missions, sky, seed):
-        sweeps = ("separation_deg=.002,.05", "radius_deg=10.66,12")
+        sweeps = ("separation_deg=.0005,.05", "radius_deg=10.66,12")
         plan = plan_of(missions["XTE"], *sweeps, seed=seed, zones=1)
         counts = zone_counts(plan, 0, sky)
         assert np.unique(counts.sum(axis=1)).size == 1

@@ -62,13 +62,18 @@ def hear(connection):
         told[type(error).__name__] += 1
 
 
+def is_over():
+    """Whether to stop: not before an answer came, which on a busy machine takes a while."""
+    return stopping.is_set() and told
+
+
 def send_endlessly(port, begin, again):
     """One request without an end after another."""
-    while not stopping.is_set():
+    while not is_over():
         with connected(port) as connection:
             try:
                 connection.sendall(begin)
-                while not stopping.is_set():
+                while not is_over():
                     connection.sendall(again)
                     counted["bytes"] += len(again)
             except OSError:
