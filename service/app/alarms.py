@@ -10,7 +10,7 @@ from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
 from service.storage.projections.silence import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms
-from service.storage.queries.period.alarms import TimeOut, alarm_spans, times_out
+from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, shifted, utc_now

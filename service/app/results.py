@@ -12,15 +12,12 @@ from service.storage.models.base import Page
 from service.storage.models.period import PeriodStars
 from service.storage.models.star_field import StarField
 from service.storage.queries import results
-from service.storage.queries.neighbours import here_of, neighbours
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.period.sample import sample_period
-from service.storage.queries.period.stars import period_stars
+from service.storage.queries.period import period_stars, sample_period
 from service.storage.queries.recorded_batch import recorded_batch, recorded_mission
-from service.storage.queries.results import OutcomeName, StatusName
-from service.storage.queries.star_field import star_field_of
+from service.storage.queries.results import OutcomeName, StatusName, here_of, neighbours
+from service.storage.queries.star_field import star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
-from service.storage.queries.tracker_comparison import tracker_comparison
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE, Answered
 from service.storage.sql.columns import Row

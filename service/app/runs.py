@@ -16,10 +16,9 @@ from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
 from service.storage.models.runs import Forgotten, Run, RunState
-from service.storage.queries import histories, overview
+from service.storage.queries import fleet, histories
+from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.runs.comparison import changed_batches, compare_runs
-from service.storage.queries.runs.rates import run_rates
 from service.storage.recording.results import set_run_alarms
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.forget import ForgetFilter, forget, found
@@ -45,7 +44,7 @@ class Runs:
     def default(self) -> str:
         """The run to show first: live, or the newest while that is empty."""
         with self._context.reading() as connection:
-            return overview.default_run(connection)
+            return fleet.default_run(connection)
 
     def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> RunState:
         """Turn the evaluation of limits on or off for the batches that a run gets from now on."""

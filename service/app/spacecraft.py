@@ -22,9 +22,9 @@ from service.storage.models.spacecraft import (
 )
 from service.storage.models.trends import History, Ranking
 from service.storage.projections import rollups
-from service.storage.queries import fleet, histories, overview, trends
+from service.storage.queries import fleet, histories, trends
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.ranking import worst_batches
+from service.storage.queries.trends import worst_batches
 from service.storage.recording.tracker_splits import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
@@ -39,10 +39,10 @@ class Spacecraft:
     def overview(
         self, run: str | None = None, spacecraft: Collection[str] | None = None
     ) -> Overview:
-        """Every spacecraft in a run at a glance, or some; see `overview.overview`."""
+        """Every spacecraft in a run at a glance, or some; see `fleet.overview`."""
         with self._context.reading() as connection:
             missions = self._context.known.values()
-            return overview.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
+            return fleet.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
 
     def fleet(
         self,

@@ -22,7 +22,7 @@ from service.products.formats import OUTPUT_FORMATS
 from service.products.parquet import write_parquet
 from service.products.tables import Column, Table, write_csv
 from service.storage.gyro import samples_table
-from service.storage.queries.tables import result_tables
+from service.storage.queries import result_tables
 from service.times import parse_utc
 from tests.products.series import GOLDEN, random_quaternions, rows, whole, written
 

@@ -18,7 +18,7 @@ from service.ingest.reprocess import ReprocessPlan, after_place, not_yet
 from service.storage.archive.folder import Part, encoded, manifest_of, manifests
 from service.storage.archive.reading import Archive, PlacedPart, parts_between
 from service.storage.queries.pages import PLACE, Place, ResultFilter
-from service.storage.queries.with_archive.rows import bounds_of
+from service.storage.queries.with_archive import bounds_of
 from service.storage.recording.identity import look_up
 from service.storage.sql.rollup_tables import rollups_daily
 from service.storage.sql.tables import batches, results

@@ -18,7 +18,7 @@ from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries.pages import PLACE, ResultFilter, newest
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
+from service.storage.queries.with_archive import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.rollup_tables import rollups_daily

@@ -16,7 +16,7 @@ from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.models.alarms import Alarm, AlarmWithActions, Limit, SeverityName
-from service.storage.queries.period.alarms import TimeOut
+from service.storage.queries.alarms import TimeOut
 from service.times import Utc, recorded_utc, shifted
 from service.web.console.formatting import with_day_of_year
 from service.web.console.page_context import ContextDep, PageContext, SortedQuery

@@ -1,28 +1,38 @@
-"""Two runs side by side: what became of the same stars, and how far the attitudes differ."""
+"""Two runs of one spacecraft side by side: batch by batch, and the rates of each over time."""
 
+import math
 from collections import Counter
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sqlalchemy import Connection, Subquery, and_, case, func, or_, select
+from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
-from service.storage.archive.reading import Archive
+from service.storage.archive.reading import Archive, parts_between, places
 from service.storage.models.compare import (
     AngleStatistics,
     OutcomeCounts,
+    RatesOfRuns,
     RunAttitudes,
     RunChange,
     RunChangeSide,
     RunComparison,
+    RunRates,
     RunStars,
     RunTransition,
     StatusCounts,
 )
-from service.storage.queries.pages import ResultFilter
-from service.storage.queries.with_archive.both_runs import both_runs, is_archived_in_part
+from service.storage.queries.pages import PLACE, Place, ResultFilter
+from service.storage.queries.time_buckets import BucketFilter, Columns, Level, read_buckets
+from service.storage.queries.with_archive import ArchiveUse, bounds_of, first_rows
+from service.storage.sql.archive_tables import archived_batches
+from service.storage.sql.rollup_tables import COUNTS, rollups_daily
 from service.storage.sql.tables import COUNTED, batches, results, solutions, star_results
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
+
+if TYPE_CHECKING:
+    from service.storage.archive.opened import Opened
 
 _READ_AT_ONCE = 10_000
 _QUATERNION = ("q1", "q2", "q3", "qc")
@@ -247,3 +257,175 @@ def _between(rows: Vector) -> Vector:
     one, other = rows[:, :4], rows[:, 4:]
     apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, apart / 2.0)) * ARCSEC_PER_RADIAN)
+
+
+GROUP = 2_000
+"""Batches of a run that are compared together."""
+_COMPARED = ("solution", "stars")
+_AT_ONCE = 1_000
+
+
+def is_archived_in_part(connection: Connection, selected: ResultFilter, other: str) -> bool:
+    """Whether the archive has batches of the period in one of the runs."""
+    return any(
+        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
+        for run in (selected.run, other)
+    )
+
+
+def both_runs(
+    connection: Connection,
+    archive: Archive,
+    selected: ResultFilter,
+    other: str,
+    latest: int | None,
+) -> Iterator["Opened"]:
+    """The selected batches with those of the same names in another run, latest first.
+
+    At most the `latest` of those selected.  Recorded and archived ones are copied into one
+    database, so that any of the two may be in either place.
+    """
+    from service.storage.archive.opened import Opened
+
+    named = (results.c.spacecraft, batches.c.batch)
+    query = select(*PLACE, *named).join_from(results, batches, results.c.batch_id == batches.c.id)
+    query = query.where(*selected.conditions())
+    use, left = ArchiveUse(archive), latest
+    beyond: Place | None = None
+    while left is None or left > 0:
+        limit = GROUP if left is None else min(GROUP, left)
+        found = first_rows(
+            connection, use, query, selected, limit, newest_first=True, beyond=beyond
+        ).rows
+        if not found:
+            return
+        opened = Opened()
+        names = [(each.row.spacecraft, each.row.batch) for each in found]
+        own: dict[bool, list[str]] = {True: [], False: []}
+        for each in found:
+            own[each.archived].append(each.row.batch_id)
+        _add_recorded(connection, opened, [*own[False], *_named(connection, batches, other, names)])
+        archived = [*own[True], *_named(connection, archived_batches, other, names)]
+        _add_archived(connection, archive, opened, archived)
+        opened.add_indexes()
+        yield opened
+        beyond = found[-1].place
+        left = None if left is None else left - len(found)
+        if len(found) < limit:
+            return
+
+
+def _named(
+    connection: Connection, table: Table, run: str, names: Sequence[tuple[str, str]]
+) -> list[str]:
+    """The ids of batches of a run by spacecraft and name."""
+    c = table.c
+    found: list[str] = []
+    for first in range(0, len(names), _AT_ONCE):
+        some = names[first : first + _AT_ONCE]
+        query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(some))
+        found += connection.scalars(query)
+    return found
+
+
+def _add_recorded(connection: Connection, opened: "Opened", ids: Sequence[str]) -> None:
+    from service.storage.archive.rows import read_rows
+
+    if ids:
+        opened.add_rows(read_rows(connection, ids))
+
+
+def _add_archived(
+    connection: Connection, archive: Archive, opened: "Opened", ids: Collection[str]
+) -> None:
+    from service.storage.archive.opened import columns_of
+
+    for path, of_part in _places(connection, list(ids)).items():
+        own: Any = [[("id", "in", of_part)], [("batch_id", "in", of_part)]]
+        opened.add_partition(archive.read(path, columns_of(_COMPARED), own))
+
+
+def _places(connection: Connection, ids: Sequence[str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for first in range(0, len(ids), _AT_ONCE):
+        for path, some in places(connection, ids[first : first + _AT_ONCE]).items():
+            found.setdefault(path, []).extend(some)
+    return found
+
+
+_SHOWN_BY_HOUR_S = 30 * DAY_S
+"""The longest period with a cell an hour; a longer one has cells of one day or several."""
+_MOST_CELLS_OF_DAYS = 732
+"""Two years of days."""
+_SHARES = ("ambiguous", "unmatched")
+
+
+def run_rates(
+    connection: Connection,
+    spacecraft: str,
+    runs: Sequence[str],
+    start: Utc | None,
+    end: Utc | None,
+) -> RatesOfRuns | None:
+    """What became of all stars of each run, in total and over time.
+
+    The period is that between `start` and `end`, and at most the days that all runs have; None
+    where there are none.
+    """
+    common = _common_days(connection, spacecraft, runs)
+    if common is None:
+        return None
+    start = max(start or common[0], common[0], key=_tai_ns)
+    end = min(end or common[1], common[1], key=_tai_ns)
+    if start.tai_ns >= end.tai_ns:
+        return None
+    first_s, end_s = unix_seconds([start.tai_ns, end.tai_ns]).tolist()
+    level: Level = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
+    width_s = HOUR_S if level == "hour" else DAY_S * _days_of_a_cell(end_s - first_s)
+    cells = int(-(-end_s // width_s) - first_s // width_s)
+    rates = []
+    for run in runs:
+        span = BucketFilter(spacecraft, run, start, end)
+        buckets = read_buckets(connection, span, level, COUNTS)
+        place = (buckets["unix_s"] // width_s - first_s // width_s).astype(int)
+        rates.append(
+            RunRates(
+                run=run,
+                totals={name: int(buckets[name].sum()) for name in COUNTS},
+                shares={name: _share(buckets, name, place, cells) for name in _SHARES},
+            )
+        )
+    return RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
+
+
+def _tai_ns(moment: Utc) -> int:
+    return moment.tai_ns
+
+
+def _days_of_a_cell(length_s: float) -> int:
+    return math.ceil(length_s / (DAY_S * _MOST_CELLS_OF_DAYS))
+
+
+def _common_days(
+    connection: Connection, spacecraft: str, runs: Sequence[str]
+) -> tuple[Utc, Utc] | None:
+    c = rollups_daily.c
+    query = (
+        select(func.min(c.bucket), func.max(c.bucket))
+        .where(c.spacecraft == spacecraft, c.run.in_(runs), c.batches > 0)
+        .group_by(c.run)
+    )
+    days = connection.execute(query).all()
+    if len(days) < len({*runs}):
+        return None
+    first, last = max(day[0] for day in days), min(day[1] for day in days)
+    return bucket_start(first, DAY_S), bucket_start(last + 1, DAY_S)
+
+
+def _share(buckets: Columns, name: str, place: Vector, cells: int) -> Vector:
+    """The share of the observed stars in each cell; NaN in one without a star."""
+    part, whole = (
+        np.bincount(place, weights=buckets[column], minlength=cells)
+        for column in (name, "observed")
+    )
+    return np.asarray(np.divide(part, whole, out=np.full(cells, np.nan), where=whole > 0))
