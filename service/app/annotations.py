@@ -8,7 +8,7 @@ from sqlalchemy import Connection
 from service.access.audit import Entry
 from service.app.context import Context, known_id
 from service.ingest.solver_pool import mission_in_input
-from service.storage.models.annotations import Annotation
+from service.storage.models.alarms import Annotation
 from service.storage.models.base import Page
 from service.storage.recording import annotations
 from service.storage.recording.ids import Ulids

@@ -6,7 +6,7 @@ from typing import Any
 
 from service.alarms.quantities import QUANTITIES, QuantityName
 from service.products.tables import Column, Page, Table
-from service.storage.models.trends import History
+from service.storage.models.spacecraft import History
 from service.times import utc_of_unix
 
 BATCH_COLUMNS = (

@@ -9,8 +9,7 @@ from service.ingest.solver_pool import mission_in_input
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
-from service.storage.models.period import PeriodStars
-from service.storage.models.star_field import StarField
+from service.storage.models.charts import PeriodStars, StarField
 from service.storage.queries import results
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import period_stars, sample_period

@@ -11,16 +11,16 @@ from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission
 from service.storage.models.base import Page
-from service.storage.models.fleet import Fleet
-from service.storage.models.overview import Overview
+from service.storage.models.overview import Fleet, Overview
 from service.storage.models.spacecraft import (
     AttitudeRow,
+    History,
     MissionNow,
+    Ranking,
     Rates,
     SpacecraftRow,
     SpacecraftState,
 )
-from service.storage.models.trends import History, Ranking
 from service.storage.projections import rollups
 from service.storage.queries import fleet, histories, trends
 from service.storage.queries.pages import ResultFilter

@@ -36,10 +36,8 @@ from service.simulate.frames import FrameSettings, draw_frames
 from service.storage.projections import rollups
 from service.storage.projections.projector import rebuild_trends
 from service.storage.recording.digests import digest_of
-from service.storage.sql.columns import metadata
+from service.storage.sql.columns import PackedText, metadata
 from service.storage.sql.engines import database_url, reading_engine
-from service.storage.sql.packed_text import PackedText
-from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.tables import (
     batches,
     catalogs,
@@ -48,6 +46,8 @@ from service.storage.sql.tables import (
     mission_uses,
     missions,
     results,
+    rollups_daily,
+    rollups_hourly,
     solutions,
     star_results,
     tracker_values,

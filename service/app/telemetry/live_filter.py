@@ -19,7 +19,7 @@ from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.access_tables import audit
-from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.tables import batches, results
 from service.times import DAY_S, recorded_utc, utc_now
 

@@ -20,8 +20,7 @@ from service.storage.archive.reading import Archive, PlacedPart, parts_between
 from service.storage.queries.pages import PLACE, Place, ResultFilter
 from service.storage.queries.with_archive import bounds_of
 from service.storage.recording.identity import look_up
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import batches, results
+from service.storage.sql.tables import batches, results, rollups_daily
 from service.storage.store import Store
 from service.times import DAY_S, bucket_start, parse_utc
 

@@ -18,7 +18,7 @@ from service.storage.models.base import Page
 from service.storage.recording.ids import following_ulid
 from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import execute
+from service.storage.sql.statements import execute
 
 _GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])
 _RESULT = msgspec.json.Decoder(CalibrationResult)

@@ -14,9 +14,8 @@ from service.sky.model import SkyModel
 from service.storage.grades.lone_stars import lone_stars
 from service.storage.gyro.blocks import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import results, solutions
+from service.storage.sql.grade_tables import gyro_blocks
+from service.storage.sql.tables import results, rollups_daily, solutions
 from service.times import DAY_S, Utc
 from service.vectors import Vector
 

@@ -15,7 +15,7 @@ from service.storage.models.base import Page
 from service.storage.models.gyro import GyroBlockRow, GyroSamples
 from service.storage.recording import events
 from service.storage.sql.columns import Row
-from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.statements import insert_runs
 from service.storage.sql.tables import runs
 from service.times import Utc, recorded_utc, shifted

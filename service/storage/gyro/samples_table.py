@@ -10,7 +10,7 @@ from sqlalchemy import Connection, func, select
 from service.gyro.block import Nanoseconds, texts_of
 from service.products.tables import Column, Page, Table
 from service.storage.gyro.blocks import BlockFilter, block_of
-from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.grade_tables import gyro_blocks
 
 BLOCKS = 20
 """Blocks that are read together."""

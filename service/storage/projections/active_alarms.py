@@ -10,7 +10,7 @@ from service.storage.queries.alarms import change, record_action
 from service.storage.recording.ids import Ulids
 from service.storage.sql.alarm_tables import alarms
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import prepared
+from service.storage.sql.statements import prepared
 
 _IDS = Ulids()
 

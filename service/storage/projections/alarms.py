@@ -23,8 +23,7 @@ from service.storage.queries.limits import limits_of
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import watches
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import prepared
-from service.storage.sql.statements import insert_missing
+from service.storage.sql.statements import insert_missing, prepared
 from service.storage.sql.tables import batches, missions, results, runs
 from service.times import recorded_utc
 

@@ -23,8 +23,8 @@ from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals, states
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
-from service.storage.sql.prepared import execute
 from service.storage.sql.projector_lock import NotProjecting
+from service.storage.sql.statements import execute
 from service.storage.sql.tables import projector
 from service.storage.store import Store
 

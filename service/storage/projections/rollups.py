@@ -17,17 +17,20 @@ from service.storage.projections.recorded import RecordedResult
 from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
 from service.storage.recording.result_metrics import merge, rolled_up
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
-from service.storage.sql.archive_tables import archived_hours
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.statements import add_rollups, insert_all
+from service.storage.sql.tables import (
     COUNTS,
+    archived_hours,
+    batches,
+    projector,
+    results,
     rollups_daily,
     rollups_hourly,
     tracker_rollups_daily,
     tracker_rollups_hourly,
+    tracker_values,
 )
-from service.storage.sql.statements import add_rollups, insert_all
-from service.storage.sql.tables import batches, projector, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc, recorded_utc
 
 Bucket = Literal["hour", "day"]

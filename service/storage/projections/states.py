@@ -13,8 +13,7 @@ from service.storage.queries.pages import PLACE
 from service.storage.recording import events
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
-from service.storage.sql.columns import Row
-from service.storage.sql.packed_text import unpack
+from service.storage.sql.columns import Row, unpack
 from service.storage.sql.tables import results
 
 

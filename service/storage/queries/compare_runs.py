@@ -25,9 +25,16 @@ from service.storage.models.compare import (
 from service.storage.queries.pages import PLACE, Place, ResultFilter
 from service.storage.queries.time_buckets import BucketFilter, Columns, Level, read_buckets
 from service.storage.queries.with_archive import ArchiveUse, bounds_of, first_rows
-from service.storage.sql.archive_tables import archived_batches
-from service.storage.sql.rollup_tables import COUNTS, rollups_daily
-from service.storage.sql.tables import COUNTED, batches, results, solutions, star_results
+from service.storage.sql.tables import (
+    COUNTED,
+    COUNTS,
+    archived_batches,
+    batches,
+    results,
+    rollups_daily,
+    solutions,
+    star_results,
+)
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 

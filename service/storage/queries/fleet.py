@@ -12,14 +12,17 @@ from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, se
 from service.missions.mission import Mission
 from service.storage.models.alarms import Alarm
 from service.storage.models.answers import Summary
-from service.storage.models.fleet import (
+from service.storage.models.overview import (
     Fleet,
     FleetCells,
     FleetRow,
     KnownAttitude,
+    Overview,
+    OverviewRow,
+    Sparkline,
     TrackerCounts,
+    WindowCounts,
 )
-from service.storage.models.overview import Overview, OverviewRow, Sparkline, WindowCounts
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
 from service.storage.queries.pages import PLACE
@@ -38,8 +41,17 @@ from service.storage.queries.trends import latest_time_of
 from service.storage.recording.rollup_sql import SUMMED
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import COUNTS, rollups_daily, rollups_hourly
-from service.storage.sql.tables import batches, mission_uses, results, runs, solutions, star_results
+from service.storage.sql.tables import (
+    COUNTS,
+    batches,
+    mission_uses,
+    results,
+    rollups_daily,
+    rollups_hourly,
+    runs,
+    solutions,
+    star_results,
+)
 from service.times import (
     DAY_S,
     HOUR_S,

@@ -21,8 +21,15 @@ from service.storage.queries.results import summary_of, summary_query
 from service.storage.queries.with_archive import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
+from service.storage.sql.tables import (
+    batches,
+    mission_uses,
+    missions,
+    results,
+    rollups_daily,
+    runs,
+    solutions,
+)
 from service.times import DAY_S, Utc, bucket_start
 
 log = logging.getLogger(__name__)

@@ -23,7 +23,7 @@ from service.sky.ephemeris import apparent, sun_direction
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star
-from service.storage.models.period import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
+from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json

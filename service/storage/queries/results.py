@@ -11,9 +11,15 @@ from sqlalchemy import ColumnElement, Connection, Select, or_, select
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import Busy, NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
-from service.storage.models.answers import Answer, Neighbours, Result, StarCounts, Summary
+from service.storage.models.answers import (
+    Answer,
+    FrameWithStars,
+    Neighbours,
+    Result,
+    StarCounts,
+    Summary,
+)
 from service.storage.models.base import Page
-from service.storage.models.frames import FrameWithStars
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.queries.with_archive import (
     FIRST_ID,
@@ -24,9 +30,16 @@ from service.storage.queries.with_archive import (
     page_of,
 )
 from service.storage.recording.unsaved_result import STARS
-from service.storage.sql.archive_tables import archived_batches, archived_what_ifs
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import batches, frames, missions, results, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_what_ifs,
+    batches,
+    frames,
+    missions,
+    results,
+    runs,
+)
 from service.times import Utc
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]

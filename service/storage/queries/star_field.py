@@ -19,7 +19,7 @@ from service.sky.ephemeris import observer_velocity, sun_distance_au
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.models.star_field import (
+from service.storage.models.charts import (
     Boresight,
     CatalogStarPlace,
     ObservedStarPlace,

@@ -17,7 +17,7 @@ from service.alarms.quantities import (
     Rate,
     StarShare,
 )
-from service.storage.models.trends import History, Numbers, RankedBatch, Series
+from service.storage.models.spacecraft import History, Numbers, RankedBatch, Series
 from service.storage.queries.pages import (
     PLACE,
     ResultFilter,
@@ -37,8 +37,15 @@ from service.storage.queries.time_buckets import (
     read_steps,
 )
 from service.storage.recording.rollup_sql import OF_TRACKERS, value_sql
-from service.storage.sql.rollup_tables import rollups_hourly, tracker_rollups_hourly
-from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
+from service.storage.sql.tables import (
+    COUNTED,
+    MEASURED,
+    batches,
+    results,
+    rollups_hourly,
+    tracker_rollups_hourly,
+    tracker_values,
+)
 from service.times import (
     DAY_S,
     HOUR_S,

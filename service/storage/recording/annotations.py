@@ -6,7 +6,7 @@ import msgspec
 from sqlalchemy import Connection, delete, insert, or_, select
 
 from service.errors import BadBatch, Fault, NotFound, shown_value
-from service.storage.models.annotations import Annotation, AnnotationChange
+from service.storage.models.alarms import Annotation, AnnotationChange
 from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid

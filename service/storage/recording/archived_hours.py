@@ -11,10 +11,16 @@ from sqlalchemy import Connection, delete, insert, select
 
 from service.storage.recording.result_metrics import merge
 from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
-from service.storage.sql.archive_tables import archived_hours
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import COUNTS, MAXIMA, MINIMA, SUMS
-from service.storage.sql.tables import results, tracker_values
+from service.storage.sql.tables import (
+    COUNTS,
+    MAXIMA,
+    MINIMA,
+    SUMS,
+    archived_hours,
+    results,
+    tracker_values,
+)
 
 WHOLE = ""
 """In place of a tracker: the spacecraft as a whole."""

@@ -15,8 +15,7 @@ from sqlalchemy import Connection, delete, func, select
 
 from service.storage.sql.columns import Row
 from service.storage.sql.heard_events import CHANNEL
-from service.storage.sql.prepared import execute
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import execute, insert_all
 from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
 

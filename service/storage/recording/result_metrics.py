@@ -6,7 +6,7 @@ from itertools import chain
 from service.acquire import Acquisition
 from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.tables import (
     COUNTS,
     MAXIMA,
     MINIMA,

@@ -10,8 +10,7 @@ from typing import Any
 from sqlalchemy import BigInteger, ColumnElement, Double, Table, case, func
 
 from service.alarms.quantities import QUANTITIES, Quantity, Ratio, StarShare
-from service.storage.sql.rollup_tables import SHARES, VALUES
-from service.storage.sql.tables import COUNTED, results, tracker_values
+from service.storage.sql.tables import COUNTED, SHARES, VALUES, results, tracker_values
 
 
 def _counts(of: Table) -> Mapping[str, ColumnElement[Any]]:

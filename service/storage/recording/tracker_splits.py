@@ -2,8 +2,7 @@
 
 from sqlalchemy import Connection, delete, insert, select
 
-from service.storage.sql.rollup_tables import rollups_daily, tracker_splits
-from service.storage.sql.tables import results
+from service.storage.sql.tables import results, rollups_daily, tracker_splits
 
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:

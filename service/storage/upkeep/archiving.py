@@ -46,10 +46,18 @@ from service.storage.archive.rows import (
 from service.storage.projections import rollups
 from service.storage.recording.archived_hours import keep_share
 from service.storage.recording.tracker_splits import is_waiting
-from service.storage.sql.archive_tables import archived_batches, archived_parts, archived_what_ifs
-from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import catalogs, missions, results, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    archived_what_ifs,
+    catalogs,
+    missions,
+    results,
+    rollups_daily,
+    rollups_hourly,
+    runs,
+)
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now

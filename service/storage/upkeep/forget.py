@@ -20,15 +20,15 @@ from service.storage.models.runs import Forgotten
 from service.storage.projections import rollups
 from service.storage.recording.archived_hours import forget_share
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.archive_tables import (
+from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.tables import (
     archived_batches,
     archived_hours,
     archived_parts,
     archived_what_ifs,
+    batches,
+    runs,
 )
-from service.storage.sql.grade_tables import graded_days
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.tables import batches, runs
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches, delete_blocks, delete_days
 from service.times import DAY_S, HOUR_S, recorded_utc

@@ -34,10 +34,14 @@ from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS
-from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import rollups_hourly
-from service.storage.sql.tables import batches, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    batches,
+    rollups_hourly,
+    runs,
+)
 from service.storage.store import Store
 from service.storage.upkeep.archiving import described, hours_of, note_part
 from service.storage.upkeep.restoring import put_back

@@ -31,9 +31,8 @@ from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
 from service.storage.recording.tracker_values import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import tracker_splits
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import batches, results, tracker_values
+from service.storage.sql.tables import batches, results, tracker_splits, tracker_values
 from service.storage.store import Store
 from service.storage.upkeep.older_digests import OlderDigests
 from service.times import HOUR_S, parse_utc

@@ -9,7 +9,7 @@ from sqlalchemy import Engine, select, tuple_
 from service.gyro.block import Nanoseconds
 from service.gyro.overlap import SAME_TIME_NS, first_shared_ns
 from service.storage.gyro.blocks import block_of
-from service.storage.sql.gyro_tables import gyro_blocks
+from service.storage.sql.grade_tables import gyro_blocks
 
 AT_ONCE = 50
 ORDER = (gyro_blocks.c.spacecraft, gyro_blocks.c.run, gyro_blocks.c.start_ns, gyro_blocks.c.id)

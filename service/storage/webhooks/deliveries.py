@@ -12,9 +12,9 @@ from sqlalchemy import Connection, case, delete, func, select, tuple_, update
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.storage.models.base import Page
+from service.storage.sql.access_tables import webhook_deliveries, webhooks
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
-from service.storage.sql.webhook_tables import webhook_deliveries, webhooks
 from service.storage.webhooks.models import WebhookDelivery
 
 DEAD_KEPT = 10_000

@@ -10,9 +10,8 @@ from sqlalchemy import Connection, case, delete, func, insert, select, update
 from service.errors import NotFound, shown_value
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
-from service.storage.sql.access_tables import access_tokens
+from service.storage.sql.access_tables import access_tokens, webhook_deliveries, webhooks
 from service.storage.sql.columns import Row
-from service.storage.sql.webhook_tables import webhook_deliveries, webhooks
 from service.storage.webhooks.models import Webhook, WebhookStateName
 
 _SHOWN = (

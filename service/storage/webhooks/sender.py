@@ -7,7 +7,7 @@ are never compared.
 
 from sqlalchemy import Connection, select, update
 
-from service.storage.sql.webhook_tables import webhook_sender
+from service.storage.sql.access_tables import webhook_sender
 
 
 def read_sender(connection: Connection) -> tuple[str | None, int]:

@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.access.tokens import Caller
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, Wire
-from service.storage.models.annotations import Annotation, AnnotationPage
+from service.storage.models.alarms import Annotation, AnnotationPage
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response, page_response

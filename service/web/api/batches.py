@@ -12,8 +12,7 @@ from starlette.responses import Response
 from service.app.submissions import MAX_ARRAY, Outcome
 from service.errors import BadInput
 from service.observations.schema import BatchIn, OptionsIn, Wire
-from service.storage.models.answers import Answer, BatchPage, Result
-from service.storage.models.outcomes import BatchOutcome, BatchOutcomes
+from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi.route import (
     IDEMPOTENCY_KEY,

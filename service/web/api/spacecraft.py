@@ -12,11 +12,12 @@ from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.storage.models.answers import Result
 from service.storage.models.spacecraft import (
     AttitudePage,
+    History,
+    Ranking,
     RateList,
     SpacecraftList,
     SpacecraftState,
 )
-from service.storage.models.trends import History, Ranking
 from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response

@@ -8,7 +8,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from service.storage.models.star_field import Boresight, ObservedStarPlace, TrackerField
+from service.storage.models.charts import Boresight, ObservedStarPlace, TrackerField
 from service.web.console.charts.sky_labels import Box, Label, Labels, Place, points_along, text_box
 
 SIZE = 640

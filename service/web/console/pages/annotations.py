@@ -7,7 +7,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.observations.schema import Key
-from service.storage.models.annotations import Annotation
+from service.storage.models.alarms import Annotation
 from service.times import parse_utc, recorded_utc, shifted
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page

@@ -14,7 +14,7 @@ from service.alarms.quantities import QUANTITIES
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.models.answers import Answer
 from service.storage.models.answers import Star as FoundStar
-from service.storage.models.star_field import ObservedStarPlace, StarField
+from service.storage.models.charts import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
 from service.storage.recording.ids import is_ulid
 from service.storage.tracks.models import TrackList

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.storage.models.period import TrackerStarsOfPeriod
+from service.storage.models.charts import TrackerStarsOfPeriod
 from service.vectors import Vector
 
 SIZE = 420.0

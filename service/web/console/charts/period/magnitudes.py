@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.storage.models.period import TrackerStarsOfPeriod
+from service.storage.models.charts import TrackerStarsOfPeriod
 from service.vectors import Vector
 from service.web.console.charts.period.histogram import robust_spread
 

@@ -14,11 +14,10 @@ from service.alarms.quantities import QUANTITIES, RankedName, ranked_names
 from service.alarms.subjects import limited_trackers
 from service.observations.schema import Key
 from service.products.formats import table_formats
-from service.storage.models.annotations import Annotation
+from service.storage.models.alarms import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
-from service.storage.models.spacecraft import MissionThen
-from service.storage.models.trends import Ranking
+from service.storage.models.spacecraft import MissionThen, Ranking
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
 from service.web.console.pages.one_spacecraft.trend_charts import charts, history_address

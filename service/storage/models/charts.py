@@ -1,4 +1,4 @@
-"""The batches of a period as arrays, for the charts of its page: attitudes, and stars by tracker.
+"""The data of charts: the stars of a batch, and the batches of a period as arrays.
 
 Batches (b) are in order of time.  Where something is not known an array has NaN.
 """
@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.sky.zones import SearchRegion
+from service.storage.models.base import Record
 from service.times import Utc
 from service.vectors import Vector
 
@@ -75,3 +76,62 @@ class PeriodStars:
     def read(self) -> int:
         """The number of batches that were read."""
         return len(self.attitudes.time)
+
+
+# Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in the tracker's axes.
+
+
+class Boresight(Record, frozen=True, kw_only=True):
+    """The boresight in the inertial frame."""
+
+    ra_deg: float
+    dec_deg: float
+
+
+class CatalogStarPlace(Record, frozen=True, kw_only=True):
+    """A catalog star in the field of view."""
+
+    id: str
+    magnitude: float
+    h_deg: float
+    v_deg: float
+
+
+class ObservedStarPlace(Record, frozen=True, kw_only=True):
+    """An observed star with its outcome; `residual_arcsec` is observed minus predicted.
+
+    The residual is along h and along v, None if the attitude does not use the star.
+    """
+
+    outcome: str
+    star: str | None
+    rivals: list[str]
+    magnitude: float | None
+    h_deg: float
+    v_deg: float
+    residual_arcsec: tuple[float, float] | None
+
+
+class TrackerField(Record, frozen=True, kw_only=True):
+    """The view of one tracker; `zone_edges` are lines of [h, v] in degrees."""
+
+    tracker: str
+    boresight: Boresight
+    field_of_view_radius_deg: float
+    radius_deg: float
+    magnitude_limit_mag: float
+    zone_edges: list[list[list[float]]]
+    catalog: list[CatalogStarPlace]
+    observed: list[ObservedStarPlace]
+
+
+class StarField(Record, frozen=True, kw_only=True):
+    """The views of all trackers of a batch.
+
+    `through` is "quest", "triad" or "a_priori": the attitude by which catalog stars are drawn.
+    `same_catalog` says whether the run catalog is the one of the answer.
+    """
+
+    through: str
+    same_catalog: bool
+    trackers: list[TrackerField]
