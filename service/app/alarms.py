@@ -8,7 +8,7 @@ from service.alarms.subjects import limited_trackers
 from service.app.context import ALL_RUNS, Context, known_id
 from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
 from service.storage.models.base import Page
-from service.storage.projections.silence import evaluate_by_clock, is_due_by_clock
+from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms
 from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
 from service.storage.recording.unsaved_result import LIVE

@@ -10,7 +10,7 @@ from service.app.context import Context, known_id
 from service.ingest.solver_pool import mission_in_input
 from service.storage.models.alarms import Annotation
 from service.storage.models.base import Page
-from service.storage.recording import annotations
+from service.storage.recording import events
 from service.storage.recording.ids import Ulids
 from service.times import Utc, utc_now
 
@@ -33,14 +33,14 @@ class Annotations:
     ) -> Page[Annotation]:
         """Annotations of a period, the latest written first; see `list_annotations`."""
         with self._context.reading() as connection:
-            return annotations.list_annotations(
+            return events.list_annotations(
                 connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
             )
 
     def get(self, id: str) -> Annotation:
         """One annotation."""
         with self._context.reading() as connection:
-            return annotations.read_annotation(connection, known_id(id, "annotation"))
+            return events.read_annotation(connection, known_id(id, "annotation"))
 
     def add(
         self,
@@ -70,7 +70,7 @@ class Annotations:
             "created": utc_now().text,
         }
         return self._context.change_audited(
-            lambda connection: annotations.add_annotation(connection, row), entry
+            lambda connection: events.add_annotation(connection, row), entry
         )
 
     def delete(self, id: str, entry: Entry | None = None) -> Annotation:
@@ -78,7 +78,7 @@ class Annotations:
         known = known_id(id, "annotation")
 
         def change(connection: Connection) -> Annotation:
-            deleted = annotations.delete_annotation(connection, known)
+            deleted = events.delete_annotation(connection, known)
             if entry is not None:
                 body = msgspec.json.encode(deleted).decode()
                 dataclasses.replace(entry, body=body).add_to(connection)

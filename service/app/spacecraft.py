@@ -25,7 +25,7 @@ from service.storage.projections import rollups
 from service.storage.queries import fleet, histories, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
-from service.storage.recording.tracker_splits import is_waiting
+from service.storage.recording.tracker_values import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 

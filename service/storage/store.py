@@ -11,6 +11,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
+from service.storage.recording.events import HeardEvents
 from service.storage.recording.transaction import may_pass
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, remove_probe
 from service.storage.sql.connections import PersistentConnection
@@ -26,7 +27,6 @@ from service.storage.sql.engines import (
     reading_engine,
     writing_engine,
 )
-from service.storage.sql.heard_events import HeardEvents
 from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
 from service.storage.sql.projector_lock import ProjectorLock
 

@@ -12,8 +12,7 @@ from service.missions.mission import Mission
 from service.storage.grades.days import DayKey
 from service.storage.grades.models import GradedDayRow
 from service.storage.grades.period import latest_innovations
-from service.storage.projections.active_alarms import ActiveAlarms
-from service.storage.projections.alarms import runs_with_alarms
+from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
 from service.storage.queries.limits import limits_of
 from service.storage.queries.pages import ResultFilter
 from service.storage.sql.grade_tables import graded_days

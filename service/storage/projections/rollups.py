@@ -15,8 +15,13 @@ from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, f
 from service.errors import BadInput, Fault
 from service.storage.projections.recorded import RecordedResult
 from service.storage.recording.archived_hours import WHOLE, every_share, shares_of_hour
-from service.storage.recording.result_metrics import merge, rolled_up
-from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.recording.result_metrics import (
+    OF_TRACKERS,
+    SUMMED,
+    SUMMED_OF_TRACKERS,
+    merge,
+    rolled_up,
+)
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import add_rollups, insert_all
 from service.storage.sql.tables import (

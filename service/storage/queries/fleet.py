@@ -38,7 +38,7 @@ from service.storage.queries.time_buckets import (
     totals,
 )
 from service.storage.queries.trends import latest_time_of
-from service.storage.recording.rollup_sql import SUMMED
+from service.storage.recording.result_metrics import SUMMED
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import (

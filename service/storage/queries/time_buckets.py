@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
-from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import (
     COUNTS,

@@ -36,7 +36,7 @@ from service.storage.queries.time_buckets import (
     read_buckets,
     read_steps,
 )
-from service.storage.recording.rollup_sql import OF_TRACKERS, value_sql
+from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
 from service.storage.sql.tables import (
     COUNTED,
     MEASURED,

@@ -9,8 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from sqlalchemy import Connection, delete, insert, select
 
-from service.storage.recording.result_metrics import merge
-from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS, merge
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import (
     COUNTS,

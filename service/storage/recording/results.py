@@ -17,7 +17,7 @@ from service.storage.recording.identity import (
     require_not_archived,
     stored_answers,
 )
-from service.storage.recording.tracker_splits import split_anew
+from service.storage.recording.tracker_values import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row

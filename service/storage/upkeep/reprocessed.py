@@ -85,7 +85,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """As `projections.states` has it."""
+    """As `projections.projector` has it."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
