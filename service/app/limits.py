@@ -12,7 +12,7 @@ from service.alarms.window import Sample
 from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission, mission_named
-from service.storage.grades.alarms import rejected_samples
+from service.storage.grades.period import rejected_samples
 from service.storage.models.alarms import (
     Limit,
     LimitExcursion,

@@ -26,8 +26,7 @@ from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
 from service.settings import Settings
 from service.storage.grades.rows import count_samples_of, graded_pages
-from service.storage.gyro.blocks import BlockFilter
-from service.storage.gyro.samples_table import count_samples, sample_table
+from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.result_tables import attitude_pages, batch_table, star_table

@@ -1,6 +1,6 @@
 """The table that `acquire tracks` prints."""
 
-from service.storage.tracks.models import Track, TrackList
+from service.storage.tracks import Track, TrackList
 
 _HEADING = (
     f"{'track':<24}{'middle':<26}{'points':>6}  {'RA, Dec':<24}"

@@ -22,8 +22,14 @@ from service.filtering.result import FilterResult
 from service.filtering.samples import GyroSamples
 from service.filtering.state import FilterState
 from service.grades.day import WARM_UP_S, GradedSamples, Model, samples_of
-from service.grades.measured import Recorded, attitudes_where, directions_where
-from service.grades.stretches import LONGEST_GAP_S, Stretch, cut
+from service.grades.stretches import (
+    LONGEST_GAP_S,
+    Recorded,
+    Stretch,
+    attitudes_where,
+    cut,
+    directions_where,
+)
 from service.gyro.block import Nanoseconds
 from service.missions.mission import Mission
 from service.times import HOUR_S, Utc, bucket_start, shifted

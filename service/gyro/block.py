@@ -1,12 +1,14 @@
-"""A gyro block: rates about three axes at rising times."""
+"""A gyro block: rates about three axes at rising times, and their packed form."""
 
 import hashlib
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from erfa import ufunc
 
+from service.errors import Conflict
 from service.times import DAY_S, Utc, shifted
 from service.vectors import Vector
 
@@ -75,3 +77,51 @@ def texts_of(start: Utc, times_s: Vector) -> list[str]:
 def tai_ns_of(start_ns: int, times_s: Vector) -> Nanoseconds:
     """Times as `Utc.tai_ns`, from seconds after a start."""
     return start_ns + np.rint(times_s * 1e9).astype(np.int64)
+
+
+SAME_TIME_NS = 1_000
+"""Samples nearer than this have the same time.
+
+Times are sent with a start that is rounded and steps that are added up, so the same sample in two
+blocks may differ by some nanoseconds.
+"""
+
+
+class SampleTaken(Conflict):
+    """A sample at a time that another block of the spacecraft and the run holds."""
+
+
+def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None:
+    """The first of the times that another block holds, or None; both in rising order."""
+    place = np.searchsorted(others_ns, times_ns)
+    after = others_ns[np.minimum(place, others_ns.size - 1)]
+    before = others_ns[np.maximum(place - 1, 0)]
+    distance = np.minimum(np.abs(after - times_ns), np.abs(times_ns - before))
+    shared = np.flatnonzero(distance < SAME_TIME_NS)
+    return int(times_ns[shared[0]]) if shared.size else None
+
+
+# A gyro counts, so its rates are few different numbers: zlib finds them again where they stand
+# whole, and takes two bytes for most.
+
+LEVEL = 1
+"""Of zlib; level 6 takes four times as long for about 2 % less."""
+
+
+def pack(values: Vector) -> bytes:
+    """The compressed bytes of an array of float64, column by column."""
+    return zlib.compress(np.ascontiguousarray(values.T, "<f8").tobytes(), LEVEL)
+
+
+def unpack(packed: bytes, shape: tuple[int, ...]) -> Vector:
+    """The array of a shape that `pack` was given.
+
+    Raises `ValueError` for bytes that are damaged or hold another number of values.
+    """
+    try:
+        columns = np.frombuffer(zlib.decompress(packed), "<f8")
+    except zlib.error as error:
+        raise ValueError(f"cannot be decompressed: {error}") from None
+    if columns.size != np.prod(shape):
+        raise ValueError(f"{columns.size} numbers are no {' x '.join(map(str, shape))}")
+    return np.ascontiguousarray(columns.reshape(shape[::-1]).T)

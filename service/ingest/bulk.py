@@ -26,7 +26,7 @@ from service.ingest.telemetry_lines import (
 )
 from service.ingest.worker_process import WorkerConfig
 from service.observations.schema import Submission, submission_from_json
-from service.storage.gyro.blocks import Recorded
+from service.storage.gyro import Recorded
 from service.storage.recording.identity import Registry, look_up
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.store import Store

@@ -7,7 +7,7 @@ from service.gyro.schema import require_rates_within
 from service.ingest.solver_pool import mission_in_input
 from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
-from service.storage.gyro.blocks import Recorded, find_block, record_block, row_of
+from service.storage.gyro import Recorded, find_block, record_block, row_of
 from service.storage.recording.ids import Ulids
 from service.storage.store import Store
 from service.times import utc_now

@@ -7,7 +7,7 @@ from functools import partial
 from typing import TypeVar
 
 from service.storage.store import Store
-from service.storage.webhooks.sender import hold_sender, read_sender
+from service.storage.webhooks.deliveries import hold_sender, read_sender
 
 BEAT_S = 3.0
 FRESH_S = 8.0

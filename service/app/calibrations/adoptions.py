@@ -17,8 +17,8 @@ from service.app.calibrations.geometry import geometry_digest, with_geometry
 from service.app.context import Context, known_id
 from service.errors import NotFound, WrongState, shown_value
 from service.missions.mission import Mission, load_missions, mission_named
-from service.storage.calibrations import stored
-from service.storage.calibrations.models import (
+from service.storage import calibrations
+from service.storage.calibrations import (
     CalibrationAdoption,
     CalibrationInForce,
     TrackerGeometry,
@@ -39,7 +39,7 @@ def adopted_missions(
 ) -> dict[str, Mission]:
     """The missions of these files with an adopted calibration over them, but for `leave`."""
     found: dict[str, Mission] = {}
-    for each in stored.latest_adoptions(connection):
+    for each in calibrations.latest_adoptions(connection):
         file = files.get(each.spacecraft)
         if file is None or each.spacecraft == leave or each.trackers is None:
             continue
@@ -83,7 +83,7 @@ class CalibrationAdoptions:
         Each group of posts begins with this: whoever posts after an adoption was answered, by
         whichever service, is answered with the calibration that was adopted.
         """
-        if stored.newest_adoption(connection) != self._loaded:
+        if calibrations.newest_adoption(connection) != self._loaded:
             self.load(self._leave)
 
     def load(self, leave: str | None = None) -> None:
@@ -92,7 +92,7 @@ class CalibrationAdoptions:
         with self._lock:
             before = dict(self._context.missions)
             with self._context.reading_record() as connection:
-                self._loaded = stored.newest_adoption(connection)
+                self._loaded = calibrations.newest_adoption(connection)
                 adopted = adopted_missions(connection, self._files, leave)
             self._context.missions.update(self._files | adopted)
             if self._context.missions != before:
@@ -102,7 +102,7 @@ class CalibrationAdoptions:
         """The calibration that new batches use, and every change of it, newest first."""
         mission = self._context.mission(spacecraft)
         with self._context.reading() as connection:
-            history = stored.list_adoptions(connection, spacecraft)
+            history = calibrations.list_adoptions(connection, spacecraft)
         latest = history[0] if history else None
         overridden = (
             latest is not None
@@ -127,7 +127,7 @@ class CalibrationAdoptions:
         trackers than the mission.
         """
         with self._context.reading() as connection:
-            found = stored.read_calibration(connection, known_id(id, "calibration"))
+            found = calibrations.read_calibration(connection, known_id(id, "calibration"))
         if found.result is None:
             raise WrongState(f"the calibration is {found.state}")
         names = [each.name for each in found.result.trackers]
@@ -147,7 +147,7 @@ class CalibrationAdoptions:
         if to is None:
             return self._change(file, None, None, who, note, entry)
         with self._context.reading() as connection:
-            history = stored.list_adoptions(connection, spacecraft)
+            history = calibrations.list_adoptions(connection, spacecraft)
         for each in history:
             if each.id == to:
                 return self._change(file, each.trackers, each.calibration, who, note, entry)
@@ -200,9 +200,9 @@ class CalibrationAdoptions:
 
         def change(connection: Connection) -> CalibrationAdoption:
             register(connection, [settings], used)
-            id = stored.begin_adoption(connection, self._ids.new())
-            stored.add_adoption(connection, row | {"id": id})
-            adopted = stored.list_adoptions(connection, name)[0]
+            id = calibrations.begin_adoption(connection, self._ids.new())
+            calibrations.add_adoption(connection, row | {"id": id})
+            adopted = calibrations.list_adoptions(connection, name)[0]
             told = {each: getattr(adopted, each) for each in TOLD}
             events.add_event(connection, "calibration", told, spacecraft=name)
             return adopted

@@ -14,7 +14,7 @@ from service.app.calibrations.findings import result_of
 from service.app.context import Context
 from service.errors import AcquisitionError, Busy, Stopping
 from service.missions.mission import Mission
-from service.storage.calibrations import stored
+from service.storage import calibrations
 from service.storage.sql.columns import Row
 from service.times import utc_now
 
@@ -117,7 +117,7 @@ class _Progress:
 
     def save(self, changes: Row) -> None:
         self._context.change(
-            lambda connection: stored.change_calibration(connection, self._id, changes)
+            lambda connection: calibrations.change_calibration(connection, self._id, changes)
         )
 
 

@@ -11,7 +11,7 @@ from service.app.calibrations.geometry import calibrated_geometry, mission_file_
 from service.calibration.estimate import Calibration
 from service.calibration.magnitudes import UNITS
 from service.calibration.observability import NotObservable
-from service.storage.calibrations.models import (
+from service.storage.calibrations import (
     CalibrationBatches,
     CalibrationHeldOut,
     CalibrationNotObservable,

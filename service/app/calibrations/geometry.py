@@ -12,7 +12,7 @@ from service.calibration.mission_file import Lines, magnitude_lines, tracker_lin
 from service.missions.corrections import AS_MEASURED, Magnitudes
 from service.missions.corrections import Calibration as FocalPlaneSettings
 from service.missions.mission import Mission, Tracker
-from service.storage.calibrations.models import FocalPlane, TrackerGeometry, TrackerMagnitudes
+from service.storage.calibrations import FocalPlane, TrackerGeometry, TrackerMagnitudes
 
 
 def geometry_of(tracker: Tracker) -> TrackerGeometry:

@@ -15,8 +15,8 @@ from service.app.context import Context, known_id
 from service.app.submissions import Submissions
 from service.errors import WrongState
 from service.missions.mission import Mission, mission_named
-from service.storage.calibrations import stored
-from service.storage.calibrations.models import Calibration, CalibrationSummary
+from service.storage import calibrations
+from service.storage.calibrations import Calibration, CalibrationSummary
 from service.storage.models.base import Page
 from service.storage.models.compare import Comparison
 from service.storage.recording.ids import Ulids
@@ -55,8 +55,8 @@ class CalibrationService:
         changes = found_columns(found) | {"done": found.sampled, "total": found.sampled}
 
         def change(connection: Connection) -> None:
-            stored.add_calibration(connection, row)
-            stored.change_calibration(connection, id, changes)
+            calibrations.add_calibration(connection, row)
+            calibrations.change_calibration(connection, id, changes)
 
         self._context.change(change)
         return self.get(id)
@@ -76,7 +76,7 @@ class CalibrationService:
 
         def begin() -> None:
             self._context.change_audited(
-                lambda connection: stored.add_calibration(connection, row), entry
+                lambda connection: calibrations.add_calibration(connection, row), entry
             )
 
         self._background.compute(id, wanted, mission, begin)
@@ -85,7 +85,7 @@ class CalibrationService:
     def get(self, id: str) -> Calibration:
         """One calibration."""
         with self._context.reading() as connection:
-            return stored.read_calibration(connection, known_id(id, "calibration"))
+            return calibrations.read_calibration(connection, known_id(id, "calibration"))
 
     def page(
         self, spacecraft: str | None = None, limit: int = 100, cursor: str | None = None
@@ -94,7 +94,7 @@ class CalibrationService:
         if spacecraft is not None:
             self._context.mission(spacecraft)
         with self._context.reading() as connection:
-            return stored.list_calibrations(connection, spacecraft, limit, cursor)
+            return calibrations.list_calibrations(connection, spacecraft, limit, cursor)
 
     def trial(
         self,
@@ -123,7 +123,9 @@ class CalibrationService:
     def interrupt(self) -> None:
         """Close the calibrations that a stopped process left unfinished."""
         now = utc_now().text
-        self._context.change(lambda connection: stored.interrupt_calibrations(connection, now))
+        self._context.change(
+            lambda connection: calibrations.interrupt_calibrations(connection, now)
+        )
 
     def close(self) -> None:
         """End the calibration that is computed, and those that wait."""

@@ -10,12 +10,15 @@ from service.errors import NotFound
 from service.grades.day import grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
-from service.storage.grades.alarms import evaluate_day
 from service.storage.grades.days import DayKey, current_day, record_day, rows_of
-from service.storage.grades.innovations import list_innovations
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
 from service.storage.grades.models import GradedDayRow, Innovation
-from service.storage.grades.period import GradesOfPeriod, grades_of_period
+from service.storage.grades.period import (
+    GradesOfPeriod,
+    evaluate_day,
+    grades_of_period,
+    list_innovations,
+)
 from service.storage.models.base import Page
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids

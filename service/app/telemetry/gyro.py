@@ -5,7 +5,7 @@ from service.gyro.block import GyroBlock
 from service.gyro.schema import block_from_json
 from service.ingest.gyro import GyroIntake
 from service.missions.mission import mission_named
-from service.storage.gyro.blocks import BlockFilter, Recorded, list_blocks, read_block
+from service.storage.gyro import BlockFilter, Recorded, list_blocks, read_block
 from service.storage.models.base import Page
 from service.storage.models.gyro import GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import LIVE

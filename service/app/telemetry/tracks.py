@@ -10,9 +10,11 @@ from service.errors import NotFound
 from service.products.tdm import TrackedObject, write_tdm
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.tracks.models import Track, TrackList, TrackPoint
-from service.storage.tracks.unexplained import (
+from service.storage.tracks import (
     RecordedBatches,
+    Track,
+    TrackList,
+    TrackPoint,
     batches_around,
     batches_of_period,
     unexplained_points,

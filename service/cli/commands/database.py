@@ -204,7 +204,7 @@ def backup(parsed: Namespace) -> int:
 def restore(parsed: Namespace) -> int:
     """Make a database from a backup."""
     from service.storage.sql.migrations import HEAD
-    from service.storage.upkeep.restore import restore as restore_backup
+    from service.storage.upkeep.backup import restore as restore_backup
 
     with _pages("restoring") as step:
         revision = restore_backup(settings_of(parsed).database, parsed.backup, step)

@@ -22,8 +22,7 @@ from service.ingest.reprocess import (
     begin_run,
     require_same_settings,
 )
-from service.storage.archive.folder import UNFINISHED, locked
-from service.storage.archive.owner import claim
+from service.storage.archive.folder import UNFINISHED, claim, locked
 from service.storage.store import Store
 from service.storage.upkeep.archiving import keep_settings
 from service.storage.upkeep.reprocessed import merge, name_part, restore_newest, unmerged

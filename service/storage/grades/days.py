@@ -11,9 +11,16 @@ import numpy as np
 from sqlalchemy import Connection, delete, func, insert, select, update
 
 from service.filtering.state import Status
-from service.grades.day import GRADES, GradedDay, GradedSamples, GradedStretch, day_bounds
+from service.grades.day import (
+    GRADES,
+    MOST_PACKED,
+    GradedDay,
+    GradedSamples,
+    GradedStretch,
+    day_bounds,
+    packed,
+)
 from service.grades.innovations import MeasuredInnovations
-from service.grades.packing import MOST_SAMPLES, packed
 from service.gyro.block import texts_of
 from service.storage.grades.models import DaySummary, GradedDayRow, GradedStretchInfo
 from service.storage.sql.columns import Row
@@ -128,7 +135,7 @@ def _blocks(day_id: str, graded: GradedDay) -> Iterator[Row]:
 def _parts(
     samples: GradedSamples | MeasuredInnovations,
 ) -> Iterator[GradedSamples | MeasuredInnovations]:
-    edges = [*range(0, len(samples), MOST_SAMPLES), len(samples)]
+    edges = [*range(0, len(samples), MOST_PACKED), len(samples)]
     for first, end in pairwise(edges):
         yield samples.taken(slice(first, end))
 

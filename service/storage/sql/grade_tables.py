@@ -73,7 +73,7 @@ graded_blocks = Table(
     Column("start_ns", BigInteger, nullable=False),
     Column("end_ns", BigInteger, nullable=False),
     Column("samples", Integer, nullable=False),
-    # See service/grades/packing.py.
+    # See service/grades/day.py.
     Column("packed", LargeBinary, nullable=False),
 )
 
@@ -95,7 +95,7 @@ gyro_blocks = Table(
     Column("samples", Integer, nullable=False),
     # Null where the block has times of its own.
     Column("step_s", Double),
-    # Packed: see service/gyro/packing.py.
+    # Packed: see service/gyro/block.py.
     Column("times_s", LargeBinary),
     Column("rates_rad_per_s", LargeBinary, nullable=False),
     UniqueConstraint("spacecraft", "run", "block"),

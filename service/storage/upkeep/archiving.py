@@ -24,6 +24,7 @@ from service.storage.archive.folder import (
     Manifest,
     Part,
     Settings,
+    claim,
     day_folder,
     locked,
     manifest_of,
@@ -34,7 +35,6 @@ from service.storage.archive.folder import (
     write_partition,
     write_settings,
 )
-from service.storage.archive.owner import claim
 from service.storage.archive.rows import (
     Rows,
     differing,

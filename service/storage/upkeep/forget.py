@@ -219,6 +219,7 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
     """
     # Archives need pyarrow, which is an extra.
     from service.storage.archive.folder import (
+        claim,
         locked,
         manifest_of,
         manifests,
@@ -226,7 +227,6 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
         read_partition,
         whole_content,
     )
-    from service.storage.archive.owner import claim
     from service.storage.archive.rows import from_partition
     from service.storage.upkeep.archiving import remove_part
     from service.storage.upkeep.restoring import put_back

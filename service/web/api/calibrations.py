@@ -14,7 +14,7 @@ from service.app.comparisons import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
-from service.storage.calibrations.models import (
+from service.storage.calibrations import (
     Calibration,
     CalibrationAdoption,
     CalibrationInForce,

@@ -10,8 +10,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observations.schema import RunName, Wire
-from service.storage.grades.live import LiveAttitude
 from service.storage.grades.models import DefinitiveJob, DefinitiveJobList, InnovationPage
+from service.storage.grades.rows import LiveAttitude
 from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response

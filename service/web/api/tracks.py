@@ -6,7 +6,7 @@ from fastapi import APIRouter
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.storage.tracks.models import TrackList
+from service.storage.tracks import TrackList
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, json_response
 from service.web.requests.path_parameters import SpacecraftPath

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.storage.calibrations.models import ResidualCell, ResidualMap
+from service.storage.calibrations import ResidualCell, ResidualMap
 from service.web.console.charts.period.focal_plane import LEAST_STARS, arrow, round_below
 
 SIZE = 420.0

@@ -17,7 +17,7 @@ from service.storage.models.answers import Star as FoundStar
 from service.storage.models.charts import ObservedStarPlace, StarField
 from service.storage.queries.results import answer_from_json
 from service.storage.recording.ids import is_ulid
-from service.storage.tracks.models import TrackList
+from service.storage.tracks import TrackList
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
 from service.web.console.options import (

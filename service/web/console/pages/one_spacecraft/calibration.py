@@ -11,7 +11,7 @@ from starlette.responses import Response
 from service.app.calibrations.estimates import CALIBRATION_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound
-from service.storage.calibrations.models import Calibration, CalibrationSummary
+from service.storage.calibrations import Calibration, CalibrationSummary
 from service.web.console.charts.calibration_history import parameter_histories
 from service.web.console.charts.residual_maps import residual_pictures
 from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
