@@ -3,7 +3,7 @@
 import textwrap
 from collections.abc import Iterable, Sequence
 
-from service.app.advice_record import no_changes_text
+from service.app.advice import no_changes_text
 from service.storage.models.advice import (
     Advice,
     AlignmentAdvice,

@@ -29,7 +29,6 @@ from service.web.api import (
     compare,
     events,
     frames,
-    grades,
     gyro,
     overview,
     probes,
@@ -45,14 +44,13 @@ from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
 from service.web.console.rendering import page_or_problem
 from service.web.event_stream import Live
-from service.web.middleware import AroundRequests, BelowPath
+from service.web.middleware import AroundRequests, BelowPath, warm_request
 from service.web.openapi.document import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
 from service.web.requests.problems import add_error_handlers
 from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
-from service.web.warm_request import warm_request
 
 log = logging.getLogger(__name__)
 
@@ -64,7 +62,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     frames.router,
     spacecraft.router,
     products.router,
-    grades.router,
     gyro.router,
     tracks.router,
     advice.router,

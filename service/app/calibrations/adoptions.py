@@ -13,7 +13,7 @@ import msgspec
 from sqlalchemy import Connection
 
 from service.access.audit import Entry
-from service.app.calibrations.geometry import geometry_digest, with_geometry
+from service.app.calibrations.findings import geometry_digest, with_geometry
 from service.app.context import Context, known_id
 from service.errors import NotFound, WrongState, shown_value
 from service.missions.mission import Mission, load_missions, mission_named

@@ -36,7 +36,7 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Write the table, page by page."""
     from service.app.factory import open_app
-    from service.app.history_table import batch_table
+    from service.app.spacecraft import batch_table
 
     start, end = period_of(parsed)
     app = open_app(settings_of_existing(parsed), reads_only=True)

@@ -12,8 +12,7 @@ from service.observations.schema import tolerances_from_text
 from service.storage.models.advice import Advice
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.query_parameters import PeriodQuery
+from service.web.requests.query_parameters import PeriodQuery, SpacecraftPath
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
 

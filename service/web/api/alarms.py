@@ -24,16 +24,18 @@ from service.storage.models.alarms import (
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     NO_QUERY,
     AlarmQuery,
+    Comment,
     LimitQuery,
     LimitStatementQuery,
     RunQuery,
+    SpacecraftPath,
+    Who,
+    without_nul,
 )
 from service.web.requests.request_body import JsonBody, read_model
-from service.web.requests.statements import Comment, Who, without_nul
 
 router = APIRouter(prefix="/api/v1", tags=["alarms"])
 

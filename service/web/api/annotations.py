@@ -15,9 +15,8 @@ from service.storage.models.alarms import Annotation, AnnotationPage
 from service.web.openapi.route import LINK, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import AnnotationQuery, AuthorQuery, Time
+from service.web.requests.query_parameters import AnnotationQuery, AuthorQuery, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
-from service.web.requests.statements import Who
 
 router = APIRouter(prefix="/api/v1", tags=["annotations"])
 

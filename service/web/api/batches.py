@@ -30,11 +30,24 @@ from service.web.requests.dependencies import (
     json_response,
     page_response,
 )
-from service.web.requests.headers import NO_IDEMPOTENCY_KEY, NO_KEY_OF_MANY, idempotency_key
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import NO_QUERY, BatchQuery, require_no_query
-from service.web.requests.request_body import BINARY, JsonBody, json_body, read_model, refused
-from service.web.requests.statements import Comment, Who
+from service.web.requests.query_parameters import (
+    NO_QUERY,
+    BatchQuery,
+    Comment,
+    Who,
+    require_no_query,
+)
+from service.web.requests.request_body import (
+    BINARY,
+    NO_IDEMPOTENCY_KEY,
+    NO_KEY_OF_MANY,
+    JsonBody,
+    idempotency_key,
+    json_body,
+    read_model,
+    refused,
+)
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
 

@@ -7,7 +7,7 @@ from fastapi import Query as InQuery
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.history_table import batch_table, history_table
+from service.app.spacecraft import batch_table, history_table
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.storage.models.answers import Result
 from service.storage.models.spacecraft import (
@@ -21,19 +21,19 @@ from service.storage.models.spacecraft import (
 from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.exports import ExportsDep
-from service.web.requests.history_files import (
+from service.web.requests.exports import (
     THINNED,
+    ExportsDep,
     history_file,
     history_headers,
     thinned_header,
 )
-from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     HistoryQuery,
     PeriodPageQuery,
     RatesQuery,
     RunQuery,
+    SpacecraftPath,
     WorstQuery,
 )
 

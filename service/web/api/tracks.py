@@ -9,8 +9,7 @@ from starlette.responses import Response
 from service.storage.tracks import TrackList
 from service.web.openapi.route import ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.product_parameters import TDM_MEDIA_TYPE, TracksQuery
+from service.web.requests.query_parameters import TDM_MEDIA_TYPE, SpacecraftPath, TracksQuery
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["products"])
 

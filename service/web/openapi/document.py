@@ -27,7 +27,7 @@ from service.web.api.calibrations import (
 )
 from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
-from service.web.api.grades import DefinitiveIn
+from service.web.api.products import DefinitiveIn
 from service.web.api.runs import ForgetIn, RunIn
 from service.web.api.tokens import SignIn, TokenIn
 from service.web.api.webhooks import ReplayEventsIn, RetryIn, SecretIn, WebhookIn

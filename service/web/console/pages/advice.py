@@ -8,7 +8,7 @@ from fastapi import Query as InQuery
 from pydantic import model_validator
 from starlette.responses import Response
 
-from service.app.advice_record import no_changes_text
+from service.app.advice import no_changes_text
 from service.missions.mission import Tolerances
 from service.web.api.advice import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.page_context import ContextDep

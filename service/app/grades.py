@@ -1,22 +1,36 @@
-"""Definitive attitudes made by the running service: on request, and each day where asked for."""
+"""Filtered and smoothed attitudes, computed day by day, on request or on schedule."""
 
 import logging
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from msgspec import structs
+from sqlalchemy import Connection
 
 from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context, checked_run_name
-from service.app.telemetry.grades import Grades, SmoothProgress
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
-from service.grades.day import LOOK_AHEAD_S
-from service.missions.mission import mission_named
-from service.storage.grades.models import DefinitiveJob, DefinitiveJobList
+from service.grades.day import LOOK_AHEAD_S, grade_day, window_of
+from service.missions.mission import Mission, mission_named
+from service.storage.archive.reading import holds_any
+from service.storage.grades.days import DayKey, current_day, record_day, rows_of
+from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
+from service.storage.grades.models import DefinitiveJob, DefinitiveJobList, GradedDayRow, Innovation
+from service.storage.grades.period import (
+    GradesOfPeriod,
+    evaluate_day,
+    grades_of_period,
+    list_innovations,
+)
+from service.storage.models.base import Page
+from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, Utc, bucket_start, shifted, utc_now
+
+log = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 MOST_KEPT = 50
@@ -29,8 +43,6 @@ LATE_DAYS = 3
 """Days before the last one that are looked at again, for batches that came late."""
 LOOK_EVERY_S = 600.0
 
-log = logging.getLogger(__name__)
-
 
 @dataclass(frozen=True)
 class _Wanted:
@@ -40,6 +52,117 @@ class _Wanted:
     run: str
     start: Utc | None
     end: Utc | None
+
+
+@dataclass
+class SmoothProgress:
+    """How far a period is smoothed.
+
+    `total` counts its days with batches; `days` are the present revisions of those that have
+    attitudes, `new` the ids of the revisions that were recorded now.  `empty` counts days
+    without an attitude to start from, and `archived` those left as they are.
+    """
+
+    total: int
+    days: list[GradedDayRow] = field(default_factory=list)
+    new: set[str] = field(default_factory=set)
+    empty: int = 0
+    archived: int = 0
+
+    @property
+    def done(self) -> int:
+        """Days that are finished."""
+        return len(self.days) + self.empty + self.archived
+
+
+class Grades:
+    """Computes and reads filtered and smoothed attitudes."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._ids = Ulids()
+
+    def smooth(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        step: Callable[[SmoothProgress], object] = lambda progress: None,
+    ) -> SmoothProgress:
+        """Filter and smooth every UTC day of a period that has batches.
+
+        A day is recorded as a new revision where anything has changed that it is computed from;
+        else the revision stays that there is, as it does where batches that the day is computed
+        from are archived: those that are left would make a poorer one.
+
+        Raises `NotFound` where the period has no batch.
+        """
+        mission = mission_named(self._context.missions, name)
+        run = LIVE if run is None else checked_run_name(run)
+        with self._context.reading() as connection:
+            days = days_with_batches(connection, name, run, start, end)
+        if not days:
+            raise NotFound(f"{name} has no batch in run {run} in the period")
+        progress = SmoothProgress(len(days))
+        step(progress)
+        for day in days:
+            self._smooth_day(mission, DayKey(name, run, day), progress)
+            step(progress)
+        return progress
+
+    def innovations(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page[Innovation]:
+        """How the measured attitudes of a period met the filter, the earliest first."""
+        self._context.mission(name)
+        selected = ResultFilter(run or LIVE, name, start, end)
+        with self._context.reading() as connection:
+            return list_innovations(connection, selected, limit=limit, cursor=cursor)
+
+    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> GradesOfPeriod | None:
+        """A bounded number of samples and innovations of a period; None where none are recorded."""
+        self._context.mission(name)
+        with self._context.reading() as connection:
+            return grades_of_period(connection, name, run, start, end)
+
+    def _smooth_day(self, mission: Mission, key: DayKey, progress: SmoothProgress) -> None:
+        window = window_of(key.day)
+        with self._context.reading() as connection:
+            if holds_any(connection, key.spacecraft, key.run, *window):
+                progress.archived += 1
+                return
+            recorded = recorded_in(connection, self._context.sky, key.spacecraft, key.run, *window)
+            before = current_day(connection, key)
+        inputs = inputs_digest(recorded, mission)
+        if before is not None and before.inputs == inputs:
+            progress.days.append(before)
+            return
+        graded = grade_day(recorded, mission, key.day)
+        if before is None and not graded.samples:
+            progress.empty += 1
+            return
+        rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
+
+        def change(connection: Connection) -> GradedDayRow:
+            recorded_day = record_day(connection, key, rows)
+            # Another process may have recorded the same meanwhile.
+            if recorded_day.id == rows[0]["id"]:
+                evaluate_day(connection, mission, key, recorded_day)
+            return recorded_day
+
+        row = self._context.change(change)
+        progress.days.append(row)
+        if row.id == rows[0]["id"]:
+            progress.new.add(row.id)
 
 
 class DefinitiveAttitudes:
