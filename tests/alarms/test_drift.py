@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.alarms.causes import CAUSES
 from service.alarms.drift import MeanStars, alignment_offsets_arcsec, scale_offset_ppm
 from service.app.factory import open_app
 from service.missions.mission import parse_mission
@@ -21,6 +20,7 @@ from service.sky.model import SkyModel
 from service.storage.recording.result_metrics import metrics_of
 from service.vectors import unit
 from service.web.app import create_app
+from service.web.console.pages.alarms import CAUSES
 from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
 from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, submission, twin

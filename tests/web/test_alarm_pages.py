@@ -6,11 +6,11 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.alarms.causes import CAUSES
 from service.alarms.quantities import QUANTITIES, limited_names
 from service.app.factory import open_app
 from service.web.app import create_app
 from service.web.console.formatting import with_day_of_year
+from service.web.console.pages.alarms import CAUSES
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.serving import Server, in_process_settings

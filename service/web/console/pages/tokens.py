@@ -1,17 +1,18 @@
-"""The pages of access: tokens with the form for a new one, and the audit list of changes."""
+"""The pages of access: tokens, the audit list of changes, and signing in."""
 
 from typing import Annotated
 
 from fastapi import Query as InQuery
+from pydantic import Field
 from starlette.responses import Response
 
 from service.access.administration import MAX_DAYS
 from service.access.tokens import SCOPES
-from service.web.console.page_context import ContextDep, PageQuery
+from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
-from service.web.requests.access import OPERATE
-from service.web.requests.query_parameters import Cursor
+from service.web.requests.access import OPEN, OPERATE
+from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 100
 
@@ -41,3 +42,19 @@ def tokens_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> 
         spacecraft=context.spacecraft,
         is_open=context.caller.token_id is None,
     )
+
+
+OWN_PATH = r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$"
+"""A second slash, or a backslash that browsers take for one, would name another host."""
+
+
+class SignInQuery(Query):
+    """The page to open after sign-in: a path of this service, never another host's address."""
+
+    next: Annotated[str, Field(max_length=2000, pattern=OWN_PATH)] = "/"
+
+
+@console_page("/sign-in", "Sign in", OPEN)
+def sign_in_page(query: Annotated[SignInQuery, InQuery()]) -> Response:
+    """Ask for a token."""
+    return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)

@@ -9,12 +9,10 @@ from starlette.responses import Response
 
 from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
-from service.web.console.charts.grades.grades import grade_charts
-from service.web.console.charts.grades.innovations import innovation_charts
-from service.web.console.charts.grades.panels import GradeChart, TimeAxis
-from service.web.console.charts.grades.time_line import Strip, strips
+from service.web.console.charts.grade_panels import GradeChart, Strip, TimeAxis, strips
+from service.web.console.charts.grades import grade_charts, innovation_charts
 from service.web.console.page_context import ContextDep
-from service.web.console.pages.one_spacecraft.spacecraft import (
+from service.web.console.pages.spacecraft import (
     RANGES_S,
     SpacecraftQuery,
     shown_period,

@@ -1,17 +1,20 @@
-"""Attitude, rate, sigma and gyro bias by grade, and differences from the smoothed attitude."""
+"""Attitude, rate, sigma and gyro bias by grade, differences from the smoothed one, innovations."""
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
 from service.attitude.rotations import matrices, rotation_vectors
+from service.filtering.gyro import FilterSettings
 from service.filtering.result import Integers
 from service.filtering.state import Status
 from service.grades.innovations import MeasuredInnovations
 from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
 from service.vectors import Vector, to_ra_dec
-from service.web.console.charts.grades.panels import (
+from service.web.console.charts.attitude import AXES, SMALL_DEG, SMALL_DEG_PER_S
+from service.web.console.charts.grade_panels import (
     FINE_HEIGHT,
     GradeChart,
     GradePanel,
@@ -24,7 +27,6 @@ from service.web.console.charts.grades.panels import (
     marks_of,
     scale_of,
 )
-from service.web.console.charts.period.attitude import AXES, SMALL_DEG, SMALL_DEG_PER_S
 from service.web.console.formatting import level
 
 BOUND = 3.0
@@ -304,3 +306,61 @@ def _largest(values: Vector) -> float:
 def _median(values: Vector) -> float:
     known = values[np.isfinite(values)]
     return float(np.median(known)) if len(known) else 0.0
+
+
+DEGREES = 3
+INSIDE = 0.95
+"""Of the measurements are between the lower two bounds, where the covariances are right."""
+
+
+@lru_cache(maxsize=1)
+def chi_square_bounds() -> tuple[float, float, float]:
+    """The region of 95 %, and what is rejected beyond."""
+    # Imported here: loading it takes longer than drawing the page.
+    from scipy.special import chdtri
+
+    tail = (1.0 - INSIDE) / 2.0
+    gate = FilterSettings().gate_tail
+    return tuple(float(chdtri(DEGREES, each)) for each in (1.0 - tail, tail, gate))  # type: ignore[return-value]
+
+
+def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[GradeChart]:
+    """Innovations about the body axes, and their chi-square."""
+    known = met.taken(np.isfinite(met.nis))
+    if not len(known):
+        return []
+    sigma = known.innovation_sigma_arcsec
+    return [
+        bounded_chart(
+            "innovation",
+            "Innovations: measured minus predicted attitude",
+            known,
+            known.innovation_arcsec,
+            sigma,
+            axis,
+        ),
+        _chi_square(known, axis),
+    ]
+
+
+def _chi_square(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
+    low, high, gate = chi_square_bounds()
+    used = met.is_used
+    scale = Scale(low / 4.0, gate * 2.0, is_log=True)
+    inside = int(np.count_nonzero((met.nis[used] >= low) & (met.nis[used] <= high)))
+    count = int(np.count_nonzero(used))
+    mean = float(met.nis[used].mean()) / DEGREES if count else 0.0
+    panel = GradePanel(
+        "χ²",
+        (Values(met.tai_ns[used], met.nis[used]).trace("raw", axis, scale),),
+        "",
+        marks_of(met.tai_ns[~used], met.nis[~used], axis, scale),
+        tuple(scale.y(np.array([low, high, gate])).tolist()),
+        f"lines at {level(low)} and {level(high)} (95 %) and at {level(gate)} (gate); logarithmic",
+        scale,
+        "",
+    )
+    share = f"{100.0 * inside / count:.1f} %" if count else "–"
+    row = ("χ²", level(mean), share, str(int(np.count_nonzero(~used))))
+    columns = ("", "mean by degree, about 1", "inside 95 %", "not used")
+    return GradeChart("chi-square", "Chi-square of each measurement", (panel,), columns, (row,))

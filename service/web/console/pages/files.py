@@ -15,7 +15,7 @@ from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products.attitudes import AttitudeSeries, ProductGrade
 from service.products.formats import attitude_formats, table_formats
 from service.web.console.page_context import ContextDep, PageContext
-from service.web.console.pages.one_spacecraft.spacecraft import (
+from service.web.console.pages.spacecraft import (
     RANGES_S,
     ShownPeriod,
     SpacecraftQuery,

@@ -8,13 +8,17 @@ from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.storage.models.charts import TrackerStarsOfPeriod
-from service.web.console.charts.period.all_sky import all_sky_chart
-from service.web.console.charts.period.attitude import attitude_charts
-from service.web.console.charts.period.focal_plane import FocalPlaneMap, focal_plane_map
-from service.web.console.charts.period.histogram import Histogram, residual_histogram
-from service.web.console.charts.period.magnitudes import MagnitudeChart, magnitude_chart
+from service.web.console.charts.all_sky import all_sky_chart
+from service.web.console.charts.attitude import attitude_charts
+from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
+from service.web.console.charts.histogram import (
+    Histogram,
+    MagnitudeChart,
+    magnitude_chart,
+    residual_histogram,
+)
 from service.web.console.page_context import ContextDep
-from service.web.console.pages.one_spacecraft.spacecraft import (
+from service.web.console.pages.spacecraft import (
     RANGES_S,
     SpacecraftQuery,
     shown_period,
