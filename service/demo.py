@@ -19,9 +19,8 @@ from typing import Any, Self
 import httpx
 import msgspec
 
-from service.acquire.kernel_build import KernelBuild
+from service.acquire.kernel_build import KernelBuild, kernel_progress
 from service.errors import BadConfiguration, BadInput, Busy, Fault
-from service.ingest.kernel_progress import kernel_progress
 from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import replay_over_http

@@ -16,10 +16,9 @@ import numba
 import pytest
 
 from service import demo as demonstration
-from service.acquire.kernel_build import mark_built
+from service.acquire.kernel_build import KERNEL_BYTES, mark_built
 from service.cli import main
 from service.demo import MISSIONS
-from service.ingest.kernel_progress import KERNEL_BYTES
 from service.settings import Settings
 from service.simulate.files import read_objects, truth_path
 from service.simulate.score import Score, score

@@ -8,8 +8,7 @@ from functools import partial
 
 from service.acquire.choices import idle_reason
 from service.advice.advice import Findings, WorkLimit, advise
-from service.advice.innovation_statements import InnovationFinding, innovation_findings
-from service.advice.innovations import innovation_noise
+from service.advice.innovations import InnovationFinding, innovation_findings, innovation_noise
 from service.advice.intervals import Interval
 from service.advice.statements import (
     Statement,
@@ -18,11 +17,11 @@ from service.advice.statements import (
     magnitude_statement,
     noise_statement,
     tolerance_statement,
+    zone_statements,
 )
 from service.advice.tolerances import ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
 from service.advice.trials import VariantOutcome
-from service.advice.zone_statements import zone_statements
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.app.zones import Zones

@@ -208,7 +208,7 @@ class Runs:
         Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
         """
         from service.ingest.partitions.coordinator import reprocess_partitions
-        from service.ingest.partitions.workers import LocalProcesses, OwnProcess, Workers
+        from service.ingest.partitions.tasks import LocalProcesses, OwnProcess, Workers
 
         plan = self._plan(run, source, spacecraft, start, end, processes)
         if plan.run == LIVE:

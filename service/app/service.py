@@ -9,14 +9,13 @@ from msgspec import structs
 
 from service import __version__
 from service.access import audit
-from service.acquire.kernel_build import KernelBuild
+from service.acquire.kernel_build import KernelBuild, progress_logged
 from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy
-from service.ingest.kernel_progress import progress_logged
 from service.ingest.solver_pool import mission_in_input
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission

@@ -14,10 +14,9 @@ from service.app.context import Context, known_id
 from service.errors import AcquisitionError, BadBatch
 from service.gyro.block import GyroBlock
 from service.gyro.schema import block_from_json
-from service.ingest.gyro import GyroIntake
 from service.ingest.outcomes import Observer
 from service.ingest.queue import Backlog
-from service.ingest.submit import SubmissionService
+from service.ingest.submit import GyroIntake, SubmissionService
 from service.missions.mission import mission_named
 from service.observations.faults import faults_of
 from service.observations.schema import Submission, submission_from_json

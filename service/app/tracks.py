@@ -22,7 +22,7 @@ from service.storage.tracks import (
 from service.times import Utc, shifted, utc_now
 from service.tracks.finding import Track as FoundTrack
 from service.tracks.finding import figures, find_tracks
-from service.tracks.points import Batches, Points
+from service.tracks.gathering import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000

@@ -25,9 +25,8 @@ from service.storage.webhooks.models import (
 )
 from service.times import HOUR_S, Utc, shifted, utc_now
 from service.webhooks.addresses import require_http_allowed, require_url
-from service.webhooks.messages import delivery_row, wants
+from service.webhooks.messages import delivery_row, new_webhook_secret, wants
 from service.webhooks.sender import WebhookSender
-from service.webhooks.signing import new_webhook_secret
 
 MAX_WEBHOOKS = 50
 PREVIOUS_SECRET_H = 24

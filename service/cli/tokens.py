@@ -10,8 +10,8 @@ from urllib.parse import quote
 import msgspec
 from sqlalchemy import Connection
 
-from service.access.administration import MAX_DAYS, Tokens
 from service.access.audit import Entry
+from service.access.tokens import MAX_DAYS, Tokens
 from service.cli.arguments import print_json
 from service.errors import (
     AcquisitionError,

@@ -9,7 +9,7 @@ import pytest
 
 from service.acquire import acquire
 from service.acquire.result import Path
-from service.alarms.measurements import a_priori_angle_deg
+from service.alarms.quantities import a_priori_angle_deg
 from service.errors import BadBatch, BadConfiguration, BadFile
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission

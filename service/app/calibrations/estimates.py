@@ -10,9 +10,13 @@ from msgspec import structs
 from service.acquire import Acquisition
 from service.app.context import Context
 from service.app.submissions import Submissions
-from service.calibration.estimate import Calibration, calibrate
+from service.calibration.estimate import (
+    Calibration,
+    HeldOut,
+    calibrate,
+    calibrate_with_chosen_degree,
+)
 from service.calibration.evidence import identified_magnitudes, identified_stars
-from service.calibration.held_out import HeldOut, calibrate_with_chosen_degree
 from service.calibration.magnitudes import (
     MagnitudeCalibration,
     MagnitudeStars,

@@ -11,10 +11,10 @@ import msgspec
 import numpy as np
 
 from service.app.calibrations.estimates import CalibrationRun
+from service.calibration.elimination import NotObservable
 from service.calibration.estimate import Calibration
 from service.calibration.magnitudes import UNITS
 from service.calibration.mission_file import Lines, magnitude_lines, tracker_lines
-from service.calibration.observability import NotObservable
 from service.missions.corrections import AS_MEASURED, Magnitudes
 from service.missions.corrections import Calibration as FocalPlaneSettings
 from service.missions.mission import Mission, Tracker

@@ -75,9 +75,8 @@ def prepare(parsed: Namespace) -> int:
     import logging
     import time
 
-    from service.acquire.kernel_build import KernelBuild
+    from service.acquire.kernel_build import KernelBuild, progress_logged
     from service.acquire.prewarm import prewarm_sky
-    from service.ingest.kernel_progress import progress_logged
     from service.missions.mission import load_missions
     from service.sky.cache import LruCache
     from service.sky.catalog.star_catalog import open_catalog

@@ -14,8 +14,13 @@ from pathlib import Path
 from urllib.parse import quote
 
 from service.ingest.partitions.plan import Planner
-from service.ingest.partitions.tasks import PartitionResult, PartitionTask
-from service.ingest.partitions.workers import Wait, Workers, remove_unfinished
+from service.ingest.partitions.tasks import (
+    PartitionResult,
+    PartitionTask,
+    Wait,
+    Workers,
+    remove_unfinished,
+)
 from service.ingest.reprocess import (
     ReprocessPlan,
     ReprocessProgress,

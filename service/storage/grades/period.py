@@ -9,9 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
-from service.alarms.preview import preview_of
 from service.alarms.quantities import REJECTED
-from service.alarms.window import Point, Sample
+from service.alarms.window import Point, Sample, preview_of
 from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers
 from service.filtering.state import Outcome, Status

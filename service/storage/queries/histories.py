@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from pydantic import ValidationError
 from sqlalchemy import Connection, Select, exists, func, select
 
-from service.acquire.measured import METHOD
+from service.acquire.result import METHOD
 from service.missions.mission import Mission
 from service.storage.archive.reading import Archive
 from service.storage.models.base import Page

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 from sqlalchemy import Select, select
 
-from service.acquire.measured import METHOD
+from service.acquire.result import METHOD
 from service.alarms.quantities import QUANTITIES
 from service.products.attitudes import AttitudeRows
 from service.products.tables import Column, Page, Table

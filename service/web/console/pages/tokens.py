@@ -6,8 +6,7 @@ from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
-from service.access.administration import MAX_DAYS
-from service.access.tokens import SCOPES
+from service.access.tokens import MAX_DAYS, SCOPES
 from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
