@@ -35,8 +35,7 @@ from service.errors import NotAvailable
 from service.imaging.detection.detect import detect, detection_kernel
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
-from service.imaging.overlay import draw_overlay
-from service.imaging.overlay_marks import marks_of
+from service.imaging.overlay import draw_overlay, marks_of
 from service.imaging.submit import read_known, submission_of_frame
 from service.missions.camera import Camera
 from service.missions.mission import Mission, load_missions

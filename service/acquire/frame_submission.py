@@ -12,11 +12,11 @@ from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, s
 from service.identify.blind.lens import Lens
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
-from service.imaging.frames.preview import preview_png
 from service.imaging.submit import (
     FrameIn,
     batch_of_stars,
     choices_of,
+    preview_png,
     submission_of_frame,
     time_of,
     with_exposure,

@@ -14,8 +14,7 @@ from pydantic import AfterValidator, Field, ValidationError, model_validator
 from service.errors import BadBatch, Fault, shown_value
 from service.gyro.block import SAME_TIME_NS, GyroBlock, tai_ns_of, times_of_steps
 from service.observations.faults import faults_of
-from service.observations.numbers import Number
-from service.observations.schema import Key, RunName, Wire, is_time
+from service.observations.schema import Key, Number, RunName, Wire, is_time
 from service.times import parse_utc
 from service.vectors import Vector, read_only
 

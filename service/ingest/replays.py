@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
 from service.ingest.replay_progress import ProgressRecorder
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.packets.upload import PacketLines
 from service.storage.models.runs import Replay, ReplayStateName
 from service.storage.queries.replays import CANCELLED

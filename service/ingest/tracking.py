@@ -26,8 +26,7 @@ from service.missions.gyro import MotionSettings
 from service.missions.mission import Mission
 from service.missions.tracking import TrackingSettings
 from service.observations.batch import ObservationBatch
-from service.observations.prediction import NoPrediction, RateSource
-from service.observations.schema import Submission, submission_from_json
+from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
 from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes
 from service.storage.gyro import BlockFilter
 from service.times import shifted

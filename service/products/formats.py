@@ -126,7 +126,7 @@ def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
 
 
 def _apm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm.apm import write_apm
+    from service.products.adm.aem import write_apm
 
     return write_apm(series)
 

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 import msgspec
 
 from service.products.attitudes import AttitudeBlock, AttitudeSeries, Texts
-from service.products.number_texts import number_texts, rows_of_texts
+from service.products.tables import number_texts, rows_of_texts
 from service.vectors import Vector
 
 _ENCODER = msgspec.json.Encoder()

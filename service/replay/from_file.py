@@ -10,8 +10,7 @@ import numpy as np
 from service.errors import BadInput, Fault, shown_value
 from service.observations.batch import ObservationBatch
 from service.observations.schema import submission_from_json
-from service.products.reading.known_attitudes import KnownAttitudes
-from service.products.reading.known_states import Ephemeris
+from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.replay.items import Item
 
 

@@ -15,8 +15,7 @@ from typing import Any, get_args
 import numpy as np
 
 from service.errors import BadInput, Fault, shown_value
-from service.imaging.detection.star_image import reach_px, still_psf
-from service.imaging.detection.trail import TrailPsf, trails_px
+from service.imaging.detection.star_image import TrailPsf, reach_px, still_psf, trails_px
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera, PsfKind
 from service.missions.mission import Mission, RunCatalogSettings, Tracker

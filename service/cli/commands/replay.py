@@ -231,8 +231,7 @@ def run(parsed: Namespace) -> int:
 
 def _sources(parsed: Namespace) -> list["FromFile"]:
     """The files that add something to each batch."""
-    from service.products.reading.ephemerides import read_ephemeris
-    from service.products.reading.files import read_attitudes
+    from service.products.reading.files import read_attitudes, read_ephemeris
     from service.replay.from_file import FileEphemeris, FilePrior
 
     sources: list[FromFile] = []

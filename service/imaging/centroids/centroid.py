@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.blending import is_blended
-from service.imaging.centroids.moments import by_moments
+from service.imaging.centroids.moments import by_moments, is_blended
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import (
     CentroidRecord,
@@ -22,7 +21,6 @@ from service.imaging.centroids.record import (
     refusal,
     too_faint,
 )
-from service.imaging.centroids.region import brightest_pixel, square_about
 from service.imaging.centroids.sequential import diffuse
 from service.imaging.centroids.shape_fit import (
     ENOUGH_SIGMAS,
@@ -35,7 +33,7 @@ from service.imaging.centroids.shape_fit import (
     stepped,
     with_level_error,
 )
-from service.imaging.centroids.window import Window
+from service.imaging.centroids.window import Window, brightest_pixel, square_about
 from service.observations.scans.profile import BREAKDOWN_RATIO
 
 Method = Literal["window", "scan", "matched", "recursive"]

@@ -14,9 +14,7 @@ from scipy.special import j1
 
 from service.errors import BadInput, Fault
 from service.imaging.centroids.psf import Array
-from service.imaging.optics.pupil import behind_wires, disc
-from service.imaging.optics.spectrum import monochromatic
-from service.imaging.optics.transfer import image_of
+from service.imaging.optics import behind_wires, disc, image_of, monochromatic
 
 LEAST_SAMPLES_PER_PX = 3
 

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.region import Region, square_about
-from service.imaging.centroids.window import Array, Window
+from service.imaging.centroids.window import Array, Region, Window, square_about
 
 MOST_STEPS = 30
 ENOUGH_SIGMAS = 0.01

@@ -19,14 +19,15 @@ from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, full_scale_of
 from service.imaging.frames.exif import (
     MAX_EXIF_BYTES,
+    TAG,
     Entry,
+    as_shown,
     bytes_beyond,
     directory,
     told_exposure,
 )
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
-from service.imaging.frames.orientation import TAG, as_shown
 
 MAX_TAGS, MAX_PAGES = 256, 256
 MAX_TAG_BYTES = 1 << 20

@@ -32,7 +32,7 @@ from service.observations.readers.csv_columns import (
     star_of,
 )
 from service.observations.readers.csv_table import CsvRow, Row, RowKind
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.observations.schema import BatchIn
 
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS

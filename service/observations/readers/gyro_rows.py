@@ -11,7 +11,7 @@ from typing import Any
 from service.errors import BadFile, BadInput, Fault
 from service.observations.readers.csv_columns import BadCell, number_cell
 from service.observations.readers.csv_table import CsvRow, Row, RowKind
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.times import parse_utc
 
 KEY = ("spacecraft", "run", "block")

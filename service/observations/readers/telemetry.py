@@ -19,8 +19,8 @@ from service.errors import BadFile, Fault, shown_value
 from service.observations.readers.csv_columns import COLUMNS
 from service.observations.readers.csv_rows import BATCH_ROWS, batches_of_rows
 from service.observations.readers.csv_table import SEPARATORS, CsvTable
+from service.observations.readers.decompress import Line, physical_lines
 from service.observations.readers.gyro_rows import GYRO_ROWS, blocks_of_rows
-from service.observations.readers.lines import Line, physical_lines
 
 TelemetryFormat = Literal["ndjson", "csv"]
 

@@ -13,8 +13,16 @@ from itertools import chain
 
 import numpy as np
 
-from service.products.adm.forms import Pairs, kvn, one_line, time_text
-from service.products.adm.header import REF_FRAME_A, REF_FRAME_B, TIME_SYSTEM, header
+from service.products.adm.forms import (
+    REF_FRAME_A,
+    REF_FRAME_B,
+    TIME_SYSTEM,
+    Pairs,
+    header,
+    kvn,
+    one_line,
+    time_text,
+)
 from service.products.attitudes import (
     AttitudeBlock,
     AttitudeSeries,
@@ -22,8 +30,8 @@ from service.products.attitudes import (
     SeriesInfo,
     stretches,
 )
-from service.products.number_texts import rows_of_texts
 from service.products.spool import pieces, spool
+from service.products.tables import rows_of_texts
 from service.vectors import Vector
 
 TRACKER_FRAME = "STARTRACKER_1"

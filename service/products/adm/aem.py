@@ -1,4 +1,4 @@
-"""AEM version 2: attitudes as a time series, a segment for each unbroken stretch.
+"""AEM version 2: attitudes as a time series; APM version 2: the last one alone.
 
 REF_FRAME_A and REF_FRAME_B fix the direction, from A to B; quaternions are scalar-last.
 Version 1 had keywords for both, which version 2 has no longer.  A rate is in the axes of
@@ -10,14 +10,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.products.adm.forms import Pairs, kvn, time_text, xml, xml_closing, xml_opening
-from service.products.adm.header import (
+from service.products.adm.forms import (
     RATE_WORDS,
     REF_FRAME_A,
     REF_FRAME_B,
     TIME_SYSTEM,
+    Pairs,
     header,
     identity,
+    kvn,
+    numbers,
+    time_text,
+    xml,
+    xml_closing,
+    xml_opening,
 )
 from service.products.attitudes import (
     AttitudeBlock,
@@ -25,8 +31,8 @@ from service.products.attitudes import (
     SeriesInfo,
     stretches,
 )
-from service.products.number_texts import rows_of_texts
 from service.products.spool import pieces, spool
+from service.products.tables import rows_of_texts
 
 
 @dataclass(frozen=True)
@@ -146,3 +152,39 @@ XML = Form(
     "      </data>\n    </segment>\n",
     xml_closing("aem"),
 )
+
+
+_FRAMES = [("REF_FRAME_A", REF_FRAME_A), ("REF_FRAME_B", REF_FRAME_B)]
+
+
+def write_apm(series: AttitudeSeries) -> Iterator[bytes]:
+    """Write the last attitude of a series, which has one at least; reads all of it."""
+    for block in series.blocks:
+        last = block.taken(slice(-1, None))
+    parts = [
+        kvn([("CCSDS_APM_VERS", "2.0")]),
+        kvn(header(series.about)),
+        "\n",
+        kvn([*identity(series.about), ("TIME_SYSTEM", TIME_SYSTEM)]),
+        "\n",
+        kvn([("EPOCH", time_text(last.time[0]))]),
+        "\nQUAT_START\n",
+        kvn(_FRAMES),
+        kvn(list(zip(("Q1", "Q2", "Q3", "QC"), numbers(last.quaternion[0].tolist()), strict=True))),
+        "QUAT_STOP\n",
+    ]
+    if not np.isnan(last.rate_deg_per_s).any():
+        words = RATE_WORDS[frozenset({last.rate_origin[0]})]
+        rates = numbers(last.rate_deg_per_s[0].tolist())
+        parts += [
+            f"\nANGVEL_START\nCOMMENT Angular velocity {words}\n",
+            kvn([*_FRAMES, ("ANGVEL_FRAME", REF_FRAME_B)]),
+            kvn(
+                [
+                    (f"ANGVEL_{axis}", f"{rate} [deg/s]")
+                    for axis, rate in zip("XYZ", rates, strict=True)
+                ]
+            ),
+            "ANGVEL_STOP\n",
+        ]
+    yield "".join(parts).encode()

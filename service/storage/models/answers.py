@@ -10,8 +10,7 @@ from pydantic_core import CoreSchema
 from service.acquire.result import TrackingState
 from service.alarms.quantities import QUANTITIES, value_names
 from service.missions.mission import Identifier
-from service.observations.prediction import NoPrediction, RateSource
-from service.observations.schema import BatchIn
+from service.observations.schema import BatchIn, NoPrediction, RateSource
 from service.storage.models.base import (
     Count,
     Covariance,
