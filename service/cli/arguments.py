@@ -7,7 +7,7 @@ import argparse
 import difflib
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -220,3 +220,24 @@ def degrees(text: str) -> float:
     if number >= 120:
         raise argparse.ArgumentTypeError(f"must be below 120 degrees (got {text!r})")
     return number
+
+
+def written_to(file: Path | None, content: Iterator[bytes]) -> None:
+    """Write content to a file, or to the standard output where there is none.
+
+    The file appears when it is whole: it is written under another name beside its place.
+    """
+    if file is None:
+        for piece in content:
+            sys.stdout.buffer.write(piece)
+        sys.stdout.buffer.flush()
+        return
+    beside = file.with_name(f"{file.name}.part")
+    try:
+        with beside.open("wb") as part:
+            for piece in content:
+                part.write(piece)
+        beside.replace(file)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise

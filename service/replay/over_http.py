@@ -24,7 +24,7 @@ from service.errors import (
     shown_value,
 )
 from service.gyro.schema import json_of_block
-from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
+from service.replay.from_file import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, LineOutcome, Pace, Problem, Report
 
 GIVE_UP_AFTER_S = 30.0

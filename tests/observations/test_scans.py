@@ -20,7 +20,7 @@ from service.observations.readers.telemetry import read_lines
 from service.observations.scans.reduce import reduced
 from service.observations.scans.sun import sun_body
 from service.observations.schema import BatchIn, submission_from_json
-from service.simulate.scans import readings
+from service.simulate.sightings import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import sun_direction

@@ -31,8 +31,7 @@ from service.errors import BadConfiguration
 from service.imaging.submit import read_known
 from service.observations.schema import OptionsIn, submission_from_json
 from service.settings import Settings
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.storage.projections import rollups
 from service.storage.projections.projector import rebuild_trends
 from service.storage.recording.digests import digest_of

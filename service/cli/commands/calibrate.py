@@ -92,7 +92,7 @@ def run(parsed: Namespace) -> int:
 
     from service.app.calibrations.estimates import CalibrationRequest
     from service.app.factory import open_app
-    from service.cli.calibration_text import calibration_json, calibration_text
+    from service.cli.texts import calibration_json, calibration_text
     from service.missions.mission import mission_named
 
     start, end = period_of(parsed)

@@ -14,9 +14,9 @@ from service.cli.arguments import (
     add_period,
     positive,
     print_json,
+    written_to,
 )
 from service.cli.configuration import period_of, settings_of_existing
-from service.cli.output import written_to
 from service.products.formats import attitude_formats, table_formats, write_attitudes, write_table
 
 TABLES = {

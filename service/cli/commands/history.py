@@ -5,9 +5,15 @@ from argparse import Namespace
 from collections.abc import Iterator
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_output, add_period
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_output,
+    add_period,
+    written_to,
+)
 from service.cli.configuration import period_of, settings_of_existing
-from service.cli.output import written_to
 from service.products.formats import table_formats, write_table
 from service.products.tables import Table
 

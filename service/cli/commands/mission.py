@@ -47,7 +47,7 @@ def add(commands: Any) -> None:
 
 def check(parsed: Namespace) -> int:
     """Print what is wrong and unusual, and the zones; 1 where something is wrong."""
-    from service.cli.mission_picture import picture
+    from service.cli.charts import zones_picture
     from service.cli.mission_report import examined, refusals, report_json, report_text
     from service.missions.mission import read_mission
     from service.settings import Settings
@@ -68,7 +68,7 @@ def check(parsed: Namespace) -> int:
     catalog = open_catalog(Settings.from_environment().catalog)
     report = examined(mission, catalog, parsed.epoch)
     if parsed.picture is not None and report.zones:
-        parsed.picture.write_text(picture(report), encoding="utf-8")
+        parsed.picture.write_text(zones_picture(report), encoding="utf-8")
     if parsed.json:
         print_json({"file": str(parsed.file), **report_json(report)})
     else:

@@ -154,7 +154,7 @@ def run(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
     from msgspec import to_builtins
 
-    from service.replay.carry_attitude import AttitudeCarrier
+    from service.replay.from_file import AttitudeCarrier
     from service.replay.items import Pace, items_of, packet_items, run_name
     from service.replay.summary import ReplaySummary
 

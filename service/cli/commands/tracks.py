@@ -39,8 +39,8 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Link, and print or write."""
     from service.app.factory import open_app
-    from service.cli.output import written_to
-    from service.cli.tracks_table import tracks_text
+    from service.cli.arguments import written_to
+    from service.cli.texts import tracks_text
 
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))

@@ -82,8 +82,13 @@ def run(parsed: Namespace) -> int:
     """Draw frames into a folder, with a progress bar."""
     from tqdm import tqdm
 
-    from service.simulate.frame_files import TRUTH, write_frames
-    from service.simulate.frames import DEFAULT_START, FrameSettings, draw_frames
+    from service.simulate.frames import (
+        DEFAULT_START,
+        TRUTH,
+        FrameSettings,
+        draw_frames,
+        write_frames,
+    )
     from service.sky.cache import LruCache
     from service.sky.model import SkyModel
 

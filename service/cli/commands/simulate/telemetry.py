@@ -124,9 +124,8 @@ def _add_gyro(parser: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Draw a pass and write it with its truth."""
-    from service.simulate.files import truth_path, write_pass
     from service.simulate.gyro import with_gyro
-    from service.simulate.telemetry import draw_pass
+    from service.simulate.telemetry import draw_pass, truth_path, write_pass
     from service.sky.cache import LruCache
     from service.sky.model import SkyModel
 
