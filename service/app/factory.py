@@ -7,14 +7,13 @@ from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits
 from service.app.calibrations.adoptions import CalibrationAdoptions
 from service.app.calibrations.service import CalibrationService
-from service.app.comparisons import Comparisons
 from service.app.context import Context
 from service.app.frames import Frames
 from service.app.grades import DefinitiveAttitudes, Grades
 from service.app.live_filter import LiveFilter
 from service.app.products import Products
 from service.app.replays import Replays
-from service.app.results import Results
+from service.app.results import Comparisons, Results
 from service.app.runs import Runs
 from service.app.service import Audit, Events, Service
 from service.app.single_projector import SingleProjector

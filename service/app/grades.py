@@ -15,9 +15,17 @@ from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.day import LOOK_AHEAD_S, grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
-from service.storage.grades.days import DayKey, current_day, record_day, rows_of
+from service.storage.grades.days import (
+    DayKey,
+    DefinitiveJob,
+    DefinitiveJobList,
+    GradedDayRow,
+    Innovation,
+    current_day,
+    record_day,
+    rows_of,
+)
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.grades.models import DefinitiveJob, DefinitiveJobList, GradedDayRow, Innovation
 from service.storage.grades.period import (
     GradesOfPeriod,
     evaluate_day,

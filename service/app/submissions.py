@@ -12,8 +12,7 @@ from service.access.tokens import Caller
 from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context, known_id
 from service.errors import AcquisitionError, BadBatch
-from service.gyro.block import GyroBlock
-from service.gyro.schema import block_from_json
+from service.gyro import GyroBlock, block_from_json
 from service.ingest.outcomes import Observer
 from service.ingest.queue import Backlog
 from service.ingest.submit import GyroIntake, SubmissionService

@@ -16,7 +16,7 @@ from service.storage.recording.events import events_between, last_event
 from service.storage.recording.ids import Ulids
 from service.storage.sql.columns import Row
 from service.storage.webhooks import deliveries, registered
-from service.storage.webhooks.models import (
+from service.storage.webhooks.registered import (
     Webhook,
     WebhookDelivery,
     WebhookQueued,

@@ -30,7 +30,7 @@ from service.grades.stretches import (
     cut,
     directions_where,
 )
-from service.gyro.block import Nanoseconds
+from service.gyro import Nanoseconds
 from service.missions.mission import Mission
 from service.times import HOUR_S, Utc, bucket_start, shifted
 

@@ -16,7 +16,7 @@ from service.filtering.samples import (
     DirectionMeasurements,
     GyroSamples,
 )
-from service.gyro.block import Nanoseconds
+from service.gyro import Nanoseconds
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.mission import Mission
 from service.vectors import ARCSEC_PER_RADIAN, Vector

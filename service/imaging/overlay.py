@@ -1,4 +1,4 @@
-"""The picture of a frame with what was made of it: stars, names, residual arrows."""
+"""Pictures with what was made of them: stars, names, residual arrows; and residuals alone."""
 
 import io
 import math
@@ -13,7 +13,7 @@ from service.missions.mission import Tracker
 from service.observations.batch import ObservationBatch
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import apparent, observer_velocity
-from service.vectors import matrix_from_quaternion
+from service.vectors import Vector, matrix_from_quaternion
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
@@ -197,3 +197,44 @@ def _draw_foot(
     if factor:
         text = f"arrows: from the expected to the measured place, {factor:,.0f} times enlarged"
         draw.text((6, top + 4 + 2 * LINE_PX), text, _ARROW, font=font)  # type: ignore[arg-type]
+
+
+SIDE_PX, MAP_FOOT_PX = 900, 24
+MAP_ARROW_PX = 22.0
+"""The length of the arrow of the reference residual."""
+_GROUND, _STAR, _MAP_ARROW, _MAP_TEXT = (
+    (12, 14, 20),
+    (90, 120, 150),
+    (110, 200, 255),
+    (225, 225, 225),
+)
+
+
+def draw_residuals(
+    place_px: Vector,
+    residual_px: Vector,
+    size_px: tuple[int, int],
+    arrow_of_px: float,
+    title: str,
+) -> bytes:
+    """A PNG of residuals (n, 2) at places (n, 2) of a sensor; `arrow_of_px` has a usual arrow."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    scale = SIDE_PX / max(size_px)
+    width, height = (max(1, round(side * scale)) for side in size_px)
+    image = Image.new("RGB", (width, height + MAP_FOOT_PX), _GROUND)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(13)
+    factor = MAP_ARROW_PX / max(arrow_of_px, 1e-9)
+    ends = (place_px + 0.5) * scale + residual_px * factor
+    for (x, y), (u, v) in zip(((place_px + 0.5) * scale).tolist(), ends.tolist(), strict=True):
+        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_STAR)
+        draw.line((x, y, u, v), fill=_MAP_ARROW)
+    rms = math.sqrt(float(np.mean(residual_px**2))) if residual_px.size else 0.0
+    text = f"{title}: {rms:.3f} px rms per axis; this bar is {arrow_of_px:.3f} px"
+    draw.rectangle((0, height, width, height + MAP_FOOT_PX), fill=(0, 0, 0))
+    draw.text((6, height + 4), text, fill=_MAP_TEXT, font=font)
+    end = draw.textlength(text, font=font) + 14
+    draw.line((end, height + 12, end + MAP_ARROW_PX, height + 12), fill=_MAP_ARROW, width=2)
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue()

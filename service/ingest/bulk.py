@@ -13,8 +13,7 @@ from typing import Annotated
 import msgspec
 
 from service.errors import AcquisitionError, Busy
-from service.gyro.block import GyroBlock
-from service.gyro.schema import block_from_line, is_gyro_line
+from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
 from service.ingest.outcomes import Answers
 from service.ingest.solver_pool import Solver

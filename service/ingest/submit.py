@@ -17,8 +17,7 @@ from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.errors import AcquisitionError, Busy
-from service.gyro.block import GyroBlock
-from service.gyro.schema import require_rates_within
+from service.gyro import GyroBlock, require_rates_within
 from service.ingest.outcomes import (
     Answers,
     Observer,

@@ -23,7 +23,7 @@ from service.errors import (
     problem_of_faults,
     shown_value,
 )
-from service.gyro.schema import json_of_block
+from service.gyro import json_of_block
 from service.replay.from_file import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, LineOutcome, Pace, Problem, Report
 

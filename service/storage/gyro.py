@@ -10,7 +10,8 @@ import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service.errors import BadBatch, Conflict, Fault, NotFound, shown_value
-from service.gyro.block import (
+from service.gyro import (
+    MAX_SPAN_S,
     SAME_TIME_NS,
     GyroBlock,
     Nanoseconds,
@@ -22,7 +23,6 @@ from service.gyro.block import (
     times_of_steps,
     unpack,
 )
-from service.gyro.schema import MAX_SPAN_S
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models.base import Page

@@ -40,11 +40,10 @@ from service.web.api import (
     zones,
 )
 from service.web.api import tokens as access
-from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
 from service.web.console.rendering import page_or_problem
 from service.web.event_stream import Live
-from service.web.middleware import AroundRequests, BelowPath, warm_request
+from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
 from service.web.openapi.document import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports

@@ -7,8 +7,7 @@ from sqlalchemy import update
 
 from service.app.factory import open_app
 from service.errors import AcquisitionError
-from service.gyro.block import pack
-from service.gyro.schema import GyroBlockIn, block_from_model
+from service.gyro import GyroBlockIn, block_from_model, pack
 from service.settings import Settings
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.upkeep.backup import back_up

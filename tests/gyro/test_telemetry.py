@@ -9,7 +9,7 @@ from acquire_client import Client
 from service.access.tokens import Caller
 from service.app.factory import open_app
 from service.errors import BadFile
-from service.gyro.schema import block_from_json, block_from_line, is_gyro_line, json_of_block
+from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
 from service.observations.readers.telemetry import read_lines
 from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process

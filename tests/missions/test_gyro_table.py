@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadBatch, BadConfiguration
-from service.gyro.schema import GyroBlockIn, block_from_model
+from service.gyro import GyroBlockIn, block_from_model
 from service.ingest.submit import GyroIntake
 from service.missions.mission import load_missions, parse_mission
 from tests.gyro.blocks import body

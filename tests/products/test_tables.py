@@ -17,9 +17,8 @@ from service.alarms.quantities import QUANTITIES
 from service.app import spacecraft
 from service.errors import NotAvailable
 from service.products.attitude_table import COLUMNS, ESTIMATED_COLUMNS
-from service.products.fits_file import write_fits
 from service.products.formats import OUTPUT_FORMATS
-from service.products.parquet import write_parquet
+from service.products.table_files import write_fits, write_parquet
 from service.products.tables import Column, Table, write_csv
 from service.storage import gyro
 from service.storage.queries import result_tables

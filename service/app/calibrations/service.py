@@ -15,8 +15,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from service.access.audit import Entry
 from service.app.calibrations.estimates import CalibrationRequest, CalibrationRun, Estimator, Step
 from service.app.calibrations.findings import result_of, with_geometry
-from service.app.comparisons import COMPARE_SAMPLE, Comparisons, Stretch
 from service.app.context import Context, known_id
+from service.app.results import COMPARE_SAMPLE, Comparisons, Stretch
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, Stopping, WrongState
 from service.missions.mission import Mission, mission_named

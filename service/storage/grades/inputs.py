@@ -16,7 +16,7 @@ from service.filtering.prediction import Known
 from service.filtering.samples import DirectionMeasurements, no_directions
 from service.grades.day import METHOD, day_bounds
 from service.grades.stretches import Recorded, usable_attitudes
-from service.gyro.block import Nanoseconds, tai_ns_of
+from service.gyro import Nanoseconds, tai_ns_of
 from service.identify.attitude_from_matches import matched_vectors
 from service.identify.identification import Outcome
 from service.missions.mission import Mission

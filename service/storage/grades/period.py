@@ -23,10 +23,9 @@ from service.grades.day import (
     unpacked_innovations,
 )
 from service.grades.innovations import MeasuredInnovations
-from service.gyro.block import texts_of
+from service.gyro import texts_of
 from service.missions.mission import Mission
-from service.storage.grades.days import DayKey, shown
-from service.storage.grades.models import GradedDayRow, Innovation
+from service.storage.grades.days import DayKey, GradedDayRow, Innovation, shown
 from service.storage.grades.rows import block_conditions
 from service.storage.models.base import Page
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms

@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
 from service.filtering.state import Status
 from service.grades.carried import Carried
 from service.grades.day import Grade, day_bounds, unpacked
-from service.gyro.block import texts_of
+from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
 from service.storage.models.base import (
     Components,

@@ -95,7 +95,7 @@ gyro_blocks = Table(
     Column("samples", Integer, nullable=False),
     # Null where the block has times of its own.
     Column("step_s", Double),
-    # Packed: see service/gyro/block.py.
+    # Packed: see service/gyro.py.
     Column("times_s", LargeBinary),
     Column("rates_rad_per_s", LargeBinary, nullable=False),
     UniqueConstraint("spacecraft", "run", "block"),

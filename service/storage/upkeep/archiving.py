@@ -44,7 +44,7 @@ from service.storage.archive.rows import (
     to_partition,
 )
 from service.storage.projections import rollups
-from service.storage.recording.archived_hours import keep_share
+from service.storage.projections.rollups import keep_share
 from service.storage.recording.tracker_values import is_waiting
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import (

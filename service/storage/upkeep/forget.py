@@ -18,7 +18,7 @@ from sqlalchemy.exc import IntegrityError
 from service.errors import BadConfiguration, NotFound, shown_value
 from service.storage.models.runs import Forgotten
 from service.storage.projections import rollups
-from service.storage.recording.archived_hours import forget_share
+from service.storage.projections.rollups import forget_share
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.grade_tables import graded_days, gyro_blocks
 from service.storage.sql.tables import (

@@ -29,8 +29,8 @@ from service.storage.archive.folder import (
 from service.storage.archive.rows import Rows, from_partition
 from service.storage.projections import alarms, rollups
 from service.storage.projections.recorded import RecordedResult
+from service.storage.projections.rollups import WHOLE, insert_share
 from service.storage.recording import events
-from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS

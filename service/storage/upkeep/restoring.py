@@ -29,7 +29,7 @@ from service.storage.archive.folder import (
 )
 from service.storage.archive.rows import Rows, from_partition, insert_rows
 from service.storage.projections import rollups, seals
-from service.storage.recording.archived_hours import forget_share
+from service.storage.projections.rollups import forget_share
 from service.storage.sql.statements import insert_missing, insert_runs
 from service.storage.sql.tables import (
     archived_batches,

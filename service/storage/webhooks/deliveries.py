@@ -15,7 +15,7 @@ from service.storage.models.base import Page
 from service.storage.sql.access_tables import webhook_deliveries, webhook_sender, webhooks
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
-from service.storage.webhooks.models import WebhookDelivery
+from service.storage.webhooks.registered import WebhookDelivery
 
 DEAD_KEPT = 10_000
 """Dead letters of one webhook; of more the oldest are deleted."""

@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from service.access.tokens import Caller
 from service.app.calibrations.estimates import CALIBRATION_SAMPLE, CalibrationRequest
-from service.app.comparisons import COMPARE_SAMPLE
+from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire

@@ -8,7 +8,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.errors import BadInput
-from service.gyro.schema import GyroBlockIn
+from service.gyro import GyroBlockIn
 from service.storage.models.gyro import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.web.openapi.route import LINK, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response, page_response

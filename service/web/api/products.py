@@ -18,7 +18,7 @@ from service.products.formats import (
     write_attitudes,
     write_table,
 )
-from service.storage.grades.models import DefinitiveJob, DefinitiveJobList, InnovationPage
+from service.storage.grades.days import DefinitiveJob, DefinitiveJobList, InnovationPage
 from service.storage.grades.rows import LiveAttitude
 from service.storage.models.products import AttitudeAtMoment, AttitudeProduct
 from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs

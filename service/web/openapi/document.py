@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 
 from service import __version__
-from service.gyro.schema import GyroBlockIn
+from service.gyro import GyroBlockIn
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
 from service.storage.models.events import EVENT_DATA
@@ -32,7 +32,7 @@ from service.web.api.runs import ForgetIn, RunIn
 from service.web.api.tokens import SignIn, TokenIn
 from service.web.api.webhooks import ReplayEventsIn, RetryIn, SecretIn, WebhookIn
 from service.web.api.zones import WarmIn
-from service.web.conditional import API
+from service.web.middleware import API
 from service.web.openapi.route import (
     ATTITUDES,
     ETAG,

@@ -32,7 +32,7 @@ from service.storage.models.zones import ZoneCache
 from service.storage.projections.projector import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
-from service.storage.webhooks.models import Webhook
+from service.storage.webhooks.registered import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now
 from service.webhooks.delivery_log import Result
 

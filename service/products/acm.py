@@ -13,7 +13,7 @@ from itertools import chain
 
 import numpy as np
 
-from service.products.adm.forms import (
+from service.products.adm import (
     REF_FRAME_A,
     REF_FRAME_B,
     TIME_SYSTEM,

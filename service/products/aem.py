@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.products.adm.forms import (
+from service.products.adm import (
     RATE_WORDS,
     REF_FRAME_A,
     REF_FRAME_B,

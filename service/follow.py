@@ -31,7 +31,7 @@ from nats.js.errors import NoStreamResponseError, NotFoundError
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
 from service.errors import BadConfiguration
-from service.gyro.schema import is_gyro_line
+from service.gyro import is_gyro_line
 
 ACK_WAIT_S = 30.0
 """After so long without a sign from its follower a message is delivered to another one."""
