@@ -21,21 +21,17 @@ from service.app.factory import App
 from service.errors import AcquisitionError
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
-    advice,
     alarms,
     annotations,
     batches,
     calibrations,
-    compare,
     events,
     frames,
     gyro,
-    overview,
     probes,
     products,
     runs,
     spacecraft,
-    tracks,
     webhooks,
     zones,
 )
@@ -56,19 +52,20 @@ log = logging.getLogger(__name__)
 WORKER_THREADS = 64
 """Handlers run in threads, and those of concurrent repeats wait there for the first."""
 
+# The order of the routes in `openapi.yaml`.
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
     frames.router,
     spacecraft.router,
     products.router,
     gyro.router,
-    tracks.router,
-    advice.router,
-    compare.router,
+    products.tracks_router,
+    spacecraft.advice_router,
+    batches.compare_router,
     calibrations.router,
     zones.router,
     runs.router,
-    overview.router,
+    spacecraft.overview_router,
     alarms.router,
     annotations.router,
     events.router,

@@ -21,7 +21,7 @@ from service.storage.calibrations import (
     CalibrationPage,
 )
 from service.storage.models.compare import Comparison
-from service.web.api.compare import WORK_S
+from service.web.api.batches import COMPARISON_S
 from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
@@ -205,7 +205,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     """Process recorded batches again with and without a calibration; nothing is recorded."""
     asked = read_model(CalibrationTrialIn, body)
     _visible(app, id, caller)
-    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=WORK_S))
+    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=COMPARISON_S))
 
 
 @router.post(

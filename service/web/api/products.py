@@ -1,4 +1,4 @@
-"""Products: attitudes and tables in the formats of other programs, and attitude over time."""
+"""Products: attitudes, tables and tracks as files, and attitude over time."""
 
 from dataclasses import asdict
 from typing import Annotated, ClassVar, Self
@@ -21,12 +21,14 @@ from service.products.formats import (
 from service.storage.grades.days import DefinitiveJob, DefinitiveJobList, InnovationPage
 from service.storage.grades.rows import LiveAttitude
 from service.storage.models.products import AttitudeAtMoment, AttitudeProduct
+from service.storage.tracks import TrackList
 from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.exports import ExportsDep, attached_as
 from service.web.requests.query_parameters import (
     NO_QUERY,
+    TDM_MEDIA_TYPE,
     AttitudeAtQuery,
     AttitudeQuery,
     End,
@@ -35,6 +37,7 @@ from service.web.requests.query_parameters import (
     Start,
     TableKindPath,
     TableQuery,
+    TracksQuery,
     Who,
     require_order,
 )
@@ -219,3 +222,30 @@ def get_definitive_attitude(
 ) -> Response:
     """How far a job is."""
     return json_response(app.definitive.get(name, id))
+
+
+tracks_router = APIRouter(prefix="/api/v1/spacecraft", tags=["products"])
+
+
+@tracks_router.get(
+    "/{name}/tracks",
+    **route_docs(
+        {200: ResponseDoc("The tracks.", TrackList, also=TDM_MEDIA_TYPE)}, problems=(404, 503)
+    ),
+)
+def list_tracks(
+    name: SpacecraftPath,
+    query: Annotated[TracksQuery, InQuery()],
+    app: AppDep,
+) -> Response:
+    """Tracks of a period: points that no catalog star explains and that move together.
+
+    They are computed from the record: unmatched stars of the batches with an attitude, of at most
+    2,000 batches. As `tdm` the moving ones are a CCSDS TDM of right ascensions and declinations;
+    404 if there are none.
+    """
+    found = app.tracks.of_period(name, **query.run_and_times)
+    if query.format == "json":
+        return json_response(found)
+    attached = {"Content-Disposition": f'attachment; filename="{name}-{query.run}-tracks.tdm"'}
+    return Response(b"".join(app.tracks.tdm(found)), 200, attached, TDM_MEDIA_TYPE)

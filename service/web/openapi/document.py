@@ -18,14 +18,13 @@ from service.storage.models.base import Record, component_name, described
 from service.storage.models.events import EVENT_DATA
 from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
 from service.web.api.annotations import AnnotationIn
-from service.web.api.batches import WhatIfIn
+from service.web.api.batches import CompareIn, WhatIfIn
 from service.web.api.calibrations import (
     CalibrationAdoptIn,
     CalibrationIn,
     CalibrationRevertIn,
     CalibrationTrialIn,
 )
-from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
 from service.web.api.products import DefinitiveIn
 from service.web.api.runs import ForgetIn, RunIn

@@ -15,7 +15,7 @@ from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison, RatesOfRuns
 from service.times import DAY_S, parse_utc, utc_now
-from service.web.api.compare import WORK_S
+from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import asked_options, fields_of, settings_of_mission
 from service.web.console.page_context import ContextDep, PageContext, PageQuery
@@ -96,7 +96,7 @@ def compare_page(
             sample=query.sample,
             a=a,
             b=b,
-            limit_s=WORK_S,
+            limit_s=COMPARISON_S,
         )
     run = pair[0] if pair and runs else query.run
     name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))

@@ -15,7 +15,7 @@ from service.errors import BadConfiguration
 from service.missions.mission import Tolerances
 from service.observations.schema import Key
 from service.storage.models.spacecraft import MissionThen
-from service.web.api.advice import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
+from service.web.api.spacecraft import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.options import SYMBOLS
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
