@@ -238,7 +238,7 @@ def innovation_findings(
             "attitudes",
             noise.attitudes,
             noise.measurements,
-            _of_attitudes(noise.attitudes, noise, mission, trackers),
+            _of_attitudes(noise.attitudes, mission, trackers),
         ),
     ]
 
@@ -266,7 +266,6 @@ def _of_gyro(ratio: Interval, noise: InnovationNoise, settings: GyroSettings) ->
 
 def _of_attitudes(
     ratio: Interval,
-    noise: InnovationNoise,
     mission: Mission,
     trackers: tuple[NoiseFinding, ...],
 ) -> Statement:

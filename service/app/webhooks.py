@@ -29,8 +29,6 @@ from service.webhooks.messages import delivery_row, new_webhook_secret, wants
 from service.webhooks.sender import WebhookSender
 
 MAX_WEBHOOKS = 50
-PREVIOUS_SECRET_H = 24
-"""How long a secret goes on signing beside the one that replaced it, in hours."""
 
 
 class Webhooks:

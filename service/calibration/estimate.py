@@ -151,7 +151,7 @@ def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
             break
         if far:
             found.counted = found.used
-            found.reduced = _reduced(found, stars, model)
+            found.reduced = _reduced(found, model)
             # Stars that were left out may have been all that showed an unknown.
             found.marks = found.marks & observable(found.reduced.normal, found.unknowns)
             found.values = np.where(found.marks, found.values, 0.0)
@@ -201,7 +201,7 @@ def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tup
     return steps, max([float(np.abs(turned).max()), *angles]) > FAR_RAD
 
 
-def _reduced(found: Fit, stars: IdentifiedStars, model: Model) -> Eliminated:
+def _reduced(found: Fit, model: Model) -> Eliminated:
     """The normal equations where the fit stands."""
     given = found.values, found.attitude, found.residual, found.counted
     return _eliminated(found.parts, *given, model)
@@ -246,7 +246,7 @@ def calibration_of(stars: IdentifiedStars, model: Model, settled: Fit, before: F
     free, used = settled.free, settled.used
     if float(np.mean(used != settled.counted)) > RECOUNTED:
         settled.counted = used
-        settled.reduced = _reduced(settled, stars, model)
+        settled.reduced = _reduced(settled, model)
     freedom = degrees_of_freedom(stars, model, used) - len(free)
     kept = tuple(settled.unknowns[at] for at in free)
     per_unit = np.array([each.per_unit for each in kept])

@@ -127,6 +127,17 @@ def add_database(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_url_or_in_process(parser: argparse.ArgumentParser) -> None:
+    """Add `--url` and `--in-process`, of which one may be given."""
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--url", help=SERVICE)
+    way.add_argument(
+        "--in-process",
+        action="store_true",
+        help="process the files in this process, without a server",
+    )
+
+
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:
     """Add `--json`, which prints `what` as JSON in the place of text for people."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")

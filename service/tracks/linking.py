@@ -263,7 +263,7 @@ def _settled(
         motion = fit_motion(
             *(points.time_s[own], points.direction[own], points.covariance[own]), moves=moves
         )
-        gathered = _gathered(points, motion, used, density, moves=moves)
+        gathered = _gathered(points, motion, used, density)
         if np.array_equal(gathered, own):
             return motion, own
         own = gathered
@@ -275,8 +275,6 @@ def _gathered(
     motion: Motion,
     used: Marks,
     density: Vector,
-    *,
-    moves: bool,
 ) -> Indices:
     """The points on a motion: of each batch and tracker the nearest within the gate."""
     off, variance = offsets(motion, (points.time_s, points.direction, points.covariance))

@@ -1,6 +1,6 @@
 """`acquire export`: files for other programs."""
 
-from argparse import Namespace
+from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from typing import Any
 
@@ -59,21 +59,14 @@ def _add_attitude(commands: Any) -> None:
     add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")
     add_grade(parser)
-    parser.add_argument(
-        "--status", choices=("good", "suspect", "all"), default="good", help="default good"
-    )
+    _add_status(parser)
     parser.add_argument(
         "--order",
         choices=("oldest", "newest"),
         default="oldest",
         help="which attitudes come first; `newest` only for JSON and tables",
     )
-    parser.add_argument(
-        "--largest-gap",
-        type=positive,
-        metavar="SECONDS",
-        help="attitudes farther apart belong to two stretches; default: the mission's",
-    )
+    _add_largest_gap(parser)
     parser.add_argument(
         "--object-id", metavar="ID", help="OBJECT_ID of CCSDS messages; default: the mission's"
     )
@@ -85,6 +78,21 @@ def _add_attitude(commands: Any) -> None:
     )
     add_output(parser)
     add_database(parser)
+
+
+def _add_status(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--status", choices=("good", "suspect", "all"), default="good", help="default good"
+    )
+
+
+def _add_largest_gap(parser: ArgumentParser) -> None:
+    parser.add_argument(
+        "--largest-gap",
+        type=positive,
+        metavar="SECONDS",
+        help="attitudes farther apart belong to two stretches; default: the mission's",
+    )
 
 
 def _write_attitude(parsed: Namespace) -> int:
@@ -139,15 +147,8 @@ def _add_attitude_at(commands: Any) -> None:
         help="the nearest attitude, or one interpolated within a stretch; default interpolated",
     )
     add_grade(parser)
-    parser.add_argument(
-        "--status", choices=("good", "suspect", "all"), default="good", help="default good"
-    )
-    parser.add_argument(
-        "--largest-gap",
-        type=positive,
-        metavar="SECONDS",
-        help="attitudes farther apart belong to two stretches; default: the mission's",
-    )
+    _add_status(parser)
+    _add_largest_gap(parser)
     add_database(parser)
 
 

@@ -11,9 +11,9 @@ from typing import Any, Protocol
 
 from service.cli.arguments import (
     CAMERA_MISSION,
-    SERVICE,
     add_command,
     add_database,
+    add_url_or_in_process,
     degrees,
     positive,
 )
@@ -77,13 +77,7 @@ def add(commands: Any) -> None:
         help="which image of a file with several: name or number of a FITS unit, :2 for the second "
         "plane of a cube, the number of a TIFF page",
     )
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", help=SERVICE)
-    way.add_argument(
-        "--in-process",
-        action="store_true",
-        help="process the files in this process, without a server",
-    )
+    add_url_or_in_process(parser)
     parser.add_argument(
         "--overlay",
         type=Path,

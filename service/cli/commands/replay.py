@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli.arguments import (
-    SERVICE,
     add_command,
     add_database,
     add_json,
+    add_url_or_in_process,
     count,
     print_json,
     speed,
@@ -64,13 +64,7 @@ def add(commands: Any) -> None:
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
     _add_packets(parser)
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", help=SERVICE)
-    way.add_argument(
-        "--in-process",
-        action="store_true",
-        help="process the files in this process, without a server",
-    )
+    add_url_or_in_process(parser)
     parser.add_argument(
         "--run", help="the run for every batch; default: the first file's name without its ending"
     )

@@ -24,12 +24,11 @@ from service.imaging.centroids.record import (
 from service.imaging.centroids.sequential import diffuse
 from service.imaging.centroids.shape_fit import (
     ENOUGH_SIGMAS,
-    FARTHEST_IN_HALF_WIDTHS,
-    MOVE_BEYOND_PX,
     Fit,
     first_flux,
     fit,
     linearised,
+    region_after_step,
     stepped,
     with_level_error,
 )
@@ -140,12 +139,9 @@ def recursive_fit(
         estimate = start_of_pass.replayed(seen.rows, seen.left, seen.variance)
         converged = not recentre or seen.sigmas_of(estimate.state) < ENOUGH_SIGMAS
         u, v, flux = stepped(u, v, flux, estimate.state)
-        if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+        moved = region_after_step(window, region, (u, v), start, half_width_px, recentre)
+        if moved is None:
             return None
-        if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
-            moved = square_about(window, round(u), round(v), half_width_px)
-            if moved is None:
-                return None
-            region = moved
+        region = moved
     covariance = with_level_error(estimate.covariance, seen, window.background_sigma_counts)
     return Fit(u, v, flux, covariance, region, passes, converged)

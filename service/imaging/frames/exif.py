@@ -173,8 +173,6 @@ _TURNS: Mapping[int, str] = {
     8: "turned by 90 deg counterclockwise",
 }
 """From the order of the stored pixels to the picture that is shown (EXIF 2.32, 4.6.4)."""
-QUARTER_TURNS = (5, 6, 7, 8)
-"""Tags that exchange width and height."""
 
 
 def as_shown(counts: CountArray, tag: object) -> tuple[CountArray, str]:

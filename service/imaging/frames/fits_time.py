@@ -130,9 +130,9 @@ class _Told:
             return shifted(start, 0.5 * lasted_s)
         if end is not None and exposure_s is not None:
             return shifted(end, -0.5 * exposure_s)
-        raise _NoTime(self._missing(start or end, exposure_s))
+        raise _NoTime(self._missing(start or end))
 
-    def _missing(self, moment: Utc | None, exposure_s: float | None) -> str:
+    def _missing(self, moment: Utc | None) -> str:
         if moment is not None:
             keys = ", ".join(EXPOSURES)
             return f"the header has a time, but no exposure ({keys}), end or average (DATE-AVG)"
