@@ -5,8 +5,7 @@ from service.access.tokens import Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits
-from service.app.calibrations.adoptions import CalibrationAdoptions
-from service.app.calibrations.service import CalibrationService
+from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
 from service.app.frames import Frames
 from service.app.grades import DefinitiveAttitudes, Grades

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from service.app.advice import no_changes_text
-from service.app.calibrations.findings import (
+from service.app.calibration_estimates import (
     not_observable_of,
     notes,
     residuals_by_tracker,
@@ -31,7 +31,7 @@ from service.storage.models.compare import RunComparison, RunTransition
 from service.storage.tracks import Track, TrackList
 
 if TYPE_CHECKING:
-    from service.app.calibrations.estimates import CalibrationRun
+    from service.app.calibration_estimates import CalibrationRun
     from service.calibration.estimate import Calibration
 
 

@@ -114,25 +114,25 @@ def _json(series: "AttitudeSeries") -> Iterator[bytes]:
 
 
 def _aem(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.aem import KVN, write_aem
+    from service.products.adm import KVN, write_aem
 
     return write_aem(series, KVN)
 
 
 def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.aem import XML, write_aem
+    from service.products.adm import XML, write_aem
 
     return write_aem(series, XML)
 
 
 def _apm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.aem import write_apm
+    from service.products.adm import write_apm
 
     return write_apm(series)
 
 
 def _acm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.acm import write_acm
+    from service.products.adm import write_acm
 
     return write_acm(series)
 

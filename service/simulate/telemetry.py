@@ -24,12 +24,12 @@ from service.observations.readers.telemetry import telemetry_format
 from service.observations.schema import BatchIn
 from service.simulate.motion import (
     body_rates_deg_per_s,
+    orbit_of,
     pointed,
     random_axis,
     slewing_attitudes,
     tilted,
 )
-from service.simulate.orbits import orbit_of
 from service.simulate.real_sky import real_sky
 from service.simulate.sightings import BatchScene, Seen
 from service.simulate.stretches import Pass

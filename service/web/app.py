@@ -1,6 +1,7 @@
 """The app, put together in one place."""
 
 import asyncio
+import json
 import logging
 import os
 import socket
@@ -10,6 +11,7 @@ from contextlib import asynccontextmanager
 
 import anyio
 import anyio.to_thread
+import yaml
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
@@ -22,7 +24,6 @@ from service.errors import AcquisitionError
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     alarms,
-    annotations,
     batches,
     calibrations,
     events,
@@ -67,7 +68,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     runs.router,
     spacecraft.overview_router,
     alarms.router,
-    annotations.router,
+    alarms.annotations_router,
     events.router,
     webhooks.router,
     access.router,
@@ -232,3 +233,22 @@ def _is_ready(app: App) -> bool:
     except Exception:  # the warm-up logs why, and the next call tries again
         return False
     return True
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes text of several lines as it stands."""
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = "|" if "\n" in text else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def openapi_yaml() -> str:
+    """The text of `openapi.yaml`, made without a running service."""
+    # Once through JSON: YAML would mark what is shared between places.
+    plain = json.loads(json.dumps(bare_app().openapi()))
+    return str(yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from service.app.calibrations.estimates import CalibrationRequest
+from service.app.calibration_estimates import CalibrationRequest
 from service.errors import NotFound, WrongState
 from service.observations.schema import submission_from_json
 from tests.calibration.wrong_file import TURNED_ARCSEC, true_batches, write_mission_files

@@ -14,7 +14,7 @@ from service.missions.corrections import Calibration
 from service.observations.calibrate import correct
 from service.observations.focal_plane import measured_angles_deg, tracker_vectors
 from service.observations.schema import submission_from_json
-from service.simulate.orbits import HaloOrbit, orbit_of
+from service.simulate.motion import HaloOrbit, orbit_of
 from service.simulate.real_sky import real_sky
 from service.simulate.sightings import BatchScene, Seen, anywhere, shaken
 from service.simulate.stretches import NO_TROUBLES, Pass, Stretch, Trouble, Troubles

@@ -7,8 +7,7 @@ import numpy as np
 from service.missions.gyro import MotionSettings
 from service.missions.mission import Band
 from service.missions.tracking import TrackingSettings
-from service.simulate.motion import pointed, random_axis, turned_by
-from service.simulate.orbits import orbit_of
+from service.simulate.motion import orbit_of, pointed, random_axis, turned_by
 from service.simulate.real_sky import real_sky
 from service.simulate.sightings import BatchScene
 from service.simulate.stretches import Stretch

@@ -178,8 +178,7 @@ def run(parsed: Namespace) -> int:
         finally:
             app.close()
     else:
-        from service.replay.bulk_upload import replay_in_bulk
-        from service.replay.over_http import replay_over_http
+        from service.replay.over_http import replay_in_bulk, replay_over_http
 
         if parsed.database is not None:
             message = "goes with --in-process; a running service has its own"

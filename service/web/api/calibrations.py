@@ -9,7 +9,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access.tokens import Caller
-from service.app.calibrations.estimates import CALIBRATION_SAMPLE, CalibrationRequest
+from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value

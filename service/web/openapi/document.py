@@ -16,8 +16,14 @@ from service.gyro import GyroBlockIn
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
 from service.storage.models.events import EVENT_DATA
-from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
-from service.web.api.annotations import AnnotationIn
+from service.web.api.alarms import (
+    AnnotationIn,
+    CommentIn,
+    LimitIn,
+    LimitTrialIn,
+    ShelveIn,
+    StatementIn,
+)
 from service.web.api.batches import CompareIn, WhatIfIn
 from service.web.api.calibrations import (
     CalibrationAdoptIn,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.app.calibrations.findings import geometry_of
+from service.app.calibration_estimates import geometry_of
 from service.calibration.magnitudes import COLOR, SCALE
 from service.missions.corrections import AS_MEASURED
 from service.missions.mission import Mission

@@ -8,7 +8,7 @@ from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
-from service.app.calibrations.estimates import CALIBRATION_SAMPLE
+from service.app.calibration_estimates import CALIBRATION_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound
 from service.storage.calibrations import Calibration, CalibrationSummary

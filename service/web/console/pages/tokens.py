@@ -1,4 +1,4 @@
-"""The pages of access: tokens, the audit list of changes, and signing in."""
+"""The pages of operators: tokens, the audit list of changes, signing in, and webhooks."""
 
 from typing import Annotated
 
@@ -7,6 +7,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.access.tokens import MAX_DAYS, SCOPES
+from service.storage.recording.events import EVENT_KINDS
 from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
@@ -57,3 +58,30 @@ class SignInQuery(Query):
 def sign_in_page(query: Annotated[SignInQuery, InQuery()]) -> Response:
     """Ask for a token."""
     return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
+
+
+SHOWN_DELIVERIES = 20
+SEVERITIES = ("watch", "warning", "critical")
+
+
+@console_page("/webhooks", "Webhooks", OPERATE, section="/about")
+def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Every webhook with what waits for it."""
+    webhooks = context.app.webhooks.all()
+    waiting = {
+        each.id: context.app.webhooks.deliveries(
+            each.id, limit=SHOWN_DELIVERIES, oldest_first=True
+        ).items
+        for each in webhooks
+    }
+    return rendered(
+        "webhooks.html.jinja",
+        context.layout(query.run),
+        webhooks=webhooks,
+        deliveries=waiting,
+        most=SHOWN_DELIVERIES,
+        kinds=EVENT_KINDS,
+        severities=SEVERITIES,
+        spacecraft=context.spacecraft,
+        may_add="read" in context.caller.scopes,
+    )
