@@ -138,7 +138,7 @@ class Results:
     ) -> PeriodStars:
         """The stars and attitudes of a period, of some batches where there are many.
 
-        See `period.sample.sample_period`, which also bounds what is read.
+        See `period.sample_period`, which also bounds what is read.
         """
         self._context.mission(spacecraft)
         span = BucketFilter(spacecraft, run or LIVE, start, end)

@@ -24,7 +24,7 @@ from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera, PsfKind
 from service.missions.mission import Mission, RunCatalogSettings, Tracker
 from service.simulate.motion import orbit_of, pointed, random_axis, turned_by
-from service.simulate.real_sky import RealSky, real_sky
+from service.simulate.sightings import RealSky, real_sky
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.model import SkyModel

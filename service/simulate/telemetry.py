@@ -30,8 +30,7 @@ from service.simulate.motion import (
     slewing_attitudes,
     tilted,
 )
-from service.simulate.real_sky import real_sky
-from service.simulate.sightings import BatchScene, Seen
+from service.simulate.sightings import BatchScene, Seen, real_sky
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
 from service.sky.model import SkyModel

@@ -29,9 +29,16 @@ from service.storage.webhooks import deliveries
 from service.storage.webhooks.deliveries import Attempt, Queue, Waiting, hold_sender, read_sender
 from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks
 from service.times import DAY_S, recorded_utc, shifted, utc_now
-from service.webhooks.delivery_log import DeliveryLog
 from service.webhooks.messages import delivery_row, signed_headers, test_message, wants
-from service.webhooks.posts import GONE, TOO_MANY, TOTAL_S, UNAVAILABLE, Outcome, Poster
+from service.webhooks.posts import (
+    GONE,
+    TOO_MANY,
+    TOTAL_S,
+    UNAVAILABLE,
+    DeliveryLog,
+    Outcome,
+    Poster,
+)
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles
 from studies.paper_1994.tables import markdown
 from studies.ptp_2015 import tables
-from studies.ptp_2015.case import Case
 from studies.ptp_2015.comparison import (
     COMPARED,
     OF_THE_PAPER,
@@ -26,10 +25,10 @@ from studies.ptp_2015.comparison import (
     false_fields,
     stars_in_fields,
 )
-from studies.ptp_2015.found import Measurements
 from studies.ptp_2015.plots import draw
 from studies.ptp_2015.printed import the_ptp_paper
-from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, section
+from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, Measurements, section
+from studies.ptp_2015.tally import Case
 
 DEFAULT_SCENES = 10_000
 SLAVES = ("PTP, 3 slaves", "PTP", "PTP, 5 slaves", "PTP, 6 slaves")

@@ -1,6 +1,7 @@
 """The paper's tables and figures as Markdown, its numbers beside ours."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -8,7 +9,7 @@ import numpy.typing as npt
 from studies.paper_1994.tables import markdown
 from studies.ptp_2015 import projections
 from studies.ptp_2015.comparison import Database
-from studies.ptp_2015.found import Measurements
+from studies.ptp_2015.plots import PlottedSeries
 from studies.ptp_2015.printed import Ends, the_ptp_paper
 from studies.ptp_2015.projections import Projections
 from studies.ptp_2015.tally import Tally
@@ -48,6 +49,31 @@ RATES = (
     "misnamed. The paper does not say when it counts a field as identified. Its times are "
     "averages; ours are the median and, in brackets, the average of this machine."
 )
+
+
+@dataclass(frozen=True)
+class Measurements:
+    """What was measured: tallies by table, the counts of Figure 10, the databases."""
+
+    scenes: int
+    seed: int
+    tallies: Mapping[str, Sequence[Tally]]
+    stars: npt.NDArray[np.int64] | None = None
+    databases: Sequence[Database] = field(default_factory=tuple)
+    false_fields: Sequence[Mapping[str, str | int]] = ()
+    projections: Projections | None = None
+    """Of the sky's triangles, for Table 2 and Figures 6 and 7."""
+
+    @property
+    def drawn(self) -> PlottedSeries:
+        """The figures, for the plots."""
+        figures: PlottedSeries = {} if self.stars is None else {"figure-10": self.stars}
+        if self.projections is not None:
+            wanted = [name for name in self.tallies if name.startswith("figure")]
+            figures |= {
+                name: self.projections for name in wanted if name in ("figure-6", "figure-7")
+            }
+        return figures | {name: tallies for name, tallies in self.tallies.items() if tallies}
 
 
 def section(found: Measurements, name: str) -> str:

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.centroids.sampled_psf import airy_psf, wired_psf
+from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Array
 from service.imaging.detection.star_image import AIRY_OVER_SIGMA
 from service.imaging.optics import behind_wires, disc, image_by_fft

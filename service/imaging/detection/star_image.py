@@ -8,8 +8,7 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.psf import GaussianPsf, Psf
-from service.imaging.centroids.sampled_psf import airy_psf, wired_psf
+from service.imaging.centroids.psf import GaussianPsf, Psf, airy_psf, wired_psf
 from service.missions.camera import Camera, PsfKind, Wire
 from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector, rotate_about

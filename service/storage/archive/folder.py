@@ -82,7 +82,7 @@ class Owner(Struct, frozen=True, kw_only=True):
     """The database whose batches an archive has."""
 
     database: str
-    """A digest; see `owner.identity_of`."""
+    """A digest; see `identity_of`."""
 
 
 class Settings(Struct, frozen=True, kw_only=True):
