@@ -1,25 +1,24 @@
 """Telemetry files as numbered lines, each holding one batch or one gyro block as JSON.
 
 Two forms are read, both in bounded memory: NDJSON, one of them a line, and CSV, one star or
-one gyro sample a row (`csv_table`, `csv_rows`, `gyro_rows`).  A line that cannot be read is
+one gyro sample a row (`csv_table`, `csv_rows`).  A line that cannot be read is
 handed on with its fault, and the next lines follow: what to make of it is the
 caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 """
 
 import codecs
 import io
-import json
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from service.errors import BadFile, BadInput, Fault, shown_value
 from service.observations.readers.csv_columns import COLUMNS, BadCell, number_cell
-from service.observations.readers.csv_rows import BATCH_ROWS, batches_of_rows
-from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, Row, RowKind
+from service.observations.readers.csv_rows import BATCH_ROWS, BatchRows, JoinedRows, joined_lines
+from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
 from service.observations.readers.decompress import Line, physical_lines
 from service.times import parse_utc
 
@@ -46,8 +45,8 @@ def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> 
     with _opened(source, form) as stream:
         if form == "csv":
             table = CsvTable(stream, (BATCH_ROWS, GYRO_ROWS))
-            of_rows = blocks_of_rows if table.kind is GYRO_ROWS else batches_of_rows
-            yield from of_rows(table.rows())
+            kind = BlockRows if table.kind is GYRO_ROWS else BatchRows
+            yield from joined_lines(table.rows(), kind)
         else:
             yield from physical_lines(stream)
 
@@ -140,71 +139,37 @@ GYRO_COLUMNS = (*KEY, "time", *RATES)
 MAX_ROWS = 10_000
 
 
-class _BlockRows:
-    """The rows of one block as they come in."""
+class BlockRows(JoinedRows):
+    """The rows of one gyro block, a sample a row."""
 
-    def __init__(self, number: int, key: tuple[str, ...], fault: Fault | None = None) -> None:
-        self.number, self.key, self.fault = number, key, fault
-        self.fault_at = number
+    key_columns = KEY
+    may_lack = "the block may lack a sample"
+    refuses_faulty_rows = False
+
+    def __init__(self, number: int, key: tuple[str, ...]) -> None:
+        super().__init__(number, key)
         self.start, self.start_ns = "", 0
         self.times_s: list[float] = []
         self.rates: list[list[float]] = []
 
-    def add(self, number: int, row: CsvRow) -> None:
-        if self.fault is not None:
-            return
+    def take(self, row: CsvRow) -> None:
+        """Take the cells of a row; raises `BadCell`."""
+        if len(self.rates) == MAX_ROWS:
+            raise BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
         try:
-            if len(self.rates) == MAX_ROWS:
-                raise BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
-            try:
-                time = parse_utc(row["time"])
-            except BadInput as error:
-                raise BadCell("time", error.faults[0].message, row["time"]) from None
-            if not self.rates:
-                self.start, self.start_ns = time.text, time.tai_ns
-            self.times_s.append((time.tai_ns - self.start_ns) * 1e-9)
-            self.rates.append([number_cell(row, column) for column in RATES])
-        except BadCell as bad:
-            self.refuse(number, bad.fault(number))
+            time = parse_utc(row["time"])
+        except BadInput as error:
+            raise BadCell("time", error.faults[0].message, row["time"]) from None
+        if not self.rates:
+            self.start, self.start_ns = time.text, time.tai_ns
+        self.times_s.append((time.tai_ns - self.start_ns) * 1e-9)
+        self.rates.append([number_cell(row, column) for column in RATES])
 
-    def refuse(self, number: int, fault: Fault) -> None:
-        if self.fault is None:
-            self.fault, self.fault_at = fault, number
-
-    def line(self) -> Line:
-        if self.fault is not None:
-            return Line(self.fault_at, None, self.fault)
+    def body(self) -> Mapping[str, Any]:
+        """The JSON object of the block."""
         named = {name: value for name, value in zip(KEY, self.key, strict=True) if value}
-        body: dict[str, Any] = {**named, "start": self.start, "times_s": self.times_s}
-        body["rates_rad_per_s"] = self.rates
-        return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
-
-
-def blocks_of_rows(rows: Iterator[Row]) -> Iterator[Line]:
-    """The blocks of the rows of a CSV file.
-
-    A block with a bad cell is refused whole, by the line and column of the first such cell.  A
-    damaged row refuses the blocks on both sides of it: one of them lacks a sample.
-    """
-    block: _BlockRows | None = None
-    stray: int | None = None
-    for row in rows:
-        if row.cells is None or row.fault is not None:
-            if block is not None:
-                block.refuse(row.number, _beside(block.number, row.number))
-                yield block.line()
-            yield Line(row.number, None, row.fault)
-            block, stray = None, row.number
-            continue
-        key = tuple(row.cells.get(column, "") for column in KEY)
-        if block is None or key != block.key:
-            if block is not None:
-                yield block.line()
-            fault = None if stray is None else _beside(row.number, stray)
-            block, stray = _BlockRows(row.number, key, fault), None
-        block.add(row.number, row.cells)
-    if block is not None:
-        yield block.line()
+        times = {"start": self.start, "times_s": self.times_s}
+        return {**named, **times, "rates_rad_per_s": self.rates}
 
 
 def _check_header(names: list[str], where: str) -> None:
@@ -235,8 +200,3 @@ GYRO_ROWS = RowKind(
     check_header=_check_header,
     ordered_by_time=True,
 )
-
-
-def _beside(block: int, damaged: int) -> Fault:
-    message = f"the block may lack a sample: the row beside it, line {damaged}, cannot be read"
-    return Fault(f"line {block}", message)
