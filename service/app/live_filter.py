@@ -80,7 +80,7 @@ class LiveFilter:
         if mission.live_filter is None:
             raise NotFound(f"the mission {name} has no live filter")
         if self._thread is None and name not in self._kept:
-            self._looked(name)
+            self.refresh(name)
         # Not of a look in this thread: many requests would wait for the first one, which may
         # take long, and repeat one that fails.
         kept = self._kept.get(name)
@@ -88,10 +88,6 @@ class LiveFilter:
         if attitude is None:
             raise NotFound(f"{name} has no filtered attitude")
         return attitude
-
-    def refresh(self, name: str) -> None:
-        """Filter what is new of a spacecraft."""
-        self._looked(name)
 
     def _names(self) -> list[str]:
         missions = self._context.missions
@@ -106,7 +102,7 @@ class LiveFilter:
             name = min(due, key=lambda each: due[each])
             begun = time.monotonic()
             try:
-                self._looked(name)
+                self.refresh(name)
             except AcquisitionError as error:
                 log.warning("the live filter of %s waits: %s", name, error)
             except Exception:
@@ -117,7 +113,8 @@ class LiveFilter:
             now = time.monotonic()
             due[name] = now + max(every_s, REST * (now - begun))
 
-    def _looked(self, name: str) -> _Kept:
+    def refresh(self, name: str) -> None:
+        """Filter what is new of a spacecraft."""
         mission = self._context.missions[name]
         with self._lock:
             kept = self._kept.setdefault(name, _Kept())
@@ -130,7 +127,7 @@ class LiveFilter:
                     kept.filter, kept.version = CarriedFilter(), None
                     kept.forgotten = forgotten
                 if kept.version == version:
-                    return kept
+                    return
                 row = newest(connection, _TIMES, ResultFilter(LIVE, name), utc_now())
                 latest = None if row is None else recorded_utc(row["time"])
                 if latest is not None:
@@ -142,4 +139,3 @@ class LiveFilter:
                 attitude = live_attitude(name, day_bounds(latest.bucket(DAY_S))[0], carried)
             # Readers do not wait: until now they had the one before.
             kept.attitude, kept.version = attitude, version
-            return kept

@@ -116,7 +116,7 @@ def submission_of_frame(
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
     if known.exposure_s is not None:
-        frame = with_exposure(frame, known.exposure_s)
+        frame = replace(frame, exposure_s=known.exposure_s)
     clock.append(clock_ns())
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
@@ -179,11 +179,6 @@ def choices_of(frame: Frame) -> list[str]:
     """What was chosen of a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
-
-
-def with_exposure(frame: Frame, exposure_s: float) -> Frame:
-    """The same frame, exposed for a time that its file does not tell."""
-    return replace(frame, exposure_s=exposure_s)
 
 
 def batch_of_stars(
