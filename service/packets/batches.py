@@ -1,7 +1,7 @@
 """Packets to batches: stars with what earlier packets carried, and measured attitudes."""
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -297,17 +297,8 @@ class BatchMaker:
         return slots, stars
 
     def json_of(self, batch: StarBatch) -> bytes:
-        """A batch as canonical JSON; raises `PacketFault` naming the parameter of the first fault.
-
-        The checks are those of every batch.
-        """
-        try:
-            model = BatchIn.model_validate(batch.body)
-        except ValidationError as error:
-            fault = faults_of(error)[0]
-            name = self._parameter_of(batch, fault)
-            raise PacketFault(name, f"{fault.field}: {fault.message}", fault.value) from None
-        return checked_from_model(model).text.encode()
+        """A batch as canonical JSON; raises `PacketFault` naming the parameter of a fault."""
+        return _json_of(batch.body, lambda fault: self._parameter_of(batch, fault))
 
     def _parameter_of(self, batch: StarBatch, fault: Fault) -> str:
         """The parameter from which a field of a batch was made."""
@@ -335,6 +326,17 @@ class BatchMaker:
             names: tuple[str, ...] = getattr(columns, word) or directions
             return names[slot] if names is not directions else ", ".join(directions)
         return ", ".join(directions)
+
+
+def _json_of(body: dict[str, Any] | None, parameters_of: Callable[[Fault], str]) -> bytes:
+    """A body as canonical JSON, with the checks of every batch."""
+    try:
+        model = BatchIn.model_validate(body)
+    except ValidationError as error:
+        fault = faults_of(error)[0]
+        message = f"{fault.field}: {fault.message}"
+        raise PacketFault(parameters_of(fault), message, fault.value) from None
+    return checked_from_model(model).text.encode()
 
 
 def _shift(stars: list[dict[str, Any]], later_s: float) -> None:
@@ -367,23 +369,16 @@ class MeasurementMaker:
                 yield MeasuredBatch(packet, columns, self._body(columns, packet, values))
 
     def json_of(self, batch: MeasuredBatch) -> bytes:
-        """A batch as canonical JSON; raises `PacketFault` naming the parameters of a fault.
+        """A batch as canonical JSON; raises `PacketFault` naming the parameters of a fault."""
+        return _json_of(batch.body, lambda fault: self._parameters_of(batch.columns, fault))
 
-        The checks are those of every batch.
-        """
-        try:
-            model = BatchIn.model_validate(batch.body)
-        except ValidationError as error:
-            fault = faults_of(error)[0]
-            columns = batch.columns
-            names = columns.quaternion
-            if fault.field.startswith(("measurement.sigma", "measurement.covariance")):
-                names = columns.sigma or columns.covariance or names
-            elif fault.field == "time":
-                names = names_of(columns.table.time or self._mapped.table.time)
-            message = f"{fault.field}: {fault.message}"
-            raise PacketFault(", ".join(names), message, fault.value) from None
-        return checked_from_model(model).text.encode()
+    def _parameters_of(self, columns: MeasurementColumns, fault: Fault) -> str:
+        names = columns.quaternion
+        if fault.field.startswith(("measurement.sigma", "measurement.covariance")):
+            names = columns.sigma or columns.covariance or names
+        elif fault.field == "time":
+            names = names_of(columns.table.time or self._mapped.table.time)
+        return ", ".join(names)
 
     def _body(
         self, columns: MeasurementColumns, packet: SpacePacket, values: Mapping[str, Any]

@@ -26,7 +26,7 @@ from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.missions.mission import Mission
 from service.storage.grades.days import DayKey, GradedDayRow, Innovation, shown
-from service.storage.grades.rows import block_conditions
+from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
 from service.storage.models.base import Page
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
 from service.storage.queries.limits import limits_of
@@ -213,23 +213,13 @@ def _innovations(
     return whole.taken(np.sort(np.concatenate(places)))
 
 
-_PLACE = (graded_days.c.day, graded_blocks.c.position)
-_BLOCKS = select(
-    *_PLACE,
-    graded_days.c.revision,
-    graded_blocks.c.model,
-    graded_blocks.c.samples,
-    graded_blocks.c.packed,
-).join_from(graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id)
-
-
 def list_innovations(
     connection: Connection, selected: ResultFilter, *, limit: int, cursor: str | None
 ) -> Page[Innovation]:
     """How the measured attitudes of a period met the filter, the earliest first."""
-    query = _BLOCKS.where(*block_conditions(selected, INNOVATIONS)).order_by(*_PLACE).limit(1)
+    query = BLOCKS.where(*block_conditions(selected, INNOVATIONS)).order_by(*PLACE).limit(1)
     day, position, row = (-1, -1, 0) if cursor is None else _read_cursor(cursor)
-    beyond = query if cursor is None else query.where(tuple_(*_PLACE) >= tuple_(day, position))
+    beyond = query if cursor is None else query.where(tuple_(*PLACE) >= tuple_(day, position))
     items: list[Innovation] = []
     while (block := connection.execute(beyond).mappings().first()) is not None:
         found = unpacked_innovations(block["packed"], block["samples"])
@@ -240,7 +230,7 @@ def list_innovations(
             if len(items) == limit:
                 return Page(items, f"{block['day']}.{block['position']}.{place}")
             items.append(item)
-        beyond = query.where(tuple_(*_PLACE) > tuple_(block["day"], block["position"]))
+        beyond = query.where(tuple_(*PLACE) > tuple_(block["day"], block["position"]))
     return Page(items, None)
 
 

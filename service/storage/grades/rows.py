@@ -31,9 +31,9 @@ from service.times import DAY_S, Utc
 METHODS: dict[Grade, str] = {"filtered": "ekf", "smoothed": "filter_smoother"}
 """The words of CCSDS ACM's AD_METHOD."""
 STATUS = {Status.GOOD: "good", Status.STARTING: "suspect", Status.DOUBTFUL: "suspect"}
-_PLACE = (graded_days.c.day, graded_blocks.c.position)
-_BLOCKS = select(
-    *_PLACE,
+PLACE = (graded_days.c.day, graded_blocks.c.position)
+BLOCKS = select(
+    *PLACE,
     graded_days.c.id,
     graded_days.c.revision,
     graded_blocks.c.model,
@@ -54,8 +54,8 @@ def graded_pages(
 
     Of each block no more than the first `page`.  Between two blocks no connection is held.
     """
-    order = [column.desc() if newest_first else column for column in _PLACE]
-    query = _BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
+    order = [column.desc() if newest_first else column for column in PLACE]
+    query = BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
     beyond: Select[Any] = query
     while True:
         with reading() as connection:
@@ -67,7 +67,7 @@ def graded_pages(
             rows = rows.taken(slice(None, None, -1))
         if len(rows):
             yield rows.taken(slice(0, page))
-        place, last = tuple_(*_PLACE), tuple_(row["day"], row["position"])
+        place, last = tuple_(*PLACE), tuple_(row["day"], row["position"])
         beyond = query.where(place < last if newest_first else place > last)
 
 
