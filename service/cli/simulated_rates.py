@@ -1,10 +1,19 @@
-"""`acquire simulate mission`: rates of a mission's settings under given errors."""
+"""`acquire simulate mission` and `paper`: rates of settings under errors, and of papers."""
 
+import io
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, add_json, count, print_json
+from service.cli.arguments import (
+    STANDARD_OUTPUT,
+    add_command,
+    add_json,
+    add_json_file,
+    count,
+    print_json,
+    table,
+)
 from service.errors import BadInput, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
 
@@ -28,7 +37,7 @@ field of view, and magnitude_bound_mag is six times magnitude_error_mag.
 All settings see the same stars and draws. Nothing is searched outside the zone."""
 
 
-def add(group: Any) -> None:
+def add_mission(group: Any) -> None:
     """Declare the command."""
     parser = add_command(
         group,
@@ -43,7 +52,7 @@ def add(group: Any) -> None:
         acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
         acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
         """,
-        run,
+        _run_mission,
         NOTES,
     )
     parser.add_argument(
@@ -134,7 +143,7 @@ def _add_outputs(parser: ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
 
 
-def run(parsed: Namespace) -> int:
+def _run_mission(parsed: Namespace) -> int:
     """Simulate and print the rates."""
     from service.cli.configuration import mission_of_file_or_name
     from service.settings import Settings
@@ -224,3 +233,140 @@ def _share(text: str) -> float:
     if not 0.0 < share < 1.0:
         raise ArgumentTypeError(f"must be a share above 0 and below 1 (got {text!r})")
     return share
+
+
+PTP_HELP = """\
+tables by name, each algorithm on the same fields (10 deg square, stars to V 6):
+  ptp-1       projections of the nine printed triangles
+  ptp-2       the k-vector of the projections
+  ptp-3       the sharing stars of the four printed triangles
+  figure-6    triangles on the projection axis
+  figure-7    projection and index of the triangles
+  ptp-5       slave stars of the guide database: memory, rate, time
+  ptp-6       PTP, P-vector, planar triangle, Liebe's triangles, pyramid at 1 px, 0.5 mag
+  figure-10   stars in the field of view; the paper's figure cannot be reproduced
+  figure-11   rate against the stars in the field
+  figure-12   rate against the noise of position
+  figure-13   rate against the noise of magnitude
+  ptp-false   mirrored skies and random points that PTP accepts
+  ptp         all of these
+strict: all stars that the algorithm names are correct, at least three; checked: the
+same after the attitude check of the identifier `ptp`."""
+
+
+def add_paper(group: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        group,
+        "paper",
+        "Repeat the experiments of a paper and compare its tables with our results: Fink & "
+        "Shoup 1994 by table number, Zhou & Ye 2015 (PTP, lost in space) by table name.",
+        """
+        acquire simulate paper --table 3 --stars 2000
+        acquire simulate paper --table ptp-6 --scenes 2000 --seed 7
+        acquire simulate paper --table ptp --plots docs/plots --report docs/ptp.md
+        acquire simulate paper --json rates.json
+        acquire simulate paper --table 3 --stars 2000 --json
+        acquire simulate paper --identifier starid --seed 1 2 3 --plots docs/plots --report paper.md
+        acquire simulate paper --identifier verified --report verified.md
+        """,
+        _run_paper,
+        PTP_HELP,
+    )
+    parser.add_argument(
+        "--table", type=table, metavar="N|NAME", help="2 to 14 (default: all of these), or a name"
+    )
+    parser.add_argument(
+        "--stars",
+        type=count,
+        metavar="N",
+        help="minimum number of stars per run; default 20000",
+    )
+    parser.add_argument(
+        "--scenes",
+        type=count,
+        metavar="N",
+        help="named tables: fields per condition; default 10000",
+    )
+    parser.add_argument("--seed", type=int, nargs="+", metavar="S", help="default 1")
+    add_json_file(parser, "the rates, one row per run,")
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write the figures")
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="write everything to a page instead of printing it",
+    )
+    parser.add_argument(
+        "--identifier",
+        choices=IN_ZONES,
+        nargs="+",
+        default=IN_ZONES,
+        metavar="NAME",
+        help=f"{', '.join(IN_ZONES)}; default all of these",
+    )
+    parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+
+
+def _run_paper(parsed: Namespace) -> int:
+    """Fly the experiments of a paper and print its tables."""
+    if isinstance(parsed.table, str):
+        return _run_ptp(parsed)
+    if parsed.scenes is not None:
+        raise BadInput(
+            Fault(
+                "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
+            )
+        )
+    from studies.paper_1994.command import DEFAULT_STARS, run_paper
+    from studies.paper_1994.report import PROPORTIONS, TIMES
+
+    if parsed.stars is not None and parsed.table in (*TIMES, *PROPORTIONS):
+        message = f"has no effect on table {parsed.table}, whose zones are as many as the paper's"
+        raise BadInput(Fault("--stars", message, str(parsed.stars)))
+    prints_json = parsed.json == STANDARD_OUTPUT
+    rows = run_paper(
+        parsed.table,
+        parsed.stars or DEFAULT_STARS,
+        parsed.seed or [1],
+        None if prints_json else parsed.json,
+        parsed.identifier,
+        processes=parsed.processes,
+        plots=parsed.plots,
+        report_path=parsed.report,
+        out=io.StringIO() if prints_json else None,
+    )
+    if prints_json:
+        print_json(rows)
+    return 0
+
+
+def _run_ptp(parsed: Namespace) -> int:
+    from studies.ptp_2015.command import DEFAULT_SCENES, rows_of, run_ptp
+    from studies.ptp_2015.tables import OF_PROJECTIONS
+
+    if parsed.stars is not None:
+        message = "goes with a table by number; a named one takes --scenes"
+        raise BadInput(Fault("--stars", message, str(parsed.stars)))
+    if parsed.table in OF_PROJECTIONS:
+        message = f"has no effect on {parsed.table}, for which nothing is drawn"
+        for option, value in (("--scenes", parsed.scenes), ("--seed", parsed.seed)):
+            if value is not None:
+                raise BadInput(Fault(option, message, shown_value(value)))
+    seeds = parsed.seed or [1]
+    if len(seeds) > 1:
+        raise BadInput(Fault("--seed", "is one with a table by name", shown_value(seeds)))
+    prints_json = parsed.json == STANDARD_OUTPUT
+    found = run_ptp(
+        parsed.table,
+        parsed.scenes or DEFAULT_SCENES,
+        seeds[0],
+        None if prints_json else parsed.json,
+        parsed.processes,
+        parsed.plots,
+        parsed.report,
+        io.StringIO() if prints_json else None,
+    )
+    if prints_json:
+        print_json(rows_of(found))
+    return 0
