@@ -152,39 +152,14 @@ class Runs:
         processes: int = 0,
         track: bool = False,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
-    ) -> tuple[ReprocessProgress, RunComparison]:
-        """Process the batches of a run again into another run, and compare both.
+    ) -> ReprocessProgress:
+        """Process the batches of a run again into another run.
 
         The settings are those of this app.  Without `run` the name is derived from the
         settings.  Batches that the run already has are not processed again.
         With `track` they are searched about the last attitude of the run, one after another.
         Raises `BadBatch` if the run has results of other settings.
         """
-        progress = self.reprocess_recorded(
-            run,
-            source=source,
-            spacecraft=spacecraft,
-            start=start,
-            end=end,
-            processes=processes,
-            track=track,
-            step=step,
-        )
-        return progress, self.compare(source, progress.run, spacecraft, start, end)
-
-    def reprocess_recorded(
-        self,
-        run: str | None,
-        *,
-        source: str = LIVE,
-        spacecraft: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        processes: int = 0,
-        track: bool = False,
-        step: Callable[[ReprocessProgress], object] = lambda progress: None,
-    ) -> ReprocessProgress:
-        """`reprocess` without the comparison."""
         plan = self._plan(run, source, spacecraft, start, end, processes, track)
         sky = self._context.sky
         own = Solver(plan.missions, sky)

@@ -130,7 +130,7 @@ def run(parsed: Namespace) -> int:
             period |= {"start": start, "end": end}
             processes = parsed.processes or 0
             if parsed.archive is None:
-                progress = app.runs.reprocess_recorded(
+                progress = app.runs.reprocess(
                     parsed.run, **period, processes=processes, track=parsed.track, step=step
                 )
             else:
