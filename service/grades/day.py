@@ -6,8 +6,7 @@ can be computed again, alone, and gives the same bytes; a late batch concerns on
 """
 
 import zlib
-from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -18,7 +17,7 @@ from service.filtering.gyro import ConstantRateModel
 from service.filtering.result import AttitudeHistory, FilterResult, Integers
 from service.filtering.smoother import smooth
 from service.filtering.state import Outcome, Status
-from service.grades.innovations import UPPER, MeasuredInnovations, innovations_of
+from service.grades.innovations import UPPER, MeasuredInnovations, TimedColumns, innovations_of
 from service.grades.stretches import Mask, Recorded, Stretch, cut
 from service.missions.mission import Mission
 from service.times import DAY_S, Utc, bucket_start, shifted
@@ -44,7 +43,7 @@ OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
 
 
 @dataclass(frozen=True, eq=False)
-class GradedSamples:
+class GradedSamples(TimedColumns):
     """Attitudes of a stretch of one grade.
 
     `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `covariance_arcsec2` (n, 6) of the small
@@ -54,30 +53,12 @@ class GradedSamples:
     rate there is no bias, and the sigma is that of the rate.
     """
 
-    tai_ns: Integers
     quaternion: Vector
     covariance_arcsec2: Vector
     rate_deg_per_s: Vector
     bias_deg_per_h: Vector
     bias_sigma_deg_per_h: Vector
     status: Integers
-
-    def __len__(self) -> int:
-        return len(self.tai_ns)
-
-    def taken(self, places: Any) -> "GradedSamples":
-        """The samples at some places."""
-        return GradedSamples(**{f.name: getattr(self, f.name)[places] for f in fields(self)})
-
-    @staticmethod
-    def joined(parts: Sequence["GradedSamples"]) -> "GradedSamples":
-        """The samples of parts, one after the other."""
-        return GradedSamples(
-            **{
-                f.name: np.concatenate([getattr(part, f.name) for part in parts])
-                for f in fields(GradedSamples)
-            }
-        )
 
 
 @dataclass(frozen=True, eq=False)
