@@ -21,6 +21,7 @@ from service.storage.models.base import Page
 from service.storage.models.charts import ObservedStarPlace, StarField
 from service.storage.queries.results import OutcomeName, StatusName, answer_from_json
 from service.storage.recording.ids import is_ulid
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.tracks import TrackList
 from service.times import Utc, parse_utc, shifted
 from service.vectors import matrix_from_quaternion, to_ra_dec
@@ -32,7 +33,7 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy

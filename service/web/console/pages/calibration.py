@@ -12,9 +12,10 @@ from service.app.calibration_estimates import CALIBRATION_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound
 from service.storage.calibrations import Calibration, CalibrationSummary
+from service.storage.recording.unsaved_result import LIVE
 from service.web.console.charts.calibration_history import parameter_histories
 from service.web.console.charts.focal_plane import residual_pictures
-from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy

@@ -19,8 +19,9 @@ from service.storage.models.alarms import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
 from service.storage.models.spacecraft import MissionThen, Ranking
+from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
-from service.web.console.page_context import LIVE, ContextDep, PageContext, PageQuery
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
