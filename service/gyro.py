@@ -107,6 +107,8 @@ def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None
     return int(times_ns[shared[0]]) if shared.size else None
 
 
+# Arrays of floating-point numbers as compressed bytes, and back, bit for bit.
+#
 # A gyro counts, so its rates are few different numbers: zlib finds them again where they stand
 # whole, and takes two bytes for most.
 
@@ -133,6 +135,8 @@ def unpack(packed: bytes, shape: tuple[int, ...]) -> Vector:
     return np.ascontiguousarray(columns.reshape(shape[::-1]).T)
 
 
+# A gyro block as JSON, checked field by field.
+#
 # The route and the readers of telemetry files read blocks here, so that they refuse the same
 # things with the same words.  The pydantic models are also what `openapi.yaml` shows.
 

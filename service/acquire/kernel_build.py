@@ -208,6 +208,8 @@ def _compile(
     prewarm_kernels(sky, missions, share.others, share.seldom)
 
 
+# How far the compiling of the kernels is, seen from the files that it leaves in the cache.
+#
 # The size of machine code grows evenly with the time that its compiling takes.
 
 KERNEL_BYTES = 6_090_000

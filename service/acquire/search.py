@@ -243,6 +243,8 @@ def _whole_sky_can_tell(corrected: Sequence[CorrectedObservations]) -> bool:
     return any(len(each.magnitude_mag) >= FEWEST_POINTS for each in corrected)
 
 
+# Stars of a batch that is too poor for an attitude, identified by the predicted one.
+#
 # One star has no pair that could tell it from others.  Where the attitude is predicted well
 # enough, its place and its magnitude tell: a catalog star is weighed against chance, which is
 # a point that is no star, or a prediction that has failed.

@@ -285,6 +285,8 @@ def found_columns(run: CalibrationRun) -> Row:
     }
 
 
+# The calibration in force of each spacecraft: adopted and taken back by an operator.
+#
 # An adopted calibration lies over the mission file: alignment and focal plane of every
 # tracker are those that were adopted, and all other settings the file's.  Where the file's
 # own alignments or focal planes have changed since, the file holds.

@@ -315,6 +315,8 @@ def covariance_factor(residual: Vector, scale: float, freedom: int) -> float:
     return float(np.sum(bounded**2)) / max(freedom, 1) / float(slope.mean()) ** 2
 
 
+# The degree of the distortion, chosen by blocks of time that the fit has not seen.
+#
 # The stretch is cut into consecutive blocks of batches.  Each block is predicted from the
 # others; only its attitudes are its own.  The smallest degree is taken whose residuals are
 # no worse than the best by more than chance: one standard error over the blocks.

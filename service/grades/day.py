@@ -195,6 +195,8 @@ def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> Grade
     )
 
 
+# Graded samples and innovations as compressed bytes, and back.
+#
 # Times and quaternions keep every bit, all else has the seven digits of a float32.  The bytes of
 # equal weight stand together, so that signs and exponents, which hardly change, take no room.
 

@@ -192,6 +192,8 @@ def _without_gyro(
             )
 
 
+# From a mission and its recorded gyro samples to what the filter takes.
+#
 # This is the one place where recorded rates are converted: to body axes, to mean rates, and to
 # samples that the gyro can have measured.
 

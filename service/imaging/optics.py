@@ -43,6 +43,8 @@ class PointImage:
         return np.arange(-reach, reach + 1) * self.step_rad
 
 
+# What stands in the aperture: open discs, wires, glass of any thickness.
+#
 # An aperture is a square grid of complex transmissions P = p e^(j alpha) (report, 2.5),
 # centred between the middle cells; edges are weighted by the area they cover.
 
@@ -155,6 +157,8 @@ def image_at(pupil: Pupil, wavelength_m: float, p_rad: Array, q_rad: Array) -> A
     return np.asarray(np.abs(field) ** 2 * (pupil.cell_m**2 / wavelength_m) ** 2)
 
 
+# The colours of a star's light, and what they make of its correlation in time.
+#
 # Frequencies are angular, rad/s; wavelengths metres; delays seconds.
 
 LIGHT_SPEED_M_PER_S = 299_792_458.0

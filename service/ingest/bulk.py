@@ -33,6 +33,8 @@ LineAnswer = Answered | Recorded | AcquisitionError
 """To a line: of a batch the answer, of a gyro block its row, or what is wrong with it."""
 
 
+# Lines of telemetry, a batch or a gyro block each: read and solved many at once.
+#
 # In this process or in a worker.
 
 

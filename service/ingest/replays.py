@@ -30,6 +30,8 @@ ReplaySource = Iterable[bytes | Line]
 """Lines of telemetry, or of `PacketLines`, which count the packets that they are made of."""
 
 
+# The lines of a telemetry file, in groups that are computed together.
+#
 # A line is text, or a `Line` with a number of its own and perhaps a fault in place of its text:
 # the batches of space packets have the numbers of their packets.
 

@@ -125,6 +125,8 @@ def identity(about: SeriesInfo) -> Pairs:
     ]
 
 
+# ACM version 2: attitudes, covariances, and how the attitudes were determined.
+#
 # Times count seconds from EPOCH_TZERO, leap seconds included.  The standard's covariances of type
 # ANGLE are diagonal, in deg^2: with one tracker they are of its own axes, in which the matrix is
 # nearly diagonal; with several they are of the body axes, and a comment says that the rest of the
@@ -269,6 +271,8 @@ def _lines(seconds: list[str], values: Vector) -> str:
     )
 
 
+# AEM version 2: attitudes as a time series, a segment for each unbroken stretch.
+#
 # REF_FRAME_A and REF_FRAME_B fix the direction, from A to B; quaternions are scalar-last.
 # Version 1 had keywords for both, which version 2 has no longer.  A rate is in the axes of
 # the body, ANGVEL_FRAME.

@@ -93,6 +93,8 @@ class _Sink:
         """Nothing is open."""
 
 
+# Tables as a FITS binary table (FITS standard 4.0).
+#
 # Numbers that are not known are NaN, integers the value of TNULL; the column VALID says of each
 # row whether all its values are known.  The column `time`, UTC as text, is named UTC.  A table
 # with `tai_ns` gets a column TIME: seconds of Terrestrial Time since the beginning of the day

@@ -114,6 +114,8 @@ class FileEphemeris(FromFile):
         return {name: state[part].tolist() for name, part in wanted.items()}
 
 
+# Carry attitudes along a replay: the attitude of one batch is the a priori of the next.
+#
 # It goes into the next batch's `a_priori` before that is sent, so the recorded
 # batch explains its answer.
 

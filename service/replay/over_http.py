@@ -193,6 +193,8 @@ def _problem(problem: answers.Problem) -> Problem:
     return {**problem_of_faults(faults), "detail": problem.detail}
 
 
+# Replay through a running service as one upload, and poll its progress.
+#
 # Lines of telemetry are sent as NDJSON, files of space packets with their XTCE file as an archive.
 #
 # Suited to files of any length: no single answer is waited for.  Repeating a replay

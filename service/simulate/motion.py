@@ -87,6 +87,8 @@ def tilted(direction: Vector, angle_rad: float, rng: np.random.Generator) -> Vec
     return rotate_about(about * angle_rad, direction)
 
 
+# Where the sample spacecraft are and how they move: geocentric, ICRS axes.
+#
 # Good enough for what a star tracker feels of an orbit: the aberration of its
 # velocity and, about L1, where the Sun is seen.  Not an ephemeris.
 

@@ -46,6 +46,8 @@ class Seen:
     """Rows of the run catalog, -1 for a spurious star."""
 
 
+# The sky as it is at one time and place, whatever a run catalog says of it.
+#
 # The service identifies with a catalog that serves a whole step of years, as
 # seen from the solar system's barycentre.  The stars themselves have moved by
 # then, and shift with the year; samples are drawn from these, so that what the

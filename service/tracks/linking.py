@@ -29,6 +29,8 @@ _ROUNDS = 8
 Marks = npt.NDArray[np.bool_]
 
 
+# A direction that moves along a great circle at a constant rate, fitted to points.
+#
 # The parameters are a direction and a rate at one moment.  Along the circle a point is off
 # by da + t dr; across it by dc cos(w t) + dq sin(w t) / w, where da and dc are errors of the
 # direction, dr and dq of the rate, and w is the rate.  These are linear, so that a few rounds of

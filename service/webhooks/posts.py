@@ -171,6 +171,8 @@ def _retry_after_s(text: str | None) -> float | None:
         return None
 
 
+# Counts attempts by webhook, and logs where deliveries begin to fail, recover or stop.
+#
 # One line for each change: what fails for a day is tried hundreds of times.
 
 Result = Literal["delivered", "failed", "dead"]

@@ -138,6 +138,9 @@ def _best(
     return row, column, best / (np.sqrt((core**2).sum()) * noise_counts)
 
 
+# Telling stars from hot pixels and cosmic rays: nothing that came through the lens is sharper
+# than the image of a point.
+#
 # Blends and trails are wider than that image and pass; a hot pixel is narrow both ways,
 # a cosmic ray's track across itself.
 

@@ -132,6 +132,8 @@ _READERS: Mapping[tuple[bytes, ...], Reader] = {
 }
 
 
+# Frames from the raw files of cameras, through LibRaw: the extra `raw` installs it.
+#
 # Pixels of a colour filter's pattern are summed, so that one count has light of all its colours.
 
 ABSENT = (

@@ -179,6 +179,8 @@ def _value(text: str) -> tuple[Value, str]:
         return None, comment
 
 
+# The time and the exposure that a FITS header tells (FITS Standard 4.0, section 9).
+#
 # A time that may be wrong is none: keywords that contradict each other, dates without a time of
 # day and time scales that are not converted lead to no time, with the reason in words.
 

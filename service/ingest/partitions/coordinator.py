@@ -135,6 +135,8 @@ def reprocess_partitions(
     return progress
 
 
+# The partitions to run again: parts of the archive, and days of the record.
+#
 # A batch that the run has already, wherever it is, is in no task: so an interrupted reprocessing
 # goes on, and every batch comes once.
 

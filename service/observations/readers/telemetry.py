@@ -129,6 +129,8 @@ def _opened(source: Path | BinaryIO, form: TelemetryFormat) -> Iterator[BinaryIO
             yield copy
 
 
+# Gyro blocks as rows of comma-separated values, one sample a row.
+#
 # The rows of one (spacecraft, run, block) form a block; `CsvTable` gives them together.  What the
 # rows give is the same JSON as that of an NDJSON file, so that the same checks hold for it.
 

@@ -99,6 +99,8 @@ def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) ->
         raise AcquisitionError(f"the C-kernel could not be written: {done.stderr[-500:]!r}")
 
 
+# Text kernels: a spacecraft's clock, its frame, leap seconds, and a list of all.
+#
 # The clock is our own, for missions without one: seconds and microseconds of TAI since
 # 1972-01-01T00:00:00 TAI, an encoded tick being a microsecond.
 

@@ -283,6 +283,8 @@ def _decoded(file: Path, kind: type[T]) -> T:
         raise BadConfiguration(f"{file}: is no file of an archive: {error}") from None
 
 
+# The database that an archive belongs to: another one with the same batches could discard parts.
+#
 # A database that was restored from an archive has the batches of the archive's own one.  What its
 # `acquire archive` takes for left over are parts that the other one needs.
 

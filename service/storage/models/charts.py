@@ -78,6 +78,8 @@ class PeriodStars:
         return len(self.attitudes.time)
 
 
+# The stars of a batch in each tracker's field of view: the data of the chart on its page.
+#
 # Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in the tracker's axes.
 
 

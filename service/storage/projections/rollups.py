@@ -360,6 +360,8 @@ def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
     }
 
 
+# The share of archived batches in the trends, hour by hour.
+#
 # A trend holds recorded and archived batches alike.  Where an hour is counted anew from the
 # recorded ones, the share that is kept here is added.
 

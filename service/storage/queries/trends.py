@@ -389,6 +389,8 @@ def _no_rows(names: Sequence[str]) -> dict[str, Any]:
     return {name: [] for name in names}
 
 
+# The worst batches of a period by a quantity, found without reading all batches.
+#
 # The rollups have the greatest value of every hour.  Hours are read in descending
 # order of it until no batch of the remaining hours can be worse than those found.
 

@@ -71,6 +71,8 @@ def merge(into: Row, row: Row) -> None:
             into[name] = row[name]
 
 
+# The columns of a rollup as SQL over current results, for sums that the database computes.
+#
 # `result_metrics.rolled_up` makes the same of results in memory.  The index of
 # current results has every column that is read here.
 

@@ -28,6 +28,8 @@ Digest = String(80)
 Moment = String(30)
 
 
+# Long texts of the record, compressed on SQLite; PostgreSQL compresses such texts itself.
+#
 # A batch and its answer are JSON with names that are always the same.  The dictionary knows
 # them: an answer of 2,600 bytes takes 450, and 7 microseconds.  Whatever was packed with a
 # dictionary can be read with that one alone: one that takes its place must stand beside it.

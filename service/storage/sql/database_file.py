@@ -135,6 +135,8 @@ def sync_folder(folder: Path) -> None:
         os.close(handle)
 
 
+# The lock of the one process that writes to a SQLite file.
+#
 # It is the operating system's, on the file itself whatever name it was opened by, and ends with the
 # process that holds it, however that ends.
 

@@ -52,6 +52,8 @@ from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
 from service.storage.sql.columns import Digest, Id, Moment, Name, PackedText, RunName, metadata
 
+# The rollups: sums and extremes of current results by hour and day, for trends.
+#
 # Of spacecraft, and of the trackers of spacecraft that have several.
 
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
@@ -410,6 +412,8 @@ WRITTEN_BY_POSTS = (
 """The tables that a batch may be written to."""
 
 
+# The tables of the archive: which batches left the database, and where they are.
+#
 # archived_parts ── archived_batches ── archived_what_ifs
 #          └── archived_hours
 #

@@ -152,6 +152,8 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
     return done.stdout
 
 
+# Makes a database from a backup: whole, or not at all, and never over records that are there.
+#
 # A backup keeps the schema of the version that wrote it.  This module does not migrate it:
 # the version that wrote a backup can be installed again and serve the database restored from it.
 

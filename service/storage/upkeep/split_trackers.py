@@ -252,6 +252,8 @@ def _write(
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))
 
 
+# Gives results of earlier versions their digests: what recording does by itself since schema 0017.
+#
 # A few at a time, each step in one short transaction with the seals of their hours.  Killed, it has
 # done whole steps; the next call goes on from there.  These digests are marked as made later: they
 # say nothing of what happened to a result before.

@@ -265,6 +265,8 @@ def _shown(row: Any) -> WebhookDelivery:
     )
 
 
+# Which process delivers: one of those that share a database.
+#
 # The process that delivers raises a number every few seconds.  Another takes over where
 # the number has stood still for a while by its own clock, so the clocks of two machines
 # are never compared.

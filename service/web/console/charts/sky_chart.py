@@ -23,6 +23,8 @@ MARK_RADIUS = 13.0
 RIVAL_MARGIN = 6.0
 
 
+# Where numbers and names stand in the picture of a star field: none over another one.
+#
 # Every text is put at the first free place about its star, close ones first.  The
 # text's size is estimated, a little larger than browsers draw it.
 

@@ -301,6 +301,8 @@ def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
     )
 
 
+# The usual cause of an alarm, and what to do about it, by quantity.
+#
 # The page of an alarm shows them, and docs/operators.md has the table of all.
 
 
