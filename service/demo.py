@@ -26,7 +26,7 @@ from service.replay.items import items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.resources import shipped
-from service.settings import PREFIX, Settings
+from service.settings import PREFIX, Settings, require_free, url_of
 from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.score import Score, score, score_table, together
 from service.simulate.stretches import Pass
@@ -35,7 +35,6 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.times import HOUR_S
-from service.web.ports import require_free, url_of
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 START = "1999-03-01T00:00:00.000Z"

@@ -60,7 +60,7 @@ def run(parsed: Namespace) -> int:
         # A fault in compiled code ends the process; this says where.
         faulthandler.enable()
     from service import logs
-    from service.web.ports import require_free
+    from service.settings import require_free
 
     require_free(settings.host, settings.port)
     logs.configure(settings.logs, "server")
