@@ -37,7 +37,17 @@ class Fault:
 
     def __str__(self) -> str:
         shown = "" if self.value is None else f" (got {self.value})"
-        return f"{self.field}: {self.message}{shown}"
+        # Names and values come from files and requests, and are shown on terminals.
+        return printable(f"{self.field}: {self.message}{shown}")
+
+
+def printable(text: str) -> str:
+    """Text that cannot begin a line or move a terminal's cursor: such characters as escapes."""
+    if text.isprintable():
+        return text
+    return "".join(
+        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
+    )
 
 
 def shown_value(value: object, limit: int = 80) -> str:

@@ -15,6 +15,8 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TextIO
 
+from service.errors import printable
+
 FORMATS = ("text", "json")
 LEVELS = ("debug", "info", "warning", "error")
 REPEATS_S = 60.0
@@ -231,13 +233,13 @@ class TextLines(_Lines):
         """The record as text."""
         fields = self.fields(record)
         head = " ".join(str(fields.pop(each)) for each in ("time", "level", "process", "logger"))
-        message = _one_line(str(fields.pop("message")))
+        message = printable(str(fields.pop("message")))
         rest = "".join(
             f" {name}={_quoted(str(value))}"
             for name, value in fields.items()
             if name not in ("method", "path", "status", "duration_ms")
         )
-        raised = "".join(f"\n    {_one_line(each)}" for each in self.error(record))
+        raised = "".join(f"\n    {printable(each)}" for each in self.error(record))
         return f"{head}: {message}{rest}{raised}"
 
 
@@ -258,15 +260,6 @@ def _harmless(text: str) -> str:
     return "\n".join(
         line if len(line) <= _MAX_LINE else line[: _MAX_LINE - 1] + "…"
         for line in text.splitlines()
-    )
-
-
-def _one_line(text: str) -> str:
-    """Text that cannot begin a line or move a terminal's cursor."""
-    if text.isprintable():
-        return text
-    return "".join(
-        each if each.isprintable() else each.encode("unicode_escape").decode() for each in text
     )
 
 

@@ -37,7 +37,7 @@ from service.acquire.warnings import (
     warnings_of_trackers,
     warnings_of_tracking,
 )
-from service.acquire.zone_search import Search, StepTimer, ZoneSearch, kept
+from service.acquire.zone_search import Search, StepTimer, ZoneSearch, as_row_error
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.errors import BadBatch, Fault, shown_value
 from service.identify.budget import MAX_WORK, WorkBudget
@@ -139,7 +139,7 @@ def acquire_many(
                 searches[row] = _search(batch, mission, sky, timer, budget)
         except Exception as error:
             # Whatever fails for one batch is its result: the others go on.
-            finished[row] = kept(error)
+            finished[row] = as_row_error(error)
         several.append(batch)
         trackers += its_trackers
     if any(one is not other for one, other in zip(several, batches.batches, strict=True)):
@@ -154,7 +154,7 @@ def acquire_many(
                 zones.add(row, search, search.prior)
             except Exception as error:
                 # As above: the others go on.
-                finished[row] = kept(error)
+                finished[row] = as_row_error(error)
     zones.run(timer)
     finished |= zones.errors
     final = set(zones.final_rows())
@@ -206,7 +206,7 @@ def _continued(
         return _composed(search, corrected, *find_groups(search, corrected, first))
     except Exception as error:
         # The row's own result, as the callers of `acquire_many` expect.
-        return kept(error)
+        return as_row_error(error)
 
 
 def _composed(

@@ -38,10 +38,10 @@ from service.sky.zones import SearchRegion, Zone, count_within, zone_key
 from service.vectors import Vector
 
 
-def kept(error: Exception) -> Exception:
-    """An error as the result of a row: without its traceback, which holds all columns, if expected.
+def as_row_error(error: Exception) -> Exception:
+    """An error as the result of a row.
 
-    A batch that has to wait is one.
+    Expected ones (`AcquisitionError`, `NotAtHand`) lose their traceback, which holds all columns.
     """
     is_expected = isinstance(error, AcquisitionError | NotAtHand)
     return error.with_traceback(None) if is_expected else error
@@ -166,7 +166,8 @@ class ZoneSearch:
         self._by_itself: dict[int, Identification] = {}
         """By tracker: of identifiers that take one sighting at a time."""
         self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
-        """Rows and trackers by place in the batch, identifier, rules and zone."""
+        """(row, tracker) that are identified in one call, by (place of the tracker in its batch,
+        identifier, rules, zone)."""
 
     def __contains__(self, row: int) -> bool:
         return row in self._asked
@@ -225,7 +226,7 @@ class ZoneSearch:
                 zone, cached = first.search.zone(first.regions[index])
             except Exception as error:
                 # The batches of this zone fail; those of other zones go on.
-                self.errors |= dict.fromkeys((row for row, _ in sightings), kept(error))
+                self.errors |= dict.fromkeys((row for row, _ in sightings), as_row_error(error))
                 continue
             timer.end("zone")
             self._identify(zone, index, sightings)
@@ -257,7 +258,7 @@ class ZoneSearch:
                     self._by_itself[t], self.found.star[stars] = alone, alone.star
             except Exception as error:
                 # This batch fails; the others of the zone go on.
-                self.errors[row] = kept(error)
+                self.errors[row] = as_row_error(error)
         count_within(zone, which, seen.axis, seen.least, seen.most, self.within)
         if budgets:
             if len(budgets) < len(which):

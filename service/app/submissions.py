@@ -28,7 +28,7 @@ from service.times import Utc
 MAX_ARRAY = 100
 """The most batches of an array."""
 READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
-"""Bounds of a batch that the event loop reads itself: more than thirty stars."""
+"""A body within both bounds is read in the event loop; thirty stars fit."""
 
 
 _ARRAY: TypeAdapter[list[Any]] = TypeAdapter(

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import to_builtins
 
-from service.errors import BadInput, Fault, shown_value
+from service.errors import BadInput, Fault, printable, shown_value
 from service.settings import Settings
 
 if TYPE_CHECKING:
@@ -132,7 +132,7 @@ def _summary(file: Path, told: dict[str, Any]) -> str:
             for each in told["stars"][:FEW_NAMES]
         ]
         lines.append("  " + ", ".join(names) + (", ..." if len(told["stars"]) > FEW_NAMES else ""))
-    lines += [f"  {each}" for each in told["remarks"]]
+    lines += [f"  {printable(each)}" for each in told["remarks"]]
     if told["overlay"] is not None:
         lines.append(f"  picture: {told['overlay']}")
     return "\n".join(lines)

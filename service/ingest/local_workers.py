@@ -75,7 +75,7 @@ class _Processes(Generic[Input, Output]):
     tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
     pids: set[int] = field(default_factory=set)
     """Those that are ready to work; all are, as soon as one is."""
-    told_to_end: bool = False
+    is_ending: bool = False
     _closing: threading.Lock = field(default_factory=threading.Lock)
 
     def end(self) -> None:
@@ -210,7 +210,7 @@ class LocalWorkers(Generic[Input, Output]):
             # Its thread would keep these workers in memory.
             self._idle_check.cancel()
         if processes is not None:
-            processes.told_to_end = True
+            processes.is_ending = True
             processes.end()
         return processes
 
@@ -286,6 +286,10 @@ class LocalWorkers(Generic[Input, Output]):
             # unfinished is seen to in `_see_the_end`.
             processes.end()
             return
+        with self._lock:
+            if processes.is_ending and not self._closing:
+                # It has the settings of before: `_see_the_end` has it computed anew.
+                return
         if error is None:
             try:
                 found = [each for some in future.result() for each in pickle.loads(some)]
@@ -314,7 +318,7 @@ class LocalWorkers(Generic[Input, Output]):
         # It fails what is unfinished, and waits for the processes.
         manager.join()
         with self._lock:
-            if not (processes.pids or processes.told_to_end):
+            if not (processes.pids or processes.is_ending):
                 # They died before they were ready: the next ones may, too.
                 self._pause()
             self._replace(processes)
@@ -335,7 +339,7 @@ class LocalWorkers(Generic[Input, Output]):
                 if len(self._one_by_one) == 1:
                     self._hand_in(chunk)
                 return
-            if not ended.told_to_end:
+            if not ended.is_ending:
                 chunk.deaths += bool(ended.pids)
                 chunk.lost_starts += not ended.pids
             if chunk.deaths < MOST_DEATHS and chunk.lost_starts < MOST_STARTS:

@@ -52,7 +52,7 @@ def decided(outcomes: WriteOutcomes) -> Answers:
     """Answers and errors of single batches; raises the others."""
     answers: Answers = []
     for outcome in outcomes:
-        # Neither is an answer to the batch: both say that nothing was decided about it.
+        # Both decide nothing about the batch.
         if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
             raise outcome
         answers.append(outcome)

@@ -48,14 +48,15 @@ class PendingBatch:
     """A submission that waits for its answer, which is set on `future`.
 
     `make` gives the submission, which of a frame takes long; what it is called and the
-    fingerprint of its body are known before that.  `turn` is whose turn it is counted as.
+    fingerprint of its body are known before that.  `client` is the client and spacecraft between
+    whose batches the pool shares its threads.
     """
 
     identity: Identity
     fingerprint: str
     key: OwnKey | None
     make: Callable[[], Submission]
-    turn: Hashable
+    client: Hashable
     is_long: bool
     future: "asyncio.Future[Answered] | Future[Answered]" = field(default_factory=Future)
     wait_s: float = WAIT_S
@@ -92,49 +93,49 @@ class IngestQueue:
         self,
         look_up: Callable[[Sequence[PendingBatch]], Sequence[Found]],
         solve: Callable[[PendingBatch], UnsavedResult],
-        solve_at_once: Callable[[Sequence[PendingBatch]], Sequence[UnsavedResult | Exception]],
+        solve_together: Callable[[Sequence[PendingBatch]], Sequence[UnsavedResult | Exception]],
         recorded: Callable[[UnsavedResult, WriteOutcome], object],
         writer: Writer,
         pool: SolverPool,
     ) -> None:
-        """`look_up` answers what is recorded; `recorded` is told of each outcome of a write.
+        """`look_up` answers what is recorded; `recorded` is called with each outcome of a write.
 
-        `solve_at_once` gives the error where a batch has no result, `NotAtHand` of one that takes
+        `solve_together` gives the error where a batch has no result, `NotAtHand` of one that takes
         long.
         """
-        self._look_up, self._told = look_up, recorded
-        self._solve, self._solve_at_once = solve, solve_at_once
+        self._look_up, self._note_outcome = look_up, recorded
+        self._solve, self._solve_together = solve, solve_together
         self._writer, self._pool = writer, pool
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """Those that are being computed or recorded, each with its repeats."""
-        self._turns: Turns[PendingBatch] = Turns()
-        self._unsettled: dict[PendingBatch, None] = {}
+        self._sequences: Sequences[PendingBatch] = Sequences()
+        self._unanswered: dict[PendingBatch, None] = {}
         self._written: list[tuple[PendingBatch, WriteOutcome]] = []
         self._closing = False
         self._empty = threading.Event()
         self._empty.set()
         writer.solve_posts = self._begin
-        writer.after_commit.append(self._answer_written)
+        writer.after_jobs.append(self._answer_written)
 
     def put(self, pending: PendingBatch) -> None:
         """Queue a submission; raises `Busy` where too many wait, `Stopping` after `close`."""
         with self._lock:
             if self._closing:
                 raise Stopping("the service is stopping")
-            if len(self._unsettled) >= MAX_WAITING:
+            if len(self._unanswered) >= MAX_WAITING:
                 message = f"{MAX_WAITING} batches are waiting to be worked on"
                 raise Busy(message, RETRY_AFTER_S)
-            self._unsettled[pending] = None
+            self._unanswered[pending] = None
             self._empty.clear()
         self._queue(pending)
 
     def state(self) -> QueueState:
         """The submissions that wait for their answers."""
         with self._lock:
-            oldest = next(iter(self._unsettled), None)
+            oldest = next(iter(self._unanswered), None)
             age_s = 0.0 if oldest is None else time.monotonic() - oldest.since_s
-            return QueueState(len(self._unsettled), age_s)
+            return QueueState(len(self._unanswered), age_s)
 
     def wait_until_empty(self, seconds: float) -> None:
         """Wait until every submission is answered, at most `seconds`."""
@@ -146,47 +147,47 @@ class IngestQueue:
             self._closing = True
         self._empty.wait(DRAIN_S)
         with self._lock:
-            left = list(self._unsettled)
-        self._settle([(each, Stopping("the service is stopping")) for each in left])
+            left = list(self._unanswered)
+        self._answer([(each, Stopping("the service is stopping")) for each in left])
 
     def _queue(self, pending: PendingBatch) -> None:
         try:
-            self._writer.put(QueuedJob(partial(self._note_written, pending), post=pending))
+            self._writer.put(QueuedJob(partial(self._note_written, pending), pending=pending))
         except Busy as error:
-            self._settle([(pending, error)])
+            self._answer([(pending, error)])
 
     # ---- the writer's thread, before a transaction --------------------------------------------
 
     def _begin(self, jobs: Sequence[QueuedJob]) -> list[QueuedJob]:
         """Answer recorded and expired submissions; compute the others, each once."""
         now_s = time.monotonic()
-        late = [job.post for job in jobs if now_s - job.post.since_s > job.post.wait_s]
+        late = [job.pending for job in jobs if now_s - job.pending.since_s > job.pending.wait_s]
         for pending in late:
             error = Busy(f"it has waited {pending.wait_s:g} s for its turn", RETRY_AFTER_S)
-            self._settle([(pending, error)])
-        jobs = [job for job in jobs if job.post not in late]
+            self._answer([(pending, error)])
+        jobs = [job for job in jobs if job.pending not in late]
         if not jobs:
             return []
         found: Sequence[Found]
         try:
-            found = self._look_up([job.post for job in jobs])
+            found = self._look_up([job.pending for job in jobs])
         except Exception as error:
             # Each client gets the error: nothing is decided about its batch.
             found = [error] * len(jobs)
         known, to_write = [], []
         for job, each in zip(jobs, found, strict=True):
             if isinstance(each, Answered | Exception):
-                known.append((job.post, each))
+                known.append((job.pending, each))
             else:
                 job.change = each
                 to_write.append(job)
-        self._settle(known)
+        self._answer(known)
         self._compute([job for job in to_write if job.change is None and self._is_for_now(job)])
         return [job for job in to_write if job.change is not None or job.unsaved_results]
 
     def _is_for_now(self, job: QueuedJob) -> bool:
         """Whether a batch is to be computed now; otherwise later, or one like it is already."""
-        pending: PendingBatch = job.post
+        pending: PendingBatch = job.pending
         with self._lock:
             repeats = self._in_flight.get(pending.identity)
             if repeats is not None:
@@ -194,7 +195,9 @@ class IngestQueue:
                 return False
             self._in_flight[pending.identity] = []
             sequence = pending.sequence
-            if sequence is not None and not self._turns.enter(sequence, pending.time_ns, pending):
+            if sequence is not None and not self._sequences.enter(
+                sequence, pending.time_ns, pending
+            ):
                 return False
         if pending.is_long or sequence is not None:
             self._start(pending)
@@ -205,12 +208,12 @@ class IngestQueue:
         """Compute batches together; those that take long go to the pool."""
         several: Sequence[UnsavedResult | Exception]
         try:
-            several = self._solve_at_once([job.post for job in jobs])
+            several = self._solve_together([job.pending for job in jobs])
         except Exception as error:
             log.exception("batches that waited together failed")
             several = [error] * len(jobs)
         for job, found in zip(jobs, several, strict=True):
-            pending: PendingBatch = job.post
+            pending: PendingBatch = job.pending
             if isinstance(found, NotAtHand):
                 self._start(pending)
             elif isinstance(found, Exception):
@@ -228,7 +231,7 @@ class IngestQueue:
             pending.since_s + pending.wait_s,
         )
         try:
-            self._pool.put(task, pending.turn, is_long=pending.is_long)
+            self._pool.put(task, pending.client, is_long=pending.is_long)
         except Stopping as error:
             self._finish([(pending, error)])
 
@@ -251,7 +254,7 @@ class IngestQueue:
     ) -> None:
         one = outcome[0] if isinstance(outcome, list) else outcome
         if pending.unsaved is not None:
-            self._told(pending.unsaved, one)
+            self._note_outcome(pending.unsaved, one)
         self._written.append((pending, one))
 
     def _answer_written(self) -> None:
@@ -271,32 +274,32 @@ class IngestQueue:
         with self._lock:
             repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
             ended = [p.sequence for p, _ in outcomes if p.sequence is not None]
-            following = [each for key in ended if (each := self._turns.leave(key)) is not None]
-        self._settle(outcomes)
+            following = [each for key in ended if (each := self._sequences.leave(key)) is not None]
+        self._answer(outcomes)
         for each in repeats:
             self._queue(each)
         for each in following:
             self._start(each)
 
-    def _settle(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
+    def _answer(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
         by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, WriteOutcome]]] = {}
         with self._lock:
             for pending, _ in outcomes:
-                self._unsettled.pop(pending, None)
-            if not self._unsettled:
+                self._unanswered.pop(pending, None)
+            if not self._unanswered:
                 self._empty.set()
         for pending, outcome in outcomes:
             if isinstance(pending.future, Future):
-                _answer([(pending, outcome)])
+                _set_futures([(pending, outcome)])
             else:
                 by_loop.setdefault(pending.future.get_loop(), []).append((pending, outcome))
         for loop, some in by_loop.items():
             # The loop may be closed: then no client waits for these answers.
             with suppress(RuntimeError):
-                loop.call_soon_threadsafe(_answer, some)
+                loop.call_soon_threadsafe(_set_futures, some)
 
 
-def _answer(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
+def _set_futures(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
     for pending, outcome in outcomes:
         if pending.future.done():
             continue  # the client has gone
@@ -309,7 +312,7 @@ def _answer(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
 T = TypeVar("T")
 
 
-class Turns(Generic[T]):
+class Sequences(Generic[T]):
     """Those of one key that wait while another of it is at work.  The caller holds a lock."""
 
     def __init__(self) -> None:

@@ -177,8 +177,8 @@ class SolverTask(NamedTuple):
     """On the clock of `time.monotonic`."""
 
 
-class TurnQueue:
-    """Tasks in turns: one of each client and spacecraft that has some, then the next."""
+class FairQueue:
+    """Tasks by client and spacecraft: one of each that has some, then the next."""
 
     def __init__(self) -> None:
         self._tasks: OrderedDict[Hashable, deque[SolverTask]] = OrderedDict()
@@ -186,16 +186,16 @@ class TurnQueue:
     def __bool__(self) -> bool:
         return bool(self._tasks)
 
-    def put(self, turn: Hashable, task: SolverTask) -> None:
-        """Add a task to those of a turn."""
-        self._tasks.setdefault(turn, deque()).append(task)
+    def put(self, client: Hashable, task: SolverTask) -> None:
+        """Add a task of a client."""
+        self._tasks.setdefault(client, deque()).append(task)
 
     def get(self) -> SolverTask:
-        """The next task; its turn comes again after all others."""
-        turn, tasks = self._tasks.popitem(last=False)
+        """The next task; its client comes again after all others."""
+        client, tasks = self._tasks.popitem(last=False)
         task = tasks.popleft()
         if tasks:
-            self._tasks[turn] = tasks
+            self._tasks[client] = tasks
         return task
 
 
@@ -208,7 +208,7 @@ class SolverPool:
     def __init__(self, threads: int | None = None) -> None:
         """At least two threads, by default one for each processor."""
         count = max(2, threads or os.cpu_count() or 1)
-        self._short, self._long = TurnQueue(), TurnQueue()
+        self._short, self._long = FairQueue(), FairQueue()
         self._long_slots = count - 1
         self._changed = threading.Condition()
         self._closing = False
@@ -221,17 +221,15 @@ class SolverPool:
         for thread in self._threads:
             thread.start()
 
-    def put(self, task: SolverTask, turn: Hashable, *, is_long: bool) -> None:
+    def put(self, task: SolverTask, client: Hashable, *, is_long: bool) -> None:
         """Queue a task; raises `Stopping` after `close`."""
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
-            (self._long if is_long else self._short).put(turn, task)
+            (self._long if is_long else self._short).put(client, task)
             self._changed.notify()
 
-    def call(
-        self, work: Callable[[], T], turn: Hashable, *, is_long: bool, wait_s: float | None = None
-    ) -> T:
+    def call(self, work: Callable[[], T], client: Hashable, *, is_long: bool) -> T:
         """Have work done by a thread and wait for what it returns or raises."""
         done: Future[T] = Future()
 
@@ -243,8 +241,8 @@ class SolverPool:
             except BaseException as error:
                 done.set_exception(error)
 
-        give_up_s = time.monotonic() + (WAIT_S if wait_s is None else wait_s)
-        self.put(SolverTask(run, done.set_exception, give_up_s), turn, is_long=is_long)
+        task = SolverTask(run, done.set_exception, time.monotonic() + WAIT_S)
+        self.put(task, client, is_long=is_long)
         return done.result()
 
     def close(self) -> None:

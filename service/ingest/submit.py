@@ -77,7 +77,7 @@ class SubmissionService:
         self.solver = Solver(missions, replace(sky, builder=self.pool.builder))
         self._store = store
         self._queue = IngestQueue(
-            *(self._recorded_before, self._solve, self._solve_at_once, self._tell),
+            *(self._recorded_before, self._solve, self._solve_together, self._note_outcome),
             *(store.writer, self.pool),
         )
         self._single_s = -float("inf")
@@ -257,7 +257,7 @@ class SubmissionService:
             submission.fingerprint,
             None,
             lambda: submission,
-            turn=None,
+            client=None,
             is_long=False,
         )
         self._recorded_before([pending])
@@ -290,7 +290,7 @@ class SubmissionService:
         def finish() -> Answers:
             outcomes = future.result()
             for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
-                self._tell(unsaved, outcome)
+                self._note_outcome(unsaved, outcome)
             return decided(outcomes)
 
         return finish
@@ -321,7 +321,7 @@ class SubmissionService:
 
     # ---- steps of the queue ------------------------------------------------------------------
 
-    def _solve_at_once(self, group: Sequence[PendingBatch]) -> list[UnsavedResult | Exception]:
+    def _solve_together(self, group: Sequence[PendingBatch]) -> list[UnsavedResult | Exception]:
         """The results of batches that wait together; `NotAtHand` of one that takes long."""
         found: dict[int, UnsavedResult | Exception] = {}
         submissions: dict[int, Submission] = {}
@@ -423,7 +423,7 @@ class SubmissionService:
             self._store.writer.note_failure(count)
             raise
 
-    def _tell(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
+    def _note_outcome(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
         """Tell the observers of a new batch; a what-if holds the stars of one that is known."""
         is_new = isinstance(outcome, Answered) and not outcome.replayed
         if not is_new or unsaved.batch is None or not self.observers:

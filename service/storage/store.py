@@ -17,11 +17,11 @@ from service.storage.recording.writer import RETRY_AFTER_S, Writer, remove_probe
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile, FileLock
 from service.storage.sql.engines import (
+    LONGEST_WAIT_S,
     TO_COMMIT,
     TO_LOOK_UP,
     TO_READ,
     TO_SHOW,
-    TURN_S,
     database_file,
     database_url,
     reading_engine,
@@ -57,7 +57,7 @@ class Readers:
         if serving and self.file is None:
             self._lookup_engine = reading_engine(self.url, TO_LOOK_UP, 1)
         self._lookup_connection = PersistentConnection(
-            self._lookup_engine, TO_READ, self.file, TURN_S if serving else None
+            self._lookup_engine, TO_READ, self.file, LONGEST_WAIT_S if serving else None
         )
 
     @contextmanager
@@ -148,7 +148,7 @@ class Store(Readers):
         super().__init__(database, serving=serving, file=file)
         self.lock = ProjectorLock() if serving and file is None else None
         """Of PostgreSQL: nothing is projected before it is taken."""
-        wait_s = TURN_S if serving else None
+        wait_s = LONGEST_WAIT_S if serving else None
         self.at_work = set[str]() if self.lock is None else self.lock.at_work
         """The ids of replays and calibrations that this process is at work on."""
         self.writer = Writer(

@@ -51,7 +51,7 @@ from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLi
 log = logging.getLogger(__name__)
 
 WORKER_THREADS = 64
-"""Handlers run in threads, and those of concurrent repeats wait there for the first."""
+"""Handlers run in threads; those of repeated frames wait there for the first."""
 
 # The order of the routes in `openapi.yaml`.
 ROUTERS: tuple[APIRouter, ...] = (
@@ -119,7 +119,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
     web_app.state.body_budget = BodyBudget(limits)
     web_app.state.metrics = Metrics(app)
     web_app.state.live = Live(app)
-    # The last that is added is the first that is asked: it passes the direct routes by these two.
+    # Added last, so outermost: the direct routes skip the two below.
     web_app.add_middleware(ConditionalAnswers)
     web_app.add_middleware(
         GZipMiddleware,

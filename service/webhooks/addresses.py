@@ -12,8 +12,6 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 
-import httpx
-
 from service.errors import BadInput, Fault, shown_value
 from service.settings import Network, networks
 
@@ -53,6 +51,8 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
         # A URL may hold what only the receiver should know: the host alone is shown.
         return BadInput(Fault("url", message, shown_value(url[:40])))
 
+    import httpx
+
     if len(url) > MAX_URL:
         raise BadInput(Fault("url", f"may have at most {MAX_URL} characters"))
     try:
@@ -89,6 +89,8 @@ def require_http_allowed(url: str, allowed: Sequence[Network]) -> None:
 
     Each attempt would be refused.  A name that cannot be resolved now is accepted.
     """
+    import httpx
+
     parsed = httpx.URL(url)
     if parsed.scheme != "http":
         return

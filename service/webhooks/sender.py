@@ -16,7 +16,7 @@ from collections.abc import Awaitable, Callable, Sequence
 from concurrent.futures import CancelledError, ThreadPoolExecutor
 from contextlib import suppress
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sqlalchemy import Connection
 
@@ -29,16 +29,21 @@ from service.storage.webhooks import deliveries
 from service.storage.webhooks.deliveries import Attempt, Queue, Waiting, hold_sender, read_sender
 from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks
 from service.times import DAY_S, recorded_utc, shifted, utc_now
-from service.webhooks.messages import delivery_row, signed_headers, test_message, wants
-from service.webhooks.posts import (
+from service.webhooks.messages import (
     GONE,
     TOO_MANY,
     TOTAL_S,
     UNAVAILABLE,
     DeliveryLog,
     Outcome,
-    Poster,
+    delivery_row,
+    signed_headers,
+    test_message,
+    wants,
 )
+
+if TYPE_CHECKING:
+    from service.webhooks.posts import Poster
 
 log = logging.getLogger(__name__)
 
@@ -316,8 +321,11 @@ class WebhookSender:
     async def _post(self, webhook: Registered, message_id: str, body: bytes) -> Outcome:
         now, unix_s = utc_now().text, int(time.time())
         headers = signed_headers(webhook.secrets(now), message_id, unix_s, body)
-        # Not before: to read the certificates of all authorities takes a while.
-        self._poster = self._poster or Poster(self._allowed)
+        if self._poster is None:
+            # Not before: httpx, and the certificates of all authorities, take a while to read.
+            from service.webhooks.posts import Poster
+
+            self._poster = Poster(self._allowed)
         return await self._poster.post(webhook.url, headers, body)
 
     def _attempt(

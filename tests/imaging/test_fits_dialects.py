@@ -241,3 +241,27 @@ def test_a_compressed_colour_cube_is_summed(rng):
     unit = fits.CompImageHDU(cube, compression_type="RICE_1")
     frame = read(written(image(None, kind=fits.PrimaryHDU), unit))
     assert np.array_equal(frame.counts, cube.sum(axis=0))
+
+
+def with_card(data, card):
+    """A file with one more card in its first header, in place of a blank one behind the last."""
+    end = b"END" + b" " * 77
+    assert end + b" " * 80 in data
+    return data.replace(end + b" " * 80, card.ljust(80) + end, 1)
+
+
+@pytest.mark.parametrize("key", ["BSCALE", "BZERO"])
+def test_a_keyword_without_a_value_counts_as_absent(values, key):
+    """FITS Standard 4.0, section 4.1.2.3."""
+    pixels = values.astype("f4")
+    data = with_card(written(fits.PrimaryHDU(pixels)), f"{key:8}=      / undefined".encode())
+    np.testing.assert_array_equal(read(data).counts, pixels)
+
+
+def test_a_header_moves_no_terminal_s_cursor(values):
+    """What a file says is shown in messages, on terminals and in logs."""
+    card = b"BSCALE  = '\x1b[31m\x07'"
+    with pytest.raises(BadFile, match="impossible BSCALE") as caught:
+        read(with_card(written(fits.PrimaryHDU(values.astype("f4"))), card))
+    assert str(caught.value).isprintable()
+    assert r"\x1b[31m\x07" in str(caught.value)

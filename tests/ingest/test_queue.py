@@ -13,7 +13,7 @@ import pytest
 from service.errors import BadInput, BeingBuilt, Busy, Fault, Stopping
 from service.ingest import queue
 from service.ingest import solver_pool as pools
-from service.ingest.solver_pool import SolverPool, SolverTask, TurnQueue, may_take_long
+from service.ingest.solver_pool import FairQueue, SolverPool, SolverTask, may_take_long
 from service.observations.schema import submission_from_json
 from service.sky.cache import NotAtHand
 from service.sky.whole_sky.index import build_sky_index
@@ -209,7 +209,7 @@ def test_a_client_that_has_gone_keeps_no_other_from_its_answer(app, make):
 
 
 def test_turns_go_around_between_clients_whatever_one_has_sent():
-    tasks = TurnQueue()
+    tasks = FairQueue()
     for k in range(3):
         tasks.put("many", f"many {k}")
     tasks.put("one", "one")

@@ -14,7 +14,7 @@ from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.storage.projections import projector as projecting
 from service.storage.projections.projector import Projector, rebuild_trends
-from service.storage.recording.results import next_places
+from service.storage.recording.results import next_seqs
 from service.storage.sql.alarm_tables import alarm_actions, alarms, limits, watches
 from service.storage.sql.tables import (
     batches,
@@ -201,7 +201,7 @@ def test_a_transaction_that_commits_late_is_neither_left_out_nor_projected_twice
     other = Store(database)
 
     def record_slowly(connection):
-        (place,) = next_places(connection, 1)
+        (place,) = next_seqs(connection, 1)
         sleeping.set()
         go_on.wait(30)
         id = "0" * 26

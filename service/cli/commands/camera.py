@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from service.cli.arguments import add_command, add_group, degrees, positive
 from service.cli.configuration import settings_of
-from service.errors import BadInput, Fault, shown_value
+from service.errors import BadInput, Fault, printable, shown_value
 
 if TYPE_CHECKING:
     from service.acquire.camera_calibration import CameraCalibration
@@ -97,7 +97,7 @@ def _solved(
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue
         if result.attitude is None:
-            reason = "; ".join(result.remarks)
+            reason = printable("; ".join(result.remarks))
             print(f"acquire: {file}: no attitude: {reason}", file=sys.stderr)
             continue
         if result.frame.is_mirrored:
@@ -164,4 +164,4 @@ def _print_result(found: "CameraCalibration") -> None:
         f"counts, zero point {found.zero_point_mag:.2f} mag"
     )
     for remark in found.remarks:
-        print(remark)
+        print(printable(remark))

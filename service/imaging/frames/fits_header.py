@@ -31,19 +31,24 @@ class Header:
 
     def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
         """A whole number of the header; raises `BadFile` for anything else."""
-        value = self.cards.get(key, default)
+        value = self._value(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 40:
             raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         return value
 
     def number(self, key: str, default: float) -> float:
         """A finite number of the header."""
-        value = self.cards.get(key, default)
+        value = self._value(key, default)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         if not abs(value) < 1e30:
             raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         return float(value)
+
+    def _value(self, key: str, default: Value) -> Value:
+        # A card without a value says nothing (FITS 4.0, 4.1.2.3).
+        value = self.cards.get(key)
+        return default if value is None else value
 
     def behind(self, primary: "Header") -> "Header":
         """The header with what it does not say itself from the primary one."""

@@ -117,7 +117,9 @@ CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
 
 _BEHIND = "SELECT count(*) FROM results WHERE seq > (SELECT seq FROM projector)"
-_PLACES = "SELECT (SELECT coalesce(max(seq), 0) FROM results), (SELECT seq FROM projector)"
+_NEWEST_AND_POSITION = (
+    "SELECT (SELECT coalesce(max(seq), 0) FROM results), (SELECT seq FROM projector)"
+)
 
 
 @dataclass(frozen=True)
@@ -174,7 +176,7 @@ class Projector:
         """Keep the projections up from now on."""
         self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
         self._thread.start()
-        self._writer.after_commit.append(self._wake)
+        self._writer.after_jobs.append(self._wake)
         self._store.before_reading, self._store.hold_back = (
             self.wait,
             partial(self.catch_up, MOST_BEHIND),
@@ -243,7 +245,7 @@ class Projector:
         """The places of the newest result and of the projector in the record."""
         asked_s = time.monotonic()
         with self._store.lookup() as connection:
-            ((newest, position),) = execute(connection, _PLACES)
+            ((newest, position),) = execute(connection, _NEWEST_AND_POSITION)
         if position >= newest:
             self._up_to_date_s = max(self._up_to_date_s, asked_s)
         return newest, position
@@ -299,7 +301,7 @@ class Projector:
         return self._is_closing or (self._is_projecting and (is_behind or is_asked))
 
     def _may_step(self) -> bool:
-        """False if nothing is to be projected, or by another process; asked on PostgreSQL alone.
+        """False if nothing is to be projected, or by another process; asked only on PostgreSQL.
 
         A transaction of the projector locks its row, even where it finds nothing.
         """

@@ -2,8 +2,8 @@
 
 Of spacecraft with several trackers also per tracker.
 
-They are at every moment what a count of the current results would give up to the place in the
-record that the projector has come to.
+They always equal a count of the current results whose `seq` is at most the position of the
+projector.
 """
 
 import json

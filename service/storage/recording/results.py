@@ -1,4 +1,4 @@
-"""Writing results: every row of a result, its part in the trends included, in one transaction."""
+"""Writing results: every row of a result in one transaction; trends follow (`projections`)."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -38,7 +38,7 @@ from service.storage.sql.tables import (
 
 RecordOutcome = Answered | AcquisitionError
 
-_TAKE_TURN = (
+_LOCK_SEQUENCE = (
     "SELECT pg_advisory_xact_lock(hashtextextended(%(pair)s, 'batches'::regclass::oid::int8))"
 )
 _RUNS = "runs"
@@ -151,7 +151,7 @@ def _outdated(
     """
     asked = [unsaved for unsaved in unsaved_results if unsaved.is_outdated is not None]
     for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved in asked}):
-        execute(connection, _TAKE_TURN, {"pair": pair})
+        execute(connection, _LOCK_SEQUENCE, {"pair": pair})
     return {
         unsaved.id: PredictionOutdated("another attitude was recorded meanwhile")
         for unsaved in asked
@@ -225,7 +225,7 @@ def _insert_results(
 ) -> None:
     # In order of their ids, which rise: each goes to the end of its table.
     in_order = sorted(unsaved_results, key=lambda each: each[0].id)
-    places = next_places(connection, len(in_order))
+    places = next_seqs(connection, len(in_order))
     rows = [
         unsaved.result_row(body, seq) for (unsaved, body), seq in zip(in_order, places, strict=True)
     ]
@@ -248,18 +248,18 @@ def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
     events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)
 
 
-def next_places(connection: Connection, count: int) -> list[int]:
+def next_seqs(connection: Connection, count: int) -> list[int]:
     """The next places in the record's order, for so many results of this transaction.
 
     On PostgreSQL a transaction may commit after one with later places.  It has its number before
     it takes places: whoever sees a later place, and finds that no transaction of that moment is
     left, knows that the missing ones will not come.
     """
-    rows = execute(connection, _PLACES[connection.dialect.name], {"count": count})
+    rows = execute(connection, _NEXT_SEQS[connection.dialect.name], {"count": count})
     return [int(place) for *_, place in rows]
 
 
-_PLACES = {
+_NEXT_SEQS = {
     # Of results that were deleted before they were projected nothing is left to tell.
     "sqlite": """
         WITH RECURSIVE next(seq, n) AS (

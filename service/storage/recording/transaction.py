@@ -33,7 +33,8 @@ MAX_LOOKS = 5
 class QueuedJob:
     """Results to record, or another change to make, and the function that takes the outcome.
 
-    The results of a `post` are added when its turn has come, see `Writer.solve_posts`.
+    The results of a `pending` submission are added when the thread comes to it, see
+    `Writer.solve_posts`.
     """
 
     settle: Callable[[Any], object]
@@ -43,8 +44,8 @@ class QueuedJob:
     low_priority: bool = False
     """As a bulk load has: it is written by itself, after what else waits."""
     needs_lock: bool = False
-    """For a step of the projector: the session that holds its lock alone may take it."""
-    post: Any = None
+    """For a step of the projector: only the session that holds its lock may run it."""
+    pending: Any = None
     since_s: float = field(default_factory=time.monotonic)
 
     @property

@@ -1,7 +1,7 @@
-"""A result that is computed but not recorded: all but the last number of its answer.
+"""A result that is computed but not recorded: complete but for `timings_us.record`.
 
 The rows are taken from the answer itself, so that what a list or a trend says
-cannot differ from what the client was told.  The answer is put into JSON where it
+cannot differ from what the client gets.  The answer is put into JSON where it
 is computed: a worker sends it to the writer as one text instead of a hundred small
 objects.
 """

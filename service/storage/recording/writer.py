@@ -100,11 +100,12 @@ class Writer:
         self.commits = 0
         """Transactions that were committed, without those of the projector."""
         self.solve_posts: Callable[[Sequence[QueuedJob]], list[QueuedJob]] = list
-        """Adds the results of posts; gives those that are to be written now.  Settles, or puts
-        again later, the others.  Called by the writer's thread."""
+        """Adds the results of posts; gives those that are to be written now.  Of the others it
+        answers some, and puts the rest again with their results.  Called by the writer's thread."""
         self._solving_since_s: float | None = None
-        self.after_commit: list[Callable[[], object]] = []
-        """Called by the writer's thread, which waits for it, after each transaction."""
+        self.after_jobs: list[Callable[[], object]] = []
+        """Called by the writer's thread, which waits for it, after each group of jobs: also where
+        it failed, or nothing was to be written."""
         self.after_events: list[Callable[[], object]] = []
         """Called after those transactions that recorded events."""
         self._has_events = False
@@ -134,8 +135,8 @@ class Writer:
     def project(self, step: Callable[[Connection], T]) -> "Future[T]":
         """Queue a step of the projector: a change with a transaction of its own.
 
-        Posts go first, and the queue is never too full for it.  Raises `NotProjecting` where
-        another service that shares the database projects.
+        It waits for one transaction of other work at most, and the queue is never too full for
+        it.  Raises `NotProjecting` where another service that shares the database projects.
         """
         if self._lock is not None:
             self._lock.require()
@@ -199,7 +200,7 @@ class Writer:
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
-            if job.post is None:
+            if job.pending is None:
                 self._require_lock()
             # A job that alone is larger than the queue is still taken by an empty one.
             is_full = self._queued and self._queued + job.weight > self._max_queued
@@ -218,8 +219,8 @@ class Writer:
     def _run(self) -> None:
         try:
             while jobs := self._take():
-                self._settle(jobs)
-                self._tell()
+                self._process(jobs)
+                self._call_listeners()
         finally:
             # Empty after closing in order; otherwise nothing that is queued will be written.
             with self._changed:
@@ -229,7 +230,7 @@ class Writer:
                 self._low_priority.clear()
             for job in left:
                 job.settle(Stopping("the writer has ended"))
-            self._tell()
+            self._call_listeners()
 
     def _take(self) -> list[QueuedJob]:
         """The jobs of the next transaction; empty after `close`."""
@@ -246,7 +247,7 @@ class Writer:
             self._queued -= sum(job.weight for job in jobs)
         return jobs
 
-    def _settle(self, jobs: Sequence[QueuedJob]) -> None:
+    def _process(self, jobs: Sequence[QueuedJob]) -> None:
         jobs = self._in_time(self._solved(jobs))
         if not jobs:
             return
@@ -255,12 +256,12 @@ class Writer:
         except BaseException as error:
             cause = error.orig if isinstance(error, DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
-            told = _told(error)
-            is_trouble = isinstance(told, Busy) and not isinstance(told, NotProjecting | Stopping)
+            shown = _error_for_client(error)
+            is_trouble = isinstance(shown, Busy) and not isinstance(shown, NotProjecting | Stopping)
             if is_trouble and not jobs[0].is_projection:
                 self.note_failure(sum(job.weight for job in jobs))
             for job in jobs:
-                job.settle(told)
+                job.settle(shown)
             if not isinstance(error, Exception):
                 raise
             return
@@ -276,7 +277,7 @@ class Writer:
 
     def _solved(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
         """The jobs, with those posts that have results now."""
-        posts = [job for job in jobs if job.post is not None]
+        posts = [job for job in jobs if job.pending is not None]
         if not posts:
             return jobs
         self._solving_since_s = time.monotonic()
@@ -297,7 +298,7 @@ class Writer:
             for job in solved:
                 job.settle(error)
             solved = []
-        return [job for job in jobs if job.post is None] + solved
+        return [job for job in jobs if job.pending is None] + solved
 
     def _in_time(self, jobs: Sequence[QueuedJob]) -> Sequence[QueuedJob]:
         """The jobs that have not waited too long; clients of the others are told."""
@@ -355,12 +356,12 @@ class Writer:
         for listener in list(self.after_events):
             listener()
 
-    def _tell(self) -> None:
-        listeners = [*self.after_commit, *(self.after_events if self._has_events else ())]
+    def _call_listeners(self) -> None:
+        listeners = [*self.after_jobs, *(self.after_events if self._has_events else ())]
         self._has_events = False
-        for told in listeners:
+        for listener in listeners:
             try:
-                told()
+                listener()
             except Exception:
                 # The transaction is committed: an error of a listener does not change that.
                 log.exception("a listener failed after a commit")
@@ -402,16 +403,16 @@ def remove_probe(connection: Connection) -> None:
         connection.exec_driver_sql(f"DROP TABLE IF EXISTS {PROBE_TABLE}")
 
 
-def _told(error: BaseException) -> Exception:
+def _error_for_client(error: BaseException) -> Exception:
     """The error as clients get it: trouble of the database may pass, so it is `Busy`.
 
     Its words name files and hosts, which are for the log alone.
     """
     if isinstance(error, DBAPIError) and is_of_the_database(error):
-        told: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
+        shown: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
     elif isinstance(error, Exception):
         return error
     else:
-        told = Stopping("the writer has ended")
-    told.__cause__ = error
-    return told
+        shown = Stopping("the writer has ended")
+    shown.__cause__ = error
+    return shown

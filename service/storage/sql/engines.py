@@ -63,8 +63,8 @@ MORE_S = 1.0
 CONNECT_S, TCP_USER_TIMEOUT_S = 2, 8
 FREE_S = 10.0
 """The longest wait for a reader's connection that is free."""
-TURN_S = 2.0
-"""The longest wait for the turn of one who looks up or writes."""
+LONGEST_WAIT_S = 2.0
+"""The longest wait of a look-up, or of what is to be written, before it begins."""
 
 SECRETS = ("password", "sslpassword")
 """Of the query part of a URL of PostgreSQL."""

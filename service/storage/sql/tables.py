@@ -409,7 +409,7 @@ WRITTEN_BY_POSTS = (
     events,
     event_counter,
 )
-"""The tables that a batch may be written to."""
+"""The tables that a batch is written to, by its post and by the projector."""
 
 
 # The tables of the archive: which batches left the database, and where they are.

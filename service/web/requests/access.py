@@ -172,8 +172,8 @@ _LOOK_UP_S = 1.5
 async def authorize(request: Request) -> None:
     """Let a request through to its handler, or raise what it lacks.
 
-    What a caller with the scope `operate` changes, and what a policy says is
-    `noted`, is noted with the change (`AuditDep`), or once it is answered
+    What a caller with the scope `operate` changes, and what a policy marks as `audited`, gets
+    its audit entry with the change (`AuditDep`), or once it is answered
     (`service.web.middleware`) where it was refused or changed no record.
     """
     route = request.scope["route"]

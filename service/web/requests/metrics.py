@@ -34,7 +34,7 @@ from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.storage.webhooks.registered import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now
-from service.webhooks.posts import Result
+from service.webhooks.messages import Result
 
 log = logging.getLogger(__name__)
 
