@@ -1,7 +1,7 @@
 """What the filter takes: recorded measurements and gyro samples, in unbroken stretches."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -74,6 +74,21 @@ class Recorded:
     attitudes: AttitudeMeasurements
     directions: DirectionMeasurements
     unusable: int = 0
+
+
+def arrays_of(
+    attitudes: AttitudeMeasurements, directions: DirectionMeasurements
+) -> Sequence[npt.NDArray[Any]]:
+    """All arrays of measurements, as digests take them in."""
+    return (
+        attitudes.tai_ns,
+        attitudes.quaternion,
+        attitudes.covariance_rad2,
+        directions.tai_ns,
+        directions.body,
+        directions.inertial,
+        directions.sigma_rad,
+    )
 
 
 def usable_attitudes(

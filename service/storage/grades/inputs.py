@@ -15,7 +15,7 @@ from service.errors import BadInput
 from service.filtering.prediction import Known
 from service.filtering.samples import DirectionMeasurements, no_directions
 from service.grades.day import METHOD, day_bounds
-from service.grades.stretches import Recorded, usable_attitudes
+from service.grades.stretches import Recorded, arrays_of, usable_attitudes
 from service.gyro import Nanoseconds, tai_ns_of
 from service.identify.attitude_from_matches import matched_vectors
 from service.identify.identification import Outcome
@@ -98,17 +98,10 @@ def inputs_digest(recorded: Recorded, mission: Mission) -> str:
         for name, each in (("gyro", mission.gyro), ("motion", mission.motion))
     }
     digest = hashlib.sha256(json.dumps([METHOD, settings], sort_keys=True).encode())
-    attitudes, directions = recorded.attitudes, recorded.directions
     for values in (
         recorded.gyro_ns,
         recorded.rates_rad_s,
-        attitudes.tai_ns,
-        attitudes.quaternion,
-        attitudes.covariance_rad2,
-        directions.tai_ns,
-        directions.body,
-        directions.inertial,
-        directions.sigma_rad,
+        *arrays_of(recorded.attitudes, recorded.directions),
         np.array([recorded.unusable]),
     ):
         digest.update(f"{values.dtype}{values.shape}".encode())
