@@ -159,10 +159,9 @@ class CalibrationResult(Record, frozen=True, kw_only=True):
     mission_file: Annotated[str, doc("The lines for the mission file, as TOML.")]
 
 
-class CalibrationSummary(Record, frozen=True, kw_only=True):
-    """A calibration without its covariance and maps; `result` fields are null until it is done."""
+class CalibrationProgress(Record, frozen=True, kw_only=True):
+    """What every calibration has from its start on."""
 
-    component: ClassVar[str] = "CalibrationSummary"
     id: Id
     spacecraft: str
     version: Annotated[Count, doc("From 1 for each spacecraft.")]
@@ -174,6 +173,12 @@ class CalibrationSummary(Record, frozen=True, kw_only=True):
     done: Annotated[Count, doc("Batches that have been processed again.")]
     total: Count
     mission: Annotated[Digest, doc("The settings that it started from.")]
+
+
+class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
+    """A calibration without its covariance and maps; `result` fields are null until it is done."""
+
+    component: ClassVar[str] = "CalibrationSummary"
     fault: str | None
     residual_over_sigma: float | None
     degree: Count | None
@@ -183,21 +188,10 @@ class CalibrationSummary(Record, frozen=True, kw_only=True):
     trackers: list[TrackerGeometry]
 
 
-class Calibration(Record, frozen=True, kw_only=True):
+class Calibration(CalibrationProgress, frozen=True, kw_only=True):
     """A calibration: what was asked, how far it is, and what was found."""
 
     component: ClassVar[str] = "Calibration"
-    id: Id
-    spacecraft: str
-    version: Annotated[Count, doc("From 1 for each spacecraft.")]
-    run: str
-    state: CalibrationStateName
-    who: str
-    created: Stamp
-    ended: Stamp | None
-    done: Annotated[Count, doc("Batches that have been processed again.")]
-    total: Count
-    mission: Annotated[Digest, doc("The settings that it started from.")]
     request: MissionSettings
     fault: str | None
     result: CalibrationResult | None
