@@ -31,6 +31,7 @@ from service.storage.recording.ids import Ulids
 from service.storage.sql.tables import (
     COUNTS,
     MAXIMA,
+    MEASURED,
     MINIMA,
     SHARES,
     SUMS,
@@ -166,6 +167,8 @@ def _drawn(rng: np.random.Generator, place: npt.NDArray[np.int64]) -> dict[str, 
         "scale_offset_ppm": np.where(solved, rng.normal(0.0, 60.0, n), np.nan),
         "alignment_offset_arcsec": np.where(solved, rng.normal(0.0, 1.5, n), np.nan),
     }
+    for name in MEASURED:
+        columns.setdefault(name, np.full(n, np.nan))
     columns["residual_ratio"] = columns["residual_rms_arcsec"] / columns["predicted_rms_arcsec"]
     for name in SHARES:
         columns[name] = columns[name.removesuffix("_share")] / 5.0
@@ -192,9 +195,7 @@ def _rows(
         "time_ns": time_ns,
         "created": texts,
         **{n: listed[n] for n in ("observed", "unique", "ambiguous", "unmatched")},
-        **{n: listed[n] for n in ("residual_rms_arcsec", "predicted_rms_arcsec")},
-        **{n: listed[n] for n in ("magnitude_offset_mag", "a_priori_angle_deg")},
-        **{n: listed[n] for n in ("scale_offset_ppm", "alignment_offset_arcsec")},
+        **{n: listed[n] for n in MEASURED},
         "status": [
             ("suspect" if suspect else "good") if solved else None
             for solved, suspect in zip(listed["solved"], listed["suspect"], strict=True)

@@ -85,6 +85,16 @@ class SmoothedShare:
 
 
 @dataclass(frozen=True)
+class Cause:
+    """Why a quantity usually leaves its limits, and what to do then."""
+
+    cause: str
+    remedy: str
+    calibrate: bool = False
+    """Whether a new calibration is the remedy."""
+
+
+@dataclass(frozen=True)
 class Quantity:
     """One quantity with all that derives from it."""
 
@@ -105,6 +115,8 @@ class Quantity:
     by_tracker: bool = False
     """Whether each tracker of a spacecraft with several has a value of it.  A tracker is suspect
     where it is the one that disagrees with the others."""
+    cause: Cause | None = None
+    """Of a value out of its limits; docs/operators.md has the table of all."""
 
     @property
     def is_share(self) -> bool:
@@ -164,6 +176,11 @@ def _over(part: float | None, whole: float | None) -> float | None:
     return None if part is None or not whole else float(part / whole)
 
 
+_SIGMA = Cause(
+    "The mission's sigma is too small, or the focal plane has changed.",
+    "Open the advice for the time of the alarm: it compares the noise of each tracker with its "
+    "sigma, and gives the lines to change.",
+)
 SILENCE = "silence_s"
 REJECTED = "innovation_rejected_share"
 
@@ -271,6 +288,11 @@ QUANTITIES: dict[str, Quantity] = {
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
             rolled_up=True,
             by_tracker=True,
+            cause=Cause(
+                "Fewer or fainter stars than usual, or a crowded or sparse region of the sky.",
+                "Open the worst batch. If its residuals are as predicted, wait until the region "
+                "has passed, or try the separation tolerance that the advice names.",
+            ),
         ),
         Quantity(
             "unmatched_share",
@@ -280,6 +302,13 @@ QUANTITIES: dict[str, Quantity] = {
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
             rolled_up=True,
             by_tracker=True,
+            cause=Cause(
+                "The a priori attitude drifts, so that stars lie beyond the edge of the zone; "
+                "or false stars: particles, planets, radiation.",
+                "Look at the angle from the a priori attitude. If it grows too, correct the a "
+                "priori attitude. If it stays the same, open the worst batch and look where its "
+                "false stars are.",
+            ),
         ),
         Quantity(
             "no_attitude_share",
@@ -287,6 +316,12 @@ QUANTITIES: dict[str, Quantity] = {
             "batches without attitude",
             BatchShare(lambda counts: counts["batches"] - counts["solved"]),
             lambda mission: above(0.1, 0.25, 0.5, hysteresis=0.03),
+            cause=Cause(
+                "Too few unique stars, or an a priori attitude that is wrong by more than the "
+                "zone covers.",
+                "Open a batch without an attitude: it states the reason. Try it as lost in "
+                "space; if that finds an attitude, correct the a priori attitude.",
+            ),
         ),
         Quantity(
             "suspect_share",
@@ -295,6 +330,11 @@ QUANTITIES: dict[str, Quantity] = {
             BatchShare(itemgetter("suspect")),
             lambda mission: above(0.1, 0.25, 0.5, hysteresis=0.03),
             by_tracker=True,
+            cause=Cause(
+                "A misidentified star, or two trackers that disagree.",
+                "Open a suspect batch and compare its trackers. The advice measures the "
+                "alignment of the one that has moved.",
+            ),
         ),
         Quantity(
             "residual_rms_arcsec",
@@ -305,6 +345,7 @@ QUANTITIES: dict[str, Quantity] = {
             lambda mission: LimitSettings(),
             rolled_up=True,
             by_tracker=True,
+            cause=_SIGMA,
         ),
         Quantity(
             "predicted_rms_arcsec",
@@ -323,6 +364,7 @@ QUANTITIES: dict[str, Quantity] = {
             description="Residual rms divided by the predicted rms; about 1.",
             rolled_up=True,
             by_tracker=True,
+            cause=_SIGMA,
         ),
         Quantity(
             "magnitude_offset_mag",
@@ -334,6 +376,13 @@ QUANTITIES: dict[str, Quantity] = {
             description="Observed minus catalog magnitude, mean over the unique stars.",
             rolled_up=True,
             by_tracker=True,
+            cause=Cause(
+                "Instrument drift: the tracker's magnitudes have shifted.",
+                "Run `acquire calibrate`, which estimates magnitudes too, or open the "
+                "calibration page; try the result over recorded batches, and adopt it. Until "
+                "then, widen the magnitude tolerance.",
+                calibrate=True,
+            ),
         ),
         Quantity(
             "a_priori_angle_deg",
@@ -344,6 +393,11 @@ QUANTITIES: dict[str, Quantity] = {
             description="Angle from the a priori attitude to the found one; without a priori roll, "
             "from the a priori boresight or pole.",
             rolled_up=True,
+            cause=Cause(
+                "The a priori attitude drifts, or a slew was not announced.",
+                "Check where the a priori attitude comes from. Until it is corrected, send the "
+                "batches as lost in space, or widen the zone.",
+            ),
         ),
         Quantity(
             "scale_offset_ppm",
@@ -357,6 +411,12 @@ QUANTITIES: dict[str, Quantity] = {
             "over catalog, less 1, in millionths: the error of the focal length.",
             rolled_up=True,
             by_tracker=True,
+            cause=Cause(
+                "Instrument drift: the focal length has changed.",
+                "Run `acquire calibrate` over the time of the alarm, or open the calibration "
+                "page; try the result over recorded batches, and adopt it.",
+                calibrate=True,
+            ),
         ),
         Quantity(
             "alignment_offset_arcsec",
@@ -369,6 +429,13 @@ QUANTITIES: dict[str, Quantity] = {
             "of a tracker, the mean over the others. Null with one tracker.",
             rolled_up=True,
             by_tracker=True,
+            cause=Cause(
+                "Instrument drift: a tracker has turned against the others. Of three trackers, "
+                "the one with the largest offset has moved.",
+                "Run `acquire calibrate` over the time of the alarm, or open the calibration "
+                "page; try the result over recorded batches, and adopt it.",
+                calibrate=True,
+            ),
         ),
         Quantity("batches_per_hour", "1/h", "batches per hour", Rate()),
         Quantity(
@@ -377,6 +444,11 @@ QUANTITIES: dict[str, Quantity] = {
             "silence",
             Gap(),
             lambda mission: above(None, 3600.0, 6 * 3600.0, minimum_count=1, duration_s=0.0),
+            cause=Cause(
+                "A fault of the telemetry link, or of the program that sends the batches.",
+                "Check that the sender runs and reaches the service, and whether its batches "
+                "are refused.",
+            ),
         ),
         Quantity(
             REJECTED,
@@ -385,6 +457,13 @@ QUANTITIES: dict[str, Quantity] = {
             SmoothedShare(),
             # Of good ones one in ten thousand is rejected.
             lambda mission: above(0.02, 0.05, 0.2, hysteresis=0.005, minimum_count=100),
+            cause=Cause(
+                "A star that is misidentified in every batch, a step of the clock, or a fault "
+                "of the gyro.",
+                "Open the innovations of that time. If the attitudes agree with each other, "
+                "check the clock and the gyro; the advice says whether the gyro is noisier than "
+                "the mission file states.",
+            ),
         ),
     )
 }

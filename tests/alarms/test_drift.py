@@ -10,6 +10,7 @@ import pytest
 
 from service.acquire import acquire
 from service.alarms.drift import MeanStars, alignment_offsets_arcsec, scale_offset_ppm
+from service.alarms.quantities import QUANTITIES
 from service.app.factory import open_app
 from service.missions.mission import parse_mission
 from service.observations.schema import submission_from_json
@@ -20,7 +21,6 @@ from service.sky.model import SkyModel
 from service.storage.recording.result_metrics import metrics_of
 from service.vectors import unit
 from service.web.app import create_app
-from service.web.console.pages.alarms import CAUSES
 from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
 from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, submission, twin
@@ -191,8 +191,9 @@ def test_an_alarm_of_drift_names_the_instrument_and_leads_to_the_calibration(cli
     assert {each["severity"] for each in drifted} == {"critical"}
     page = client.get(f"/alarms/{drifted[0]['id']}").raise_for_status().text
     text = re.sub(r"\s+", " ", page)
-    assert CAUSES["alignment_offset_arcsec"].cause in text
-    assert "acquire calibrate" in CAUSES["alignment_offset_arcsec"].remedy
+    cause = QUANTITIES["alignment_offset_arcsec"].cause
+    assert cause.cause in text
+    assert "acquire calibrate" in cause.remedy
     assert 'href="/spacecraft/TWO/calibration"' in page
     assert client.get("/spacecraft/TWO/calibration").status_code == 200
     trends = client.get("/spacecraft/TWO").raise_for_status().text

@@ -3,7 +3,7 @@
 from service.storage.projections import rollups
 from service.storage.recording.ids import Ulids
 from service.storage.sql.statements import insert_all, insert_runs
-from service.storage.sql.tables import batches, results
+from service.storage.sql.tables import MEASURED, batches, results
 from service.times import HOUR_S, parse_utc
 
 
@@ -43,12 +43,12 @@ def result_row(app, time, *, spacecraft="XTE", run="live", name="b", **values):
         "unmatched": 0,
         "status": "good",
         "reason": None,
+        **dict.fromkeys(MEASURED),
         "residual_rms_arcsec": 2.0,
         "predicted_rms_arcsec": 2.0,
         "magnitude_offset_mag": 0.0,
         "a_priori_angle_deg": 1.0,
         "scale_offset_ppm": 0.0,
-        "alignment_offset_arcsec": None,
         "answer": "{}",
     } | values
     return batch, result

@@ -10,7 +10,6 @@ from service.alarms.quantities import QUANTITIES, limited_names
 from service.app.factory import open_app
 from service.web.app import create_app
 from service.web.console.formatting import with_day_of_year
-from service.web.console.pages.alarms import CAUSES
 from tests.fresh_databases import sqlite_at
 from tests.web import fleet
 from tests.web.serving import Server, in_process_settings
@@ -39,17 +38,16 @@ def text_of(page):
 
 
 def test_every_limit_as_shipped_has_a_cause_and_the_guide_has_the_same():
-    assert set(CAUSES) == set(limited_names())
     guide = OPERATORS.read_text(encoding="utf-8")
-    for name, known in CAUSES.items():
-        assert f"| {QUANTITIES[name].label} | {known.cause} | {known.remedy} |" in guide
+    for known in map(QUANTITIES.get, limited_names()):
+        assert f"| {known.label} | {known.cause.cause} | {known.cause.remedy} |" in guide
 
 
 def test_the_page_of_an_alarm_says_why_and_what_to_do(fleet_client):
     alarm = alarm_of(fleet_client, "unmatched_share")
     text = text_of(fleet_client.get(f"/alarms/{alarm['id']}"))
-    assert CAUSES["unmatched_share"].cause in text
-    assert CAUSES["unmatched_share"].remedy in text
+    assert QUANTITIES["unmatched_share"].cause.cause in text
+    assert QUANTITIES["unmatched_share"].cause.remedy in text
     assert "bound of" in text
     # The fifth of the six has the same quantity, and the others have other ones.
     others = set(fleet.troubled(SIZE)) - {alarm["spacecraft"]}

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-HEAD = "0017"
+HEAD = max(each.name[:4] for each in shipped("migrations", "versions").glob("[0-9]*.py"))
 """The latest revision of `migrations/`."""
 UNFINISHED = "copy:"
 """How the revision of a database begins that `upkeep.copy` has not copied to its end."""

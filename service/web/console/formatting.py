@@ -199,7 +199,11 @@ def quantity(value: float | None, name: str) -> str:
     if value is None:
         return DASH
     known = quantity_named(name)
-    return share(value) if known.is_share else UNITS.get(known.unit, number)(value)
+    if known.is_share:
+        return share(value)
+    if (shown := UNITS.get(known.unit)) is not None:
+        return shown(value)
+    return number(value) if known.unit in ("", "1") else f"{number(value)}{THIN}{known.unit}"
 
 
 def unit_of(name: str) -> str:

@@ -333,7 +333,7 @@ CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
     ("rate", "Batches per hour", ("batches_per_hour",)),
 )
 """Id, title and quantities of the charts; every other quantity gets one of its own."""
-UNITS = {"arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
+UNITS = {"1": "", "arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
 
 
 TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
@@ -373,7 +373,7 @@ def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
         "id": id,
         "title": title,
         "percent": first.is_share,
-        "unit": " %" if first.is_share else UNITS.get(first.unit, ""),
+        "unit": " %" if first.is_share else UNITS.get(first.unit, f" {first.unit}"),
         "quantities": [{"name": name, "label": QUANTITIES[name].label} for name in names],
     }
 
