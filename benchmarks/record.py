@@ -33,7 +33,6 @@ CORE = (
     ":!service/acquire/camera_calibration.py",
     ":!service/acquire/frame_submission.py",
     ":!service/acquire/picture.py",
-    ":!service/acquire/picture.py",
     ":!service/identify/blind",
 )
 """What the answer to a batch depends on.  `:!` leaves out a file or a folder, as in git."""
@@ -41,7 +40,6 @@ SIMULATOR = (
     "service/simulate",
     "tests/reference",
     ":!service/simulate/frames.py",
-    ":!service/simulate/frame_files.py",
 )
 IMAGING = (
     "service/imaging",

@@ -22,8 +22,7 @@ from tqdm import tqdm
 from service.app.factory import App, open_app
 from service.missions.mission import load_missions
 from service.settings import Settings
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass

@@ -21,7 +21,7 @@ from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.storage.sql.packed_text import LEVEL
+from service.storage.sql.columns import LEVEL
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 BATCHES, BYTES = 400, 8192

@@ -19,26 +19,22 @@ from typing import Any, Self
 import httpx
 import msgspec
 
-from service.acquire.kernel_build import KernelBuild
+from service.acquire.kernel_build import KernelBuild, kernel_progress
 from service.errors import BadConfiguration, BadInput, Busy, Fault
-from service.ingest.kernel_progress import kernel_progress
 from service.missions.mission import load_missions
 from service.replay.items import items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.resources import shipped
-from service.settings import PREFIX, Settings
-from service.simulate.files import read_objects, truth_path, write_pass
+from service.settings import PREFIX, Settings, require_free, url_of
 from service.simulate.gyro import GyroWanted, with_gyro
-from service.simulate.score import Score, score, together
-from service.simulate.score_table import table
+from service.simulate.score import Score, score, score_table, together
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import draw_pass, read_objects, truth_path, write_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.times import HOUR_S
-from service.web.ports import require_free, url_of
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 START = "1999-03-01T00:00:00.000Z"
@@ -112,7 +108,7 @@ def run_demo(
             seconds = {"seconds": whole_s, "seconds_until_ready": ready_s}
             _print_json({"run": run, "url": url, **seconds, "scores": rows_of(scores)})
         else:
-            print(table(scores))
+            print(score_table(scores))
             print()
             print(f"That took {whole_s:.1f} s, {ready_s:.1f} s of them until the server was ready.")
             print("Where to look next:")

@@ -35,8 +35,7 @@ from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
 from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.decompress import unpacked_lines
-from service.observations.readers.lines import MAX_LINE_BYTES
+from service.observations.readers.decompress import MAX_LINE_BYTES, unpacked_lines
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
 from service.packets.definition import PacketDefinition

@@ -8,15 +8,14 @@ import pytest
 
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json
-from service.replay.carry_attitude import AttitudeCarrier, turned
+from service.replay.from_file import AttitudeCarrier, turned
 from service.replay.in_process import replay_in_process
 from service.replay.items import LineOutcome, items_of
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import Settings
-from service.simulate.files import read_objects
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import draw_pass, read_objects
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion, quaternion_from_matrix
 from service.web.app import create_app
 from tests.web.serving import Server

@@ -18,10 +18,10 @@ import pytest
 
 from service import __version__
 from service.acquire import kernel_build
-from service.cli.parser import build_parser
+from service.cli import build_parser
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.readers.csv_columns import COLUMNS
-from service.simulate.files import read_objects
+from service.simulate.telemetry import read_objects
 from service.times import parse_utc
 from tests.fresh_databases import sqlite_at
 from tests.sky.test_sky2000 import SIRIUS, written
@@ -133,7 +133,7 @@ def packages(modules):
 
 
 def test_help_loads_nothing_that_takes_time():
-    loaded = loaded_by("from service.cli.parser import build_parser; build_parser().format_help()")
+    loaded = loaded_by("from service.cli import build_parser; build_parser().format_help()")
     assert packages(loaded) <= {"service", "msgspec", "typing_extensions"}
     assert {each for each in loaded if each.startswith("service.") and each.count(".") == 1} == {
         *("service.cli", "service.compiled", "service.csv_cells", "service.errors"),

@@ -16,14 +16,12 @@ import numba
 import pytest
 
 from service import demo as demonstration
-from service.acquire.kernel_build import mark_built
+from service.acquire.kernel_build import KERNEL_BYTES, mark_built
 from service.cli import main
 from service.demo import MISSIONS
-from service.ingest.kernel_progress import KERNEL_BYTES
 from service.settings import Settings
-from service.simulate.files import read_objects, truth_path
-from service.simulate.score import Score, score
-from service.simulate.score_table import table
+from service.simulate.score import Score, score, score_table
+from service.simulate.telemetry import read_objects, truth_path
 from tests.scale import draws, is_full
 
 BATCHES = draws(100, 300)
@@ -294,4 +292,4 @@ def test_a_score_counts_wrong_names_and_compares_errors_with_their_sigma():
 
 
 def test_a_pass_without_stars_has_a_table_all_the_same():
-    assert "nan" in table({"XTE": {"nominal": Score()}})
+    assert "nan" in score_table({"XTE": {"nominal": Score()}})

@@ -15,15 +15,13 @@ from service.app.factory import open_app
 from service.errors import BadFile, BadInput, Busy, Forbidden, NotFound, Unauthenticated
 from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.schema import BatchIn
-from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of, run_name
-from service.replay.over_http import replay_over_http
+from service.replay.over_http import replay_in_bulk, replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import Settings
-from service.simulate.files import read_objects
 from service.simulate.stretches import Pass, Trouble, Troubles
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import draw_pass, read_objects
 from service.storage.queries.replays import mark_interrupted
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at

@@ -16,8 +16,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from service.missions.mission import SHIPPED_FOLDER, Mission, load_missions
-from service.simulate.frame_files import FrameFormat, frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameFormat, FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass, PriorKind, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache

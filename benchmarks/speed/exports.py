@@ -29,8 +29,8 @@ from benchmarks.speed.fill_database import fill
 from service.products.attitudes import AttitudeRows, SeriesInfo, series_of
 from service.products.formats import write_attitudes, write_table
 from service.products.tables import Table
-from service.storage.queries.tables.result_tables import BATCH_COLUMNS
-from service.storage.queries.tables.result_tables import BATCHES as BATCHES_READ
+from service.storage.queries.result_tables import BATCH_COLUMNS
+from service.storage.queries.result_tables import BATCHES as BATCHES_READ
 from service.times import parse_utc, shifted
 
 DAY, QUICK_DAY = 86_400, 3_600

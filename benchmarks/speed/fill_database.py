@@ -28,17 +28,21 @@ from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.storage.recording.ids import Ulids
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.tables import (
     COUNTS,
     MAXIMA,
+    MEASURED,
     MINIMA,
     SHARES,
     SUMS,
     VALUES,
+    batches,
+    results,
     rollups_daily,
     rollups_hourly,
+    runs,
+    solutions,
 )
-from service.storage.sql.tables import MEASURED, batches, results, runs, solutions
 from service.times import DAY_S, HOUR_S, UNIX_DAY, parse_utc
 
 DEFAULT_BATCHES = 5_000_000

@@ -23,8 +23,7 @@ from benchmarks.record import IMAGING
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.imaging.centroids.centroid import METHODS, centroid
-from service.imaging.centroids.psf import GaussianPsf, Psf
-from service.imaging.centroids.sampled_psf import airy_psf
+from service.imaging.centroids.psf import GaussianPsf, Psf, airy_psf
 from service.imaging.centroids.window import Detector, cutout
 from studies.star_image_report.windows import WindowStar, draw_stars, flux_of_peak
 

@@ -35,14 +35,12 @@ from service.errors import NotAvailable
 from service.imaging.detection.detect import detect, detection_kernel
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import Frame, FrameLimits
-from service.imaging.overlay import draw_overlay
-from service.imaging.overlay_marks import marks_of
+from service.imaging.overlay import draw_overlay, marks_of
 from service.imaging.submit import read_known, submission_of_frame
 from service.missions.camera import Camera
 from service.missions.mission import Mission, load_missions
 from service.observations.schema import Submission, submission_from_json
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import DrawnFrame, FrameSettings, draw_frames
+from service.simulate.frames import DrawnFrame, FrameSettings, draw_frames, frame_bytes
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -74,7 +72,7 @@ CROSSED = "\n<!-- crossed wires -->\n"
 PICTURE = ROOT / "docs" / "images" / "overlay.png"
 
 
-SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py", "service/simulate/frame_files.py")
+SOURCES = (*CORE, *IMAGING, "service/simulate/frames.py")
 
 
 @dataclass

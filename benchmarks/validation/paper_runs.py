@@ -17,7 +17,7 @@ from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from service.simulate.drawing import Folder
-from studies.paper_1994.document import document
+from studies.paper_1994.command import document
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.plots import draw
 from studies.paper_1994.printed import Run, the_paper

@@ -8,16 +8,21 @@ import hashlib
 import json
 import re
 import secrets
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, get_args
+from typing import Any, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
+from service.access.audit import Entry
 from service.errors import BadInput, Conflict, Fault, Forbidden, NotFound, shown_value
-from service.storage.models.access import Scope, Token, TokenState
+from service.missions.mission import Mission, mission_named
+from service.storage.models.access import NewToken, Scope, Token, TokenState
 from service.storage.recording.identity import OwnKey
+from service.storage.recording.ids import Ulids
 from service.storage.sql.access_tables import access_sessions, access_tokens
+from service.times import DAY_S, shifted, utc_now
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 
@@ -212,3 +217,79 @@ def _caller(connection: Connection, condition: object, moment: str) -> Caller | 
         row["id"],
         row["rate_per_s"],
     )
+
+
+MAX_DAYS = 3660
+DEFAULT_DAYS = 365
+
+
+class Database(Protocol):
+    """Reads, and changes together with the audit list."""
+
+    def reading(self) -> AbstractContextManager[Connection]:
+        """A connection that sees one moment of the database."""
+
+    def change_audited(self, change: Callable[[Connection], Any], entry: Entry | None) -> Any:
+        """Change the database in one transaction, with an entry in the audit list."""
+
+
+class Tokens:
+    """Makes, lists and revokes tokens.  `entry` goes to the audit list with a change."""
+
+    def __init__(self, database: Database, missions: Mapping[str, Mission]) -> None:
+        self._database, self._missions = database, missions
+        self._ids = Ulids()
+
+    def all(self) -> list[Token]:
+        """Every token without its secret, the oldest first."""
+        with self._database.reading() as connection:
+            return list_tokens(connection, utc_now().text)
+
+    def add(
+        self,
+        name: str,
+        scopes: Collection[str],
+        *,
+        spacecraft: Collection[str] | None = None,
+        days: int = DEFAULT_DAYS,
+        rate_per_s: float | None = None,
+        entry: Entry | None = None,
+    ) -> NewToken:
+        """Make a token; its secret is in the answer alone.
+
+        Raises `BadInput` for what cannot be and `Conflict` for a name that was used before.
+        """
+        for each in spacecraft or ():
+            # A misspelt name would bind the token to nothing.
+            mission_named(self._missions, each)
+        secret, id, created = new_secret(), self._ids.new(), utc_now()
+
+        def change(connection: Connection) -> Token:
+            add_token(
+                connection,
+                id=id,
+                name=name,
+                secret=secret,
+                scopes=scopes,
+                spacecraft=spacecraft,
+                rate_per_s=rate_per_s,
+                created=created.text,
+                expires=shifted(created, days * DAY_S).text,
+            )
+            return read_token(connection, name, created.text)
+
+        made = self._database.change_audited(change, entry)
+        return NewToken(
+            token=secret, **{each: getattr(made, each) for each in Token.__struct_fields__}
+        )
+
+    def revoke(self, name: str, entry: Entry | None = None) -> Token:
+        """End a token and the sessions begun with it; raises `NotFound`."""
+
+        def change(connection: Connection) -> Token:
+            moment = utc_now().text
+            revoke_token(connection, name, moment)
+            return read_token(connection, name, moment)
+
+        revoked: Token = self._database.change_audited(change, entry)
+        return revoked

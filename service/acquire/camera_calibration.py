@@ -133,7 +133,7 @@ def calibrate_camera(
         exposure_s=float(np.median(exposures)) if exposures else None,
         faintest_mag=float(np.percentile(magnitudes, 80.0)),
         pictures=len(results),
-        remarks=tuple(_remarks(lens, covariance, zero)),
+        remarks=tuple(_remarks(covariance, zero)),
     )
 
 
@@ -199,7 +199,7 @@ def _fit(lens: Lens, views: Sequence[_View], parameters: int) -> tuple[Lens, Mat
     return lens_of(lens, names, free), np.asarray(np.linalg.inv(normal), dtype=np.float64)
 
 
-def _remarks(lens: Lens, covariance: Matrix, zero: Vector) -> list[str]:
+def _remarks(covariance: Matrix, zero: Vector) -> list[str]:
     """What the pictures did not show."""
     remarks = []
     if math.sqrt(covariance[1, 1]) > OBSERVABLE * BEND_PRIOR:

@@ -12,14 +12,13 @@ from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, s
 from service.identify.blind.lens import Lens
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
-from service.imaging.frames.preview import preview_png
 from service.imaging.submit import (
     FrameIn,
     batch_of_stars,
     choices_of,
+    preview_png,
     submission_of_frame,
     time_of,
-    with_exposure,
 )
 from service.missions.camera import Camera
 from service.missions.mission import Mission
@@ -67,7 +66,8 @@ def _of_unknown_lens(
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
-    frame = with_exposure(frame, known.exposure_s or frame.exposure_s or camera.exposure_s)
+    exposure_s = known.exposure_s or frame.exposure_s or camera.exposure_s
+    frame = replace(frame, exposure_s=exposure_s)
     read = perf_counter_ns()
     sky, solver = blind_sky(catalog, round(parse_utc(time).julian_year))
     result = solve_picture(_without_time(frame), sky, solver, camera.focal_length_px)

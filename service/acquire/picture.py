@@ -25,8 +25,8 @@ from service.imaging.detection.points import (
     PointSources,
     find_points,
 )
+from service.imaging.frames.exif import is_by_rows, mirrored
 from service.imaging.frames.frame import Frame, require_light
-from service.imaging.frames.orientation import is_by_rows, mirrored
 from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
 from service.sky.catalog.proper_names import PROPER_NAMES
 from service.sky.catalog.star_catalog import Catalog

@@ -17,12 +17,12 @@ from msgspec.structs import replace
 
 from service import __version__
 from service.acquire.choices import aberration_velocity, choices_of
-from service.acquire.measured import measured_solution
 from service.acquire.result import (
     Acquisition,
     Path,
     Provenance,
     RivalAttitude,
+    measured_solution,
     outcome_counts,
     tracker_results,
     unmatched_results,

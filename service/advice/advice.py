@@ -121,7 +121,7 @@ def advise(
         noise=tuple(noise_findings(mission, evidence)),
         magnitudes=tuple(magnitude_findings(mission, evidence)),
         alignment=tuple(alignment_findings(mission, evidence)),
-        trials=tuple(_trials(mission, tolerances, sample, run, own or {}, pace)),
+        trials=tuple(_trials(tolerances, sample, run, own or {}, pace)),
         refused=sample.refused,
         refusal=sample.refusal,
         uses_voting=any(
@@ -152,14 +152,13 @@ class _SampledBatches:
 
 
 def _trials(
-    mission: Mission,
     findings: Sequence[ToleranceFinding],
     sample: _SampledBatches,
     run: RunAgain,
     own: Mapping[str, float],
     pace: WorkLimit,
 ) -> list[VariantOutcome]:
-    present, by_probability, *others = variants(mission, findings, own)
+    present, by_probability, *others = variants(findings, own)
     counts: dict[Variant, list[TrialCounts]] = {each: [] for each in (present, *others)}
     for batch, sure, _ in sample.cases:
         if not pace.in_time(1.0):

@@ -16,7 +16,7 @@ from service.acquire import Acquisition
 from service.advice.intervals import Z95, Interval
 from service.advice.tolerances import ToleranceFinding
 from service.identify.identification import Identification
-from service.missions.mission import Identifier, Mission
+from service.missions.mission import Identifier
 from service.observations.batch import ObservationBatch
 
 PRESENT = "present settings"
@@ -80,9 +80,7 @@ class VariantOutcome:
         return 100.0 * (self.ambiguous + self.unmatched) / self.observed if self.observed else 0.0
 
 
-def variants(
-    mission: Mission, findings: Sequence[ToleranceFinding], own: Mapping[str, float]
-) -> Iterator[Variant]:
+def variants(findings: Sequence[ToleranceFinding], own: Mapping[str, float]) -> Iterator[Variant]:
     """The variants to try: both identifiers, each tolerance halved, doubled and as recommended.
 
     `own` are requested values, tried together.  The tolerances belong

@@ -12,21 +12,25 @@ of its name in `results`; and for `rolled_up`, of a share or a value, the column
 were recorded before it have no value of it.
 """
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
+import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from service.alarms import measurements
 from service.alarms.limits import LimitSettings, about_zero, above
 from service.alarms.window import Sample
 from service.missions.mission import Band, Mission
+from service.vectors import separation_deg
 
 if TYPE_CHECKING:
     from service.acquire import Acquisition
+    from service.alarms.drift import MeanStars
+
 
 Counts = Mapping[str, Any]
 """`batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`: the counts of
@@ -179,6 +183,100 @@ _SIGMA = Cause(
 )
 SILENCE = "silence_s"
 REJECTED = "innovation_rejected_share"
+
+
+def residual_rms_arcsec(acquisition: "Acquisition") -> float | None:
+    """The rms of the attitude's residuals; None without an attitude from stars."""
+    solution = acquisition.solution
+    return None if solution is None else _known(solution.residual_rms_arcsec)
+
+
+def predicted_rms_arcsec(acquisition: "Acquisition") -> float | None:
+    """The residual rms that the covariance predicts; None without an attitude from stars."""
+    solution = acquisition.solution
+    return None if solution is None else _known(solution.predicted_rms_arcsec)
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
+
+
+def magnitude_offset_mag(acquisition: "Acquisition") -> float | None:
+    """The mean of observed less catalog magnitude over the unique stars.
+
+    None where no unique star has a magnitude.
+    """
+    catalog_mag = acquisition.run_catalog.magnitude_mag
+    offsets = []
+    for each in acquisition.trackers:
+        star, observed_mag = each.identification.star, each.corrected.magnitude_mag
+        # Row -1, no star, reads the last star's magnitude; it is left out.
+        known = zip(star.tolist(), observed_mag.tolist(), catalog_mag[star].tolist(), strict=True)
+        offsets += [mag - known_mag for row, mag, known_mag in known if row >= 0 and mag == mag]
+    return math.fsum(offsets) / len(offsets) if offsets else None
+
+
+def scale_offset_ppm(acquisition: "Acquisition") -> float | None:
+    """How much larger the stars' distances are than the catalog's, in millionths.
+
+    None without an attitude, or where the stars are too close together.
+    """
+    from service.alarms import drift
+
+    means = _mean_stars(acquisition)
+    return drift.scale_offset_ppm(means) if means else None
+
+
+def alignment_offset_arcsec(acquisition: "Acquisition") -> float | None:
+    """How much larger the angles between trackers are than the catalog's, as a mean.
+
+    None without an attitude, or where fewer than two trackers have unique stars.
+    """
+    from service.alarms import drift
+
+    if len(acquisition.trackers) == 1:
+        return None
+    offsets = [
+        each
+        for each in drift.alignment_offsets_arcsec(_mean_stars(acquisition))
+        if each is not None
+    ]
+    return math.fsum(offsets) / len(offsets) if offsets else None
+
+
+def _mean_stars(acquisition: "Acquisition") -> list["MeanStars"]:
+    """The mean directions of every tracker; none without an attitude."""
+    # Only what records an acquisition needs the ephemeris.
+    from service.alarms.drift import mean_stars
+
+    if acquisition.solution is None:
+        return []
+    return mean_stars(
+        acquisition.batch,
+        [each.corrected for each in acquisition.trackers],
+        [each.identification.star for each in acquisition.trackers],
+        acquisition.run_catalog.direction_at(acquisition.batch.time),
+    )
+
+
+def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:
+    """The angle from the a priori attitude to the one found; None without either.
+
+    Where the a priori gives an axis alone, the pole of a band or the boresight
+    of a cap, the angle between that axis and where it was found to be.
+    """
+    if acquisition.solution is None or acquisition.prior is None:
+        return None
+    prior = acquisition.prior
+    attitude = acquisition.solution.matrix
+    if prior.known_axis is not None:
+        axis = np.dot(prior.axis_body(acquisition.mission), attitude)
+        return separation_deg(axis, prior.known_axis)
+    # The Frobenius norm of A - B is 2 sqrt(2) sin(angle / 2).
+    apart = math.dist(attitude.ravel().tolist(), prior.attitude.ravel().tolist())
+    return math.degrees(2.0 * math.asin(min(1.0, apart / math.sqrt(8.0))))
+
+
 QUANTITIES: dict[str, Quantity] = {
     each.name: each
     for each in (
@@ -242,7 +340,7 @@ QUANTITIES: dict[str, Quantity] = {
             "residual_rms_arcsec",
             "arcsec",
             "residual rms",
-            Measured(measurements.residual_rms_arcsec),
+            Measured(residual_rms_arcsec),
             # The normal value depends on the tracker; the ratio below takes that into account.
             lambda mission: LimitSettings(),
             rolled_up=True,
@@ -253,7 +351,7 @@ QUANTITIES: dict[str, Quantity] = {
             "predicted_rms_arcsec",
             "arcsec",
             "predicted residual rms",
-            Measured(measurements.predicted_rms_arcsec),
+            Measured(predicted_rms_arcsec),
             rolled_up=True,
             by_tracker=True,
         ),
@@ -272,7 +370,7 @@ QUANTITIES: dict[str, Quantity] = {
             "magnitude_offset_mag",
             "mag",
             "magnitude offset",
-            Measured(measurements.magnitude_offset_mag),
+            Measured(magnitude_offset_mag),
             lambda mission: about_zero(0.2, 0.35, 0.6, hysteresis=0.03),
             worse="size",
             description="Observed minus catalog magnitude, mean over the unique stars.",
@@ -290,7 +388,7 @@ QUANTITIES: dict[str, Quantity] = {
             "a_priori_angle_deg",
             "deg",
             "angle from the a priori attitude",
-            Measured(measurements.a_priori_angle_deg),
+            Measured(a_priori_angle_deg),
             _a_priori_limits,
             description="Angle from the a priori attitude to the found one; without a priori roll, "
             "from the a priori boresight or pole.",
@@ -305,7 +403,7 @@ QUANTITIES: dict[str, Quantity] = {
             "scale_offset_ppm",
             "ppm",
             "scale offset",
-            Measured(measurements.scale_offset_ppm),
+            Measured(scale_offset_ppm),
             # The normal value depends on the tracker; docs/alarms.md says how to set limits.
             lambda mission: LimitSettings(),
             worse="size",
@@ -324,7 +422,7 @@ QUANTITIES: dict[str, Quantity] = {
             "alignment_offset_arcsec",
             "arcsec",
             "alignment offset",
-            Measured(measurements.alignment_offset_arcsec),
+            Measured(alignment_offset_arcsec),
             lambda mission: LimitSettings(),
             worse="size",
             description="Angle between the unique stars of two trackers, observed minus catalog; "

@@ -1,26 +1,49 @@
-"""Advice on a mission's settings from recorded batches; see `service.advice`."""
+"""Advice on a mission's settings from recorded batches, as the API and the command show it."""
 
 import math
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from service.acquire.choices import idle_reason
-from service.advice.advice import WorkLimit, advise
-from service.advice.innovation_statements import innovation_findings
-from service.advice.innovations import innovation_noise
-from service.advice.zone_statements import zone_statements
-from service.app.advice_record import advice_record
+from service.advice.advice import Findings, WorkLimit, advise
+from service.advice.innovations import InnovationFinding, innovation_findings, innovation_noise
+from service.advice.intervals import Interval
+from service.advice.statements import (
+    Statement,
+    alignment_statement,
+    group_statements,
+    magnitude_statement,
+    noise_statement,
+    tolerance_statement,
+    zone_statements,
+)
+from service.advice.tolerances import ToleranceFinding
+from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
+from service.advice.trials import VariantOutcome
 from service.app.context import Context
 from service.app.submissions import Submissions
 from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
-from service.storage.models.advice import Advice
+from service.storage.models.advice import (
+    Advice,
+    AlignmentAdvice,
+    Change,
+    Estimate,
+    GroupAdvice,
+    InnovationAdvice,
+    MagnitudeAdvice,
+    NoiseAdvice,
+    NoisePeriodAdvice,
+    ToleranceAdvice,
+    Trial,
+    ZoneAdvice,
+)
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import sample_batches
+from service.storage.queries.recorded_batch import BatchSample, sample_batches
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 
@@ -82,3 +105,182 @@ class AdviceService:
             self._lock.release()
         noise = innovation_findings(innovation_noise(met), mission, findings.noise)
         return advice_record(name, run or LIVE, drawn, findings, zone, noise)
+
+
+def advice_record(
+    spacecraft: str,
+    run: str,
+    sample: BatchSample,
+    findings: Findings,
+    zone: Sequence[Statement],
+    innovations: Sequence[InnovationFinding] = (),
+) -> Advice:
+    """The findings with their figures and sentences, the trials, and the lines to change."""
+    tolerances = [(each, tolerance_statement(each, findings)) for each in findings.tolerances]
+    noise = [(each, noise_statement(each)) for each in findings.noise]
+    magnitudes = [(each, magnitude_statement(each, findings)) for each in findings.magnitudes]
+    alignment = [(each, alignment_statement(each)) for each in findings.alignment]
+    statements = [*zone]
+    statements += [
+        each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs
+    ]
+    statements += [each.statement for each in innovations]
+    return Advice(
+        spacecraft=spacecraft,
+        run=run,
+        first=sample.first,
+        last=sample.last,
+        batches_in_range=sample.total,
+        batches_sampled=findings.sampled,
+        batches_identified=findings.identified,
+        batches_refused=findings.refused,
+        refusal=findings.refusal,
+        mission=findings.mission.digest,
+        identifier=findings.mission.identifier,
+        groups=[
+            GroupAdvice(action=each.action, text=each.text) for each in group_statements(findings)
+        ],
+        zone=[ZoneAdvice(action=each.action, text=each.text) for each in zone],
+        tolerances=[_tolerance(*each, findings.uses_voting) for each in tolerances],
+        noise=[_noise(*each) for each in noise],
+        magnitudes=[_magnitude(*each) for each in magnitudes],
+        alignment=[_alignment(*each) for each in alignment],
+        innovations=[_innovation(each) for each in innovations],
+        tried=[_trial(each) for each in findings.trials],
+        changes=_changes(statements),
+    )
+
+
+def _tolerance(finding: ToleranceFinding, statement: Statement, is_used: bool) -> ToleranceAdvice:
+    return ToleranceAdvice(
+        tolerance=finding.tolerance.name,
+        symbol=finding.symbol,
+        unit=finding.tolerance.unit,
+        now=finding.now,
+        verdict=finding.verdict if is_used else "not_used",
+        confidence=finding.confidence if is_used else "none",
+        differences=finding.differences,
+        batches=finding.batches,
+        needed=_estimate(finding.needed),
+        share_beyond=_estimate(finding.beyond),
+        recommended=finding.recommended,
+        action=statement.action,
+        text=statement.text,
+    )
+
+
+def _noise(finding: NoiseFinding, statement: Statement) -> NoiseAdvice:
+    return NoiseAdvice(
+        tracker=finding.tracker,
+        now_arcsec=finding.now_arcsec,
+        sigma_arcsec=_estimate(finding.sigma_arcsec),
+        batches=finding.batches,
+        verdict=finding.verdict,
+        worst=_noise_period(finding.worst),
+        action=statement.action,
+        text=statement.text,
+    )
+
+
+def _noise_period(found: NoisePeriod | None) -> NoisePeriodAdvice | None:
+    if found is None:
+        return None
+    return NoisePeriodAdvice(
+        sigma_arcsec=_bounded(found.sigma_arcsec),
+        batches=found.batches,
+        first=found.first.text,
+        last=found.last.text,
+    )
+
+
+def _magnitude(finding: MagnitudeFinding, statement: Statement) -> MagnitudeAdvice:
+    return MagnitudeAdvice(
+        tracker=finding.tracker,
+        pivot_mag=None if math.isnan(finding.pivot_mag) else finding.pivot_mag,
+        offset_mag=_estimate(finding.offset_mag),
+        scale=_estimate(finding.scale),
+        now_sigma_mag=finding.now_sigma_mag,
+        scatter_mag=_estimate(finding.scatter_mag),
+        stars=finding.stars,
+        verdict=finding.verdict,
+        scatter_verdict=finding.scatter_verdict,
+        action=statement.action,
+        text=statement.text,
+    )
+
+
+def _alignment(finding: AlignmentFinding, statement: Statement) -> AlignmentAdvice:
+    rotation, axes = finding.rotation_arcsec, finding.axes_body
+    return AlignmentAdvice(
+        tracker=finding.tracker,
+        reference=finding.reference,
+        rotation_arcsec=None if rotation is None else [_bounded(part) for part in rotation],
+        axes_body=None if axes is None else [list(axis) for axis in axes],
+        batches=finding.batches,
+        verdict=finding.verdict,
+        action=statement.action,
+        text=statement.text,
+    )
+
+
+def _innovation(finding: InnovationFinding) -> InnovationAdvice:
+    return InnovationAdvice(
+        subject=finding.subject,
+        ratio=_estimate(finding.ratio),
+        measurements=finding.measurements,
+        action=finding.statement.action,
+        text=finding.statement.text,
+    )
+
+
+def _trial(outcome: VariantOutcome) -> Trial:
+    return Trial(
+        name=outcome.variant.name,
+        identifier=outcome.variant.identifier,
+        tolerances=dict(outcome.variant.tolerances),
+        batches=outcome.batches,
+        observed=outcome.observed,
+        unique=outcome.unique,
+        ambiguous=outcome.ambiguous,
+        unmatched=outcome.unmatched,
+        named_otherwise=outcome.other_star,
+        change_points=_estimate(outcome.change),
+    )
+
+
+def _changes(statements: Iterable[Statement]) -> list[Change]:
+    """The lines to write, a key of a table once: trackers may share one."""
+    lines: dict[tuple[str, str | None, str], Change] = {}
+    for each in (change for statement in statements for change in statement.changes):
+        key = each.table, each.tracker, each.line.partition(" = ")[0]
+        lines.setdefault(key, Change(table=each.table, tracker=each.tracker, line=each.line))
+    return list(lines.values())
+
+
+def _estimate(found: Interval | None) -> Estimate | None:
+    return None if found is None else _bounded(found)
+
+
+def _bounded(found: Interval) -> Estimate:
+    """The interval, with null for a bound that the sample does not give."""
+    low, high = (part if math.isfinite(part) else None for part in (found.low, found.high))
+    return Estimate(value=found.value, low=low, high=high)
+
+
+def no_changes_text(advice: Advice) -> str:
+    """The text shown when no line of the mission file should change."""
+    findings = (
+        advice.groups,
+        advice.zone,
+        advice.tolerances,
+        advice.noise,
+        advice.magnitudes,
+        advice.alignment,
+        advice.innovations,
+    )
+    actions = {each.action for found in findings for each in found}
+    if actions - {"keep", "wait"}:
+        return "No line of the mission file corrects these findings: each sentence says what to do."
+    if "wait" in actions:
+        return "The batches so far give no reason to change the mission file."
+    return "Nothing in the mission file needs to change."

@@ -1,19 +1,45 @@
-"""Alarms: lists, one with its history, and what operators do about them."""
+"""Limits, alarms and what operators do about them, and annotations."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
+from typing import cast
+
+import msgspec
+from sqlalchemy import Connection
 
 from service.access.audit import Entry
 from service.alarms import state_machine
-from service.alarms.subjects import limited_trackers
+from service.alarms.limits import LimitSettings
+from service.alarms.quantities import REJECTED, SILENCE, QuantityName, tracker_names
+from service.alarms.subjects import limited_trackers, subject_of
+from service.alarms.window import Preview, Sample, preview_of, preview_of_gaps
 from service.app.context import ALL_RUNS, Context, known_id
-from service.storage.models.alarms import Alarm, AlarmSpan, AlarmWithActions
+from service.errors import BadBatch, Fault, shown_value
+from service.ingest.solver_pool import mission_in_input
+from service.missions.mission import Mission, mission_named
+from service.storage.grades.period import rejected_samples
+from service.storage.models.alarms import (
+    Alarm,
+    AlarmSpan,
+    AlarmWithActions,
+    Annotation,
+    Limit,
+    LimitExcursion,
+    LimitHistory,
+    LimitPreview,
+    LimitTrial,
+    SeverityName,
+)
 from service.storage.models.base import Page
-from service.storage.projections.silence import evaluate_by_clock, is_due_by_clock
-from service.storage.queries import alarms
-from service.storage.queries.period.alarms import TimeOut, alarm_spans, times_out
+from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
+from service.storage.queries import alarms, limits
+from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
+from service.storage.queries.pages import ResultFilter
+from service.storage.recording import events
+from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
-from service.times import Utc, shifted, utc_now
+from service.times import DAY_S, Utc, shifted, utc_now
 
 
 class Alarms:
@@ -146,3 +172,231 @@ class Alarms:
             ),
             entry,
         )
+
+
+PREVIEW_DAYS = 7
+MOST_PREVIEWED = 50_000
+"""Batches of one preview: to read them takes about a second."""
+MOST_EXCURSIONS = 50
+
+
+class Limits:
+    """Reads and sets the limits of spacecraft."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def all(self, name: str, tracker: str | None = None) -> list[Limit]:
+        """The limit of every quantity of a spacecraft, or of one of its trackers."""
+        mission = self._context.mission(name)
+        own = _checked_tracker(mission, tracker)
+        with self._context.reading() as connection:
+            return limits.list_limits(connection, mission, own)
+
+    def get(self, name: str, quantity: QuantityName, tracker: str | None = None) -> LimitHistory:
+        """The limit of one quantity, the shipped limit, and the history of changes."""
+        mission = self._context.mission(name)
+        own = _checked_tracker(mission, tracker, quantity)
+        with self._context.reading() as connection:
+            return limits.limit_history(connection, mission, quantity, own)
+
+    def set(
+        self,
+        name: str,
+        quantity: QuantityName,
+        settings: LimitSettings | None,
+        *,
+        who: str,
+        comment: str | None = None,
+        entry: Entry | None = None,
+        tracker: str | None = None,
+    ) -> Limit:
+        """Set a limit, which holds from the next batch on; None restores the shipped one.
+
+        `entry` goes to the audit list with the change.
+        """
+        mission, moment = mission_named(self._context.missions, name), utc_now().text
+        own = _checked_tracker(mission, tracker, quantity)
+        return self._context.change_audited(
+            lambda connection: limits.set_limit(
+                connection,
+                mission,
+                quantity,
+                settings,
+                who=who,
+                comment=comment,
+                now=moment,
+                tracker=own,
+            ),
+            entry,
+        )
+
+    def preview(
+        self,
+        name: str,
+        quantity: QuantityName,
+        settings: LimitSettings,
+        *,
+        run: str | None = None,
+        days: int = PREVIEW_DAYS,
+        tracker: str | None = None,
+    ) -> LimitPreview:
+        """How a limit and the one in force evaluate the days up to the run's latest batch.
+
+        Of more than `MOST_PREVIEWED` batches it takes the latest ones.  They are evaluated in the
+        order of their time, whenever they came.
+        """
+        mission = self._context.mission(name)
+        own = _checked_tracker(mission, tracker, quantity)
+        subject = subject_of(quantity, own)
+        with self._context.reading() as connection:
+            in_force = limits.limits_of(connection, mission)[subject]
+            last = limits.latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
+            time_ns: list[int] = []
+            samples: list[Sample] = []
+            if last is not None:
+                # The latest batch belongs to the period.
+                start, end = shifted(last, -DAY_S * days), shifted(last, 0.001)
+                period = ResultFilter(run or LIVE, name, start, end)
+                if quantity == REJECTED:
+                    samples = rejected_samples(connection, period)[-MOST_PREVIEWED:]
+                    time_ns = [at_ns for at_ns, _, _ in samples]
+                else:
+                    time_ns, samples = limits.latest_samples(
+                        connection, period, subject, MOST_PREVIEWED
+                    )
+
+        def moment(at_ns: int) -> str:
+            assert last is not None
+            return shifted(last, (at_ns - last.tai_ns) / 1e9).text
+
+        def trial(tried: LimitSettings) -> LimitTrial:
+            of_gaps = quantity == SILENCE
+            found = preview_of_gaps(time_ns, tried) if of_gaps else preview_of(samples, tried)
+            return _trial(found, tried, moment)
+
+        return LimitPreview(
+            spacecraft=name,
+            run=run or LIVE,
+            quantity=quantity,
+            tracker=own or None,
+            start=moment(time_ns[0]) if time_ns else None,
+            end=moment(time_ns[-1]) if time_ns else None,
+            batches=len(time_ns),
+            is_cut=len(time_ns) == MOST_PREVIEWED,
+            proposed=trial(settings),
+            in_force=trial(in_force),
+        )
+
+
+def _trial(found: Preview, tried: LimitSettings, moment: Callable[[int], str]) -> LimitTrial:
+    """A preview as the interface shows it; `moment` gives the text of a time in TAI ns."""
+    return LimitTrial(
+        settings=tried.model_dump(mode="json"),
+        evaluated=found.evaluated,
+        beyond={
+            cast(SeverityName, severity.word): count for severity, count in found.beyond.items()
+        },
+        alarms=len(found.excursions),
+        excursions=[
+            LimitExcursion(
+                severity=cast(SeverityName, each.severity.word),
+                start=moment(each.start_ns),
+                end=None if each.end_ns is None else moment(each.end_ns),
+                worst=each.worst,
+                bound=each.bound,
+            )
+            for each in found.excursions[-MOST_EXCURSIONS:]
+        ],
+    )
+
+
+def _checked_tracker(
+    mission: Mission, tracker: str | None, quantity: QuantityName | None = None
+) -> str:
+    """The tracker whose limits are meant; empty for those of the spacecraft.
+
+    Raises `BadInput` for one that has none of its own, and for a quantity that no tracker has.
+    """
+    if tracker is None:
+        return ""
+    mission.tracker(tracker, "tracker")
+    if tracker not in limited_trackers(mission):
+        message = f"{mission.name} has one tracker; its limits are those of the spacecraft"
+        raise BadBatch(Fault("tracker", message, shown_value(tracker)))
+    if quantity is not None and quantity not in tracker_names():
+        known = ", ".join(tracker_names())
+        raise BadBatch(Fault("tracker", f"a tracker has {known} only", shown_value(quantity)))
+    return tracker
+
+
+class Annotations:
+    """Reads, writes and deletes annotations.  `entry` goes to the audit list with a change."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._ids = Ulids()
+
+    def page(
+        self,
+        *,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page[Annotation]:
+        """Annotations of a period, the latest written first; see `list_annotations`."""
+        with self._context.reading() as connection:
+            return events.list_annotations(
+                connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
+            )
+
+    def get(self, id: str) -> Annotation:
+        """One annotation."""
+        with self._context.reading() as connection:
+            return events.read_annotation(connection, known_id(id, "annotation"))
+
+    def add(
+        self,
+        text: str,
+        *,
+        start: Utc,
+        who: str,
+        end: Utc | None = None,
+        spacecraft: str | None = None,
+        entry: Entry | None = None,
+    ) -> Annotation:
+        """Write an annotation; without an end about a moment, without a spacecraft about all.
+
+        Raises `BadInput` for a spacecraft without a mission file.
+        """
+        if spacecraft is not None:
+            mission_in_input(self._context.missions, spacecraft)
+        row = {
+            "id": self._ids.new(),
+            "spacecraft": spacecraft,
+            "start": start.text,
+            "start_ns": start.tai_ns,
+            "end": None if end is None else end.text,
+            "end_ns": (end or start).tai_ns,
+            "text": text,
+            "who": who,
+            "created": utc_now().text,
+        }
+        return self._context.change_audited(
+            lambda connection: events.add_annotation(connection, row), entry
+        )
+
+    def delete(self, id: str, entry: Entry | None = None) -> Annotation:
+        """Delete an annotation; the audit list keeps what it said."""
+        known = known_id(id, "annotation")
+
+        def change(connection: Connection) -> Annotation:
+            deleted = events.delete_annotation(connection, known)
+            if entry is not None:
+                body = msgspec.json.encode(deleted).decode()
+                dataclasses.replace(entry, body=body).add_to(connection)
+            return deleted
+
+        return self._context.change(change)

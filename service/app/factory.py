@@ -1,32 +1,25 @@
 """The app: every part of the service, put together in one place."""
 
-from service.access.administration import Tokens
 from service.access.sessions import Access
+from service.access.tokens import Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
-from service.app.alarms import Alarms
-from service.app.annotations import Annotations
-from service.app.calibrations.adoptions import CalibrationAdoptions
-from service.app.calibrations.service import CalibrationService
-from service.app.comparisons import Comparisons
+from service.app.alarms import Alarms, Annotations, Limits
+from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
-from service.app.events import Audit, Events
 from service.app.frames import Frames
-from service.app.limits import Limits
-from service.app.outgoing.webhooks import Webhooks
+from service.app.grades import DefinitiveAttitudes, Grades
+from service.app.live_filter import LiveFilter
 from service.app.products import Products
 from service.app.replays import Replays
-from service.app.results import Results
+from service.app.results import Comparisons, Results
 from service.app.runs import Runs
-from service.app.service import Service
+from service.app.service import Audit, Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Spacecraft
-from service.app.submissions import Submissions
-from service.app.telemetry.grades import Grades
-from service.app.telemetry.gyro import Gyro
-from service.app.telemetry.live_filter import LiveFilter
-from service.app.telemetry.smoothing import DefinitiveAttitudes
-from service.app.telemetry.tracks import Tracks
+from service.app.submissions import Gyro, Submissions
+from service.app.tracks import Tracks
+from service.app.webhooks import Webhooks
 from service.app.zones import Zones
 from service.ingest.spool import Spool
 from service.missions.mission import Mission, load_missions

@@ -15,8 +15,7 @@ from service.app.submissions import Submissions
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import FrameLimits
-from service.imaging.overlay import draw_overlay
-from service.imaging.overlay_marks import marks_of
+from service.imaging.overlay import draw_overlay, marks_of
 from service.imaging.submit import FrameIn
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import FromLastIn, Submission, submission_from_json

@@ -9,7 +9,7 @@ import numpy as np
 from sqlalchemy import Connection
 
 from service import __version__
-from service.app.calibrations.adoptions import adopted_missions
+from service.app.calibrations import adopted_missions
 from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, load_missions, mission_named
 from service.missions.product_settings import MAX_LARGEST_GAP_S
@@ -26,13 +26,11 @@ from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
 from service.settings import Settings
 from service.storage.grades.rows import count_samples_of, graded_pages
-from service.storage.gyro.blocks import BlockFilter
-from service.storage.gyro.samples_table import count_samples, sample_table
-from service.storage.queries.attitude_rows import attitude_pages
+from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.tables.result_tables import batch_table, star_table
-from service.storage.queries.with_archive.rows import count
+from service.storage.queries.result_tables import attitude_pages, batch_table, star_table
+from service.storage.queries.with_archive import count
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.times import Utc, shifted, utc_now

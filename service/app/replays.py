@@ -17,9 +17,9 @@ from service.app.context import Context, checked_run_name, known_id
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.ingest.bulk import Bulk, Check
-from service.ingest.gyro import GyroIntake
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
+from service.ingest.submit import GyroIntake
 from service.ingest.worker_process import WorkerConfig
 from service.observations.readers.decompress import Coding, unpacked_lines
 from service.packets.upload import PacketLines

@@ -16,10 +16,9 @@ from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
 from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
 from service.storage.models.runs import Forgotten, Run, RunState
-from service.storage.queries import histories, overview
+from service.storage.queries import fleet, histories
+from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.runs.comparison import changed_batches, compare_runs
-from service.storage.queries.runs.rates import run_rates
 from service.storage.recording.results import set_run_alarms
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.forget import ForgetFilter, forget, found
@@ -45,7 +44,7 @@ class Runs:
     def default(self) -> str:
         """The run to show first: live, or the newest while that is empty."""
         with self._context.reading() as connection:
-            return overview.default_run(connection)
+            return fleet.default_run(connection)
 
     def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> RunState:
         """Turn the evaluation of limits on or off for the batches that a run gets from now on."""
@@ -153,39 +152,14 @@ class Runs:
         processes: int = 0,
         track: bool = False,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
-    ) -> tuple[ReprocessProgress, RunComparison]:
-        """Process the batches of a run again into another run, and compare both.
+    ) -> ReprocessProgress:
+        """Process the batches of a run again into another run.
 
         The settings are those of this app.  Without `run` the name is derived from the
         settings.  Batches that the run already has are not processed again.
         With `track` they are searched about the last attitude of the run, one after another.
         Raises `BadBatch` if the run has results of other settings.
         """
-        progress = self.reprocess_recorded(
-            run,
-            source=source,
-            spacecraft=spacecraft,
-            start=start,
-            end=end,
-            processes=processes,
-            track=track,
-            step=step,
-        )
-        return progress, self.compare(source, progress.run, spacecraft, start, end)
-
-    def reprocess_recorded(
-        self,
-        run: str | None,
-        *,
-        source: str = LIVE,
-        spacecraft: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        processes: int = 0,
-        track: bool = False,
-        step: Callable[[ReprocessProgress], object] = lambda progress: None,
-    ) -> ReprocessProgress:
-        """`reprocess` without the comparison."""
         plan = self._plan(run, source, spacecraft, start, end, processes, track)
         sky = self._context.sky
         own = Solver(plan.missions, sky)
@@ -209,7 +183,7 @@ class Runs:
         Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
         """
         from service.ingest.partitions.coordinator import reprocess_partitions
-        from service.ingest.partitions.workers import LocalProcesses, OwnProcess, Workers
+        from service.ingest.partitions.tasks import LocalProcesses, OwnProcess, Workers
 
         plan = self._plan(run, source, spacecraft, start, end, processes)
         if plan.run == LIVE:

@@ -1,27 +1,31 @@
-"""The service itself: readiness, and its description."""
+"""The service itself: readiness, its description, its log of events, and the audit list."""
 
 import gc
 import logging
 import threading
-from collections.abc import Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 
 from msgspec import structs
 
 from service import __version__
-from service.acquire.kernel_build import KernelBuild
+from service.access import audit
+from service.acquire.kernel_build import KernelBuild, progress_logged
 from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
 from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy
-from service.ingest.kernel_progress import progress_logged
 from service.ingest.solver_pool import mission_in_input
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
+from service.storage.models.access import AuditEntry
+from service.storage.models.base import Page
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
+from service.storage.recording import events
+from service.storage.recording.events import Event
 from service.storage.recording.ids import Ulids
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade
@@ -177,3 +181,42 @@ class Service:
             ],
             credits=list(CREDITS),
         )
+
+
+class Events:
+    """Reads events, and calls listeners when something was written."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def last(self, spacecraft: Collection[str] | None = None) -> int:
+        """The number of the latest event; with `spacecraft`, of the latest about one of these."""
+        with self._context.reading() as connection:
+            if spacecraft is None:
+                return events.last_event(connection)
+            return events.last_event_about(connection, spacecraft)
+
+    def after(self, last: int, limit: int) -> Sequence[Event] | None:
+        """The events after a number, oldest first; None where some of them are no longer kept."""
+        with self._context.reading_record() as connection:
+            return events.events_after(connection, last, limit)
+
+    def listen(self, listener: Callable[[], object]) -> None:
+        """Call a function, from any thread, after each commit that has events."""
+        self._context.store.writer.after_events.append(listener)
+
+    def unlisten(self, listener: Callable[[], object]) -> None:
+        """Stop calling a function after each commit that has events."""
+        self._context.store.writer.after_events.remove(listener)
+
+
+class Audit:
+    """Reads the audit list."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+
+    def page(self, limit: int = 100, cursor: str | None = None) -> Page[AuditEntry]:
+        """The audit list of changes, newest first."""
+        with self._context.reading() as connection:
+            return audit.list_entries(connection, limit, cursor)

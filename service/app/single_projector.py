@@ -14,7 +14,7 @@ from functools import partial
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import AcquisitionError
-from service.storage.calibrations.stored import interrupt_calibrations, unfinished_calibrations
+from service.storage.calibrations import interrupt_calibrations, unfinished_calibrations
 from service.storage.queries.replays import mark_interrupted, unfinished_replays
 from service.storage.sql.projector_lock import left_behind
 from service.storage.store import Store

@@ -1,33 +1,36 @@
-"""Spacecraft: their state, attitudes, star rates, histories and worst batches."""
+"""Spacecraft: state, attitudes, star rates, worst batches, histories and these as tables."""
 
 from collections.abc import Collection, Iterator, Sequence
+from itertools import chain
 from typing import Any
 
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
-from service.alarms.quantities import QuantityName, tracker_names, trend_names
+from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
 from service.app.context import Context
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission
+from service.products.tables import Column, Table
+from service.products.tables import Page as TablePage
 from service.storage.models.base import Page
-from service.storage.models.fleet import Fleet
-from service.storage.models.overview import Overview
+from service.storage.models.overview import Fleet, Overview
 from service.storage.models.spacecraft import (
     AttitudeRow,
+    History,
     MissionNow,
+    Ranking,
     Rates,
     SpacecraftRow,
     SpacecraftState,
 )
-from service.storage.models.trends import History, Ranking
 from service.storage.projections import rollups
-from service.storage.queries import fleet, histories, overview, trends
+from service.storage.queries import fleet, histories, trends
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.ranking import worst_batches
-from service.storage.recording.tracker_splits import is_waiting
+from service.storage.queries.trends import worst_batches
+from service.storage.recording.tracker_values import is_waiting
 from service.storage.recording.unsaved_result import LIVE
-from service.times import Utc, utc_now
+from service.times import Utc, utc_now, utc_of_unix
 
 
 class Spacecraft:
@@ -39,10 +42,10 @@ class Spacecraft:
     def overview(
         self, run: str | None = None, spacecraft: Collection[str] | None = None
     ) -> Overview:
-        """Every spacecraft in a run at a glance, or some; see `overview.overview`."""
+        """Every spacecraft in a run at a glance, or some; see `fleet.overview`."""
         with self._context.reading() as connection:
             missions = self._context.known.values()
-            return overview.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
+            return fleet.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
 
     def fleet(
         self,
@@ -220,3 +223,67 @@ def _named(
         return {"tracker": UNSET, "not_split": UNSET}
     waits = len(mission.trackers) > 1 and is_waiting(connection, mission.name, run)
     return {"tracker": tracker, "not_split": waits}
+
+
+BATCH_COLUMNS = (
+    Column("time", "utc", description="UTC. Time of the batch.", width=30),
+    Column("batch", "text", description="Name of the batch.", width=128),
+    Column("id", "text", description="Id of the result.", width=26),
+)
+BUCKET_COLUMNS = (
+    Column("start", "utc", description="UTC. Start of the bucket.", width=30),
+    Column("bucket_s", "integer", "s", description="Width of the bucket."),
+    Column("batches", "integer", description="Batches in the bucket."),
+)
+BUCKET_PARTS = {
+    "count": "batches with a value",
+    "mean": "mean",
+    "min": "least of a batch",
+    "max": "greatest of a batch",
+}
+
+
+def history_table(history: History) -> Table:
+    """The table of a history; see `trends.history`."""
+    if history.strategy == "latest":
+        return batch_table(iter([history]))
+    columns = [
+        _column(name, part, told) for name in history.series for part, told in BUCKET_PARTS.items()
+    ]
+    starts = [utc_of_unix(each).text for each in history.unix_s]
+    page: list[Any] = [starts, [history.bucket_s] * len(starts), history.batches]
+    page += [getattr(each, part) for each in history.series.values() for part in BUCKET_PARTS]
+    return Table([*BUCKET_COLUMNS, *columns], [page], _about(history))
+
+
+def batch_table(pages: Iterator[History]) -> Table:
+    """The table of pages of batches; see `trends.every_batch`.
+
+    The first page is read at once: its errors are raised here.
+    """
+    first = next(pages)
+    columns = [*BATCH_COLUMNS, *(_column(name) for name in first.series)]
+    return Table(columns, (_batch_page(page) for page in chain([first], pages)), _about(first))
+
+
+def _batch_page(page: History) -> TablePage:
+    values: list[Any] = [each.value for each in page.series.values()]
+    return [*(getattr(page, each.name) for each in BATCH_COLUMNS), *values]
+
+
+def _column(name: QuantityName, part: str = "", told: str = "") -> Column:
+    quantity = QUANTITIES[name]
+    about = f"{quantity.label}: {told}" if told else quantity.label
+    if part == "count":
+        return Column(f"{name}_count", "integer", description=about)
+    return Column(f"{name}_{part}" if part else name, unit=quantity.unit, description=about)
+
+
+def _about(history: History) -> dict[str, str]:
+    return {
+        "product": "history",
+        "spacecraft": history.spacecraft,
+        "run": history.run,
+        "start": history.start or "",
+        "end": history.end or "",
+    }

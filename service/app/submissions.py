@@ -1,4 +1,4 @@
-"""Batches to identify, solve and record."""
+"""Batches to identify, solve and record; and gyro blocks, recorded once and read back."""
 
 import asyncio
 from collections.abc import Sequence
@@ -10,14 +10,20 @@ from pydantic_core import to_json
 
 from service.access.tokens import Caller
 from service.acquire.kernel_build import KernelBuild
-from service.app.context import Context
+from service.app.context import Context, known_id
 from service.errors import AcquisitionError, BadBatch
+from service.gyro import GyroBlock, block_from_json
 from service.ingest.outcomes import Observer
 from service.ingest.queue import Backlog
-from service.ingest.submit import SubmissionService
+from service.ingest.submit import GyroIntake, SubmissionService
+from service.missions.mission import mission_named
 from service.observations.faults import faults_of
 from service.observations.schema import Submission, submission_from_json
-from service.storage.recording.unsaved_result import Answered
+from service.storage.gyro import BlockFilter, Recorded, list_blocks, read_block
+from service.storage.models.base import Page
+from service.storage.models.gyro import GyroBlockRow, GyroSamples
+from service.storage.recording.unsaved_result import LIVE, Answered
+from service.times import Utc
 
 MAX_ARRAY = 100
 """The most batches of an array."""
@@ -145,3 +151,44 @@ def _submission_of(element: Any) -> Submission | BadBatch:
         return submission_from_json(to_json(element, inf_nan_mode="constants"))
     except BadBatch as error:
         return error
+
+
+class Gyro:
+    """Takes and reads gyro blocks."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self.intake = GyroIntake(context.missions, context.store)
+
+    def submit(self, name: str, sent: bytes) -> Recorded:
+        """Record the block of a JSON body; see `record`."""
+        mission_named(self._context.missions, name)
+        return self.record(block_from_json(sent, name))
+
+    def record(self, block: GyroBlock) -> Recorded:
+        """Record a block, and wait for that; a repeat of the same body gets the recorded one.
+
+        See `GyroIntake.begin` for what is refused.
+        """
+        return self.intake.begin(block)()
+
+    def page(
+        self,
+        name: str,
+        *,
+        run: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page[GyroBlockRow]:
+        """The blocks of a period without their samples, the earliest first."""
+        self._context.mission(name)
+        selected = BlockFilter(name, run or LIVE, start, end)
+        with self._context.reading() as connection:
+            return list_blocks(connection, selected, limit=limit, cursor=cursor)
+
+    def get(self, name: str, id: str) -> GyroSamples:
+        """A block of a spacecraft with its samples."""
+        with self._context.reading() as connection:
+            return read_block(connection, name, known_id(id, "gyro block"))

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from service.calibration.observability import NotObservable
+from service.calibration.elimination import NotObservable
 from service.calibration.stars import Indices
 from service.errors import BadInput, Fault
 from service.missions.corrections import AS_MEASURED, Magnitudes

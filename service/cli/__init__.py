@@ -4,12 +4,17 @@ Nothing is imported before it is needed: help answers at once, and each command
 loads its own part of the service alone.
 """
 
+import argparse
 import os
+import pkgutil
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from io import TextIOWrapper
 
-from service.cli.parser import build_parser
+from service import __version__
+from service.cli import commands
+from service.cli.arguments import add_command, add_subcommands
 from service.errors import AcquisitionError, BadInput
 
 USAGE_ERROR = 2
@@ -56,3 +61,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _complain(text: str) -> None:
     for line in text.splitlines() or [""]:
         print(f"acquire: {line}", file=sys.stderr)
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of the whole command; `function` of what it parses runs the chosen command."""
+    parser = add_command(
+        None,
+        "acquire",
+        "Star identification and attitude: from observed stars to a recorded attitude.",
+        """
+        acquire demo                                 start the service and replay sample passes
+        acquire serve                                serve on http://127.0.0.1:8000
+        acquire replay pass.ndjson --results out.ndjson
+        acquire COMMAND --help                       the arguments of a command
+        """,
+    )
+    parser.add_argument("--version", action="version", version=f"acquire {__version__}")
+    added = add_subcommands(parser)
+    for module in pkgutil.iter_modules(commands.__path__):
+        import_module(f"{commands.__name__}.{module.name}").add(added)
+    return parser

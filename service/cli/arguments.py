@@ -7,7 +7,7 @@ import argparse
 import difflib
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -127,6 +127,17 @@ def add_database(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_url_or_in_process(parser: argparse.ArgumentParser) -> None:
+    """Add `--url` and `--in-process`, of which one may be given."""
+    way = parser.add_mutually_exclusive_group()
+    way.add_argument("--url", help=SERVICE)
+    way.add_argument(
+        "--in-process",
+        action="store_true",
+        help="process the files in this process, without a server",
+    )
+
+
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:
     """Add `--json`, which prints `what` as JSON in the place of text for people."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
@@ -220,3 +231,24 @@ def degrees(text: str) -> float:
     if number >= 120:
         raise argparse.ArgumentTypeError(f"must be below 120 degrees (got {text!r})")
     return number
+
+
+def written_to(file: Path | None, content: Iterator[bytes]) -> None:
+    """Write content to a file, or to the standard output where there is none.
+
+    The file appears when it is whole: it is written under another name beside its place.
+    """
+    if file is None:
+        for piece in content:
+            sys.stdout.buffer.write(piece)
+        sys.stdout.buffer.flush()
+        return
+    beside = file.with_name(f"{file.name}.part")
+    try:
+        with beside.open("wb") as part:
+            for piece in content:
+                part.write(piece)
+        beside.replace(file)
+    except BaseException:
+        beside.unlink(missing_ok=True)
+        raise

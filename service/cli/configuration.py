@@ -26,7 +26,7 @@ def settings_of(parsed: Namespace) -> Settings:
 
 def service_url(parsed: Namespace) -> str:
     """The address of the service: that of `--url`, else where the settings have it listen."""
-    from service.web.ports import url_of
+    from service.settings import url_of
 
     settings = settings_of(parsed)
     return parsed.url or url_of(settings.host, settings.port)

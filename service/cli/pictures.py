@@ -59,7 +59,7 @@ def picture_reader(
     dark_file: Path | None, settings: Settings, image: str | None = None
 ) -> "Callable[[Path, tuple[int, int] | None], Frame]":
     """A function that reads a picture, of a shape if one is given, less the dark frame."""
-    from service.imaging.frames.dark import without_dark
+    from service.imaging.detection.points import without_dark
     from service.imaging.frames.files import read_frame
     from service.imaging.frames.frame import FrameLimits
 

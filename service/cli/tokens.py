@@ -10,8 +10,8 @@ from urllib.parse import quote
 import msgspec
 from sqlalchemy import Connection
 
-from service.access.administration import MAX_DAYS, Tokens
 from service.access.audit import Entry
+from service.access.tokens import MAX_DAYS, Tokens
 from service.cli.arguments import print_json
 from service.errors import (
     AcquisitionError,
@@ -26,8 +26,8 @@ from service.missions.mission import load_missions
 from service.settings import Settings
 from service.storage.models.access import NewToken, Token
 from service.storage.recording.ids import Ulids
+from service.storage.sql.database_file import is_written
 from service.storage.sql.engines import database_file, database_url
-from service.storage.sql.file_lock import is_written
 from service.storage.store import Readers, Store
 from service.storage.upkeep.expiries import SOON_DAYS
 from service.times import DAY_S, shifted, utc_now

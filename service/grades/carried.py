@@ -22,9 +22,16 @@ from service.filtering.result import FilterResult
 from service.filtering.samples import GyroSamples
 from service.filtering.state import FilterState
 from service.grades.day import WARM_UP_S, GradedSamples, Model, samples_of
-from service.grades.measured import Recorded, attitudes_where, directions_where
-from service.grades.stretches import LONGEST_GAP_S, Stretch, cut
-from service.gyro.block import Nanoseconds
+from service.grades.stretches import (
+    LONGEST_GAP_S,
+    Recorded,
+    Stretch,
+    arrays_of,
+    attitudes_where,
+    cut,
+    directions_where,
+)
+from service.gyro import Nanoseconds
 from service.missions.mission import Mission
 from service.times import HOUR_S, Utc, bucket_start, shifted
 
@@ -161,16 +168,7 @@ def _digest_of_model(stretch: Stretch) -> bytes:
 
 def _digest_after(before: bytes, part: Stretch) -> bytes:
     digest = hashlib.sha256(before)
-    attitudes, directions = part.attitudes, part.directions
-    values = [
-        attitudes.tai_ns,
-        attitudes.quaternion,
-        attitudes.covariance_rad2,
-        directions.tai_ns,
-        directions.body,
-        directions.inertial,
-        directions.sigma_rad,
-    ]
+    values = [*arrays_of(part.attitudes, part.directions)]
     if part.gyro is not None:
         values += [part.gyro.tai_ns, part.gyro.rate_rad_s]
     for each in values:

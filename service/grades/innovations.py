@@ -8,7 +8,7 @@ the covariance of the difference is R - P; of a measurement that was not used it
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -25,7 +25,27 @@ UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredInnovations:
+class TimedColumns:
+    """Columns of equal length, the first of which are times."""
+
+    tai_ns: Integers
+
+    def __len__(self) -> int:
+        return len(self.tai_ns)
+
+    def taken(self, places: Any) -> Self:
+        """The rows at some places."""
+        return type(self)(**{each.name: getattr(self, each.name)[places] for each in fields(self)})
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """The rows of parts, one after the other."""
+        columns = (each.name for each in fields(cls))
+        return cls(**{name: np.concatenate([getattr(p, name) for p in parts]) for name in columns})
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredInnovations(TimedColumns):
     """What became of m measured attitudes, in order of time; equal times are allowed.
 
     `tai_ns` (m,) and `outcome` (m,), a `filtering.state.Outcome`.  About the body axes in
@@ -36,7 +56,6 @@ class MeasuredInnovations:
     measurement, and one sigma of it (m, 3).
     """
 
-    tai_ns: Integers
     outcome: Integers
     innovation_arcsec: Vector
     predicted_arcsec2: Vector
@@ -44,25 +63,6 @@ class MeasuredInnovations:
     measured_arcsec2: Vector
     difference_arcsec: Vector
     difference_sigma_arcsec: Vector
-
-    def __len__(self) -> int:
-        return len(self.tai_ns)
-
-    def taken(self, places: Any) -> "MeasuredInnovations":
-        """The measurements at some places."""
-        return MeasuredInnovations(
-            **{each.name: getattr(self, each.name)[places] for each in fields(self)}
-        )
-
-    @staticmethod
-    def joined(parts: Sequence["MeasuredInnovations"]) -> "MeasuredInnovations":
-        """The measurements of parts, one after the other."""
-        return MeasuredInnovations(
-            **{
-                each.name: np.concatenate([getattr(part, each.name) for part in parts])
-                for each in fields(MeasuredInnovations)
-            }
-        )
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:

@@ -1,17 +1,25 @@
-"""Stretches of a window: with a gyro as long as it runs, at a constant rate where there is none."""
+"""What the filter takes: recorded measurements and gyro samples, in unbroken stretches."""
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.samples import AttitudeMeasurements, DirectionMeasurements, GyroSamples
-from service.grades.measured import Mask, Recorded, attitudes_where, directions_where
-from service.grades.models import believed, constant_rate, gyro_samples
-from service.gyro.block import Nanoseconds
+from service.filtering.samples import (
+    LARGEST_SIGMA_RAD,
+    AttitudeMeasurements,
+    DirectionMeasurements,
+    GyroSamples,
+)
+from service.gyro import Nanoseconds
+from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.mission import Mission
+from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 LONGEST_GAP_S = 600.0
 """A longer gap ends a stretch; what an attitude is worth is gone by then."""
@@ -46,6 +54,74 @@ class Cut:
     stretches: list[Stretch]
     beyond_largest: int
     alone: int
+
+
+Mask = npt.NDArray[np.bool_]
+LEAST_RATIO = 1e-10
+"""Of the smallest variance to the largest: a covariance of less is no better than singular."""
+
+
+@dataclass(frozen=True, eq=False)
+class Recorded:
+    """Gyro samples and measurements of a window, each in order of time.
+
+    `gyro_ns` (n,) and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.  Of m
+    attitudes those are left out whose covariance says nothing, and counted in `unusable`.
+    """
+
+    gyro_ns: Nanoseconds
+    rates_rad_s: Vector
+    attitudes: AttitudeMeasurements
+    directions: DirectionMeasurements
+    unusable: int = 0
+
+
+def arrays_of(
+    attitudes: AttitudeMeasurements, directions: DirectionMeasurements
+) -> Sequence[npt.NDArray[Any]]:
+    """All arrays of measurements, as digests take them in."""
+    return (
+        attitudes.tai_ns,
+        attitudes.quaternion,
+        attitudes.covariance_rad2,
+        directions.tai_ns,
+        directions.body,
+        directions.inertial,
+        directions.sigma_rad,
+    )
+
+
+def usable_attitudes(
+    tai_ns: Nanoseconds, quaternion: Vector, covariance_arcsec2: Vector
+) -> tuple[AttitudeMeasurements, int]:
+    """The attitudes with a sound covariance, and how many there are without one.
+
+    `covariance_arcsec2` (m, 6) is the upper triangle: 11, 12, 13, 22, 23, 33.
+    """
+    full = covariance_arcsec2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+    full = full / ARCSEC_PER_RADIAN**2
+    sound: Mask = np.asarray(np.isfinite(full).all(axis=(1, 2)))
+    sound &= np.asarray(np.isfinite(quaternion).all(axis=1))
+    variances = np.linalg.eigvalsh(np.where(sound[:, None, None], full, np.eye(3)))
+    sound &= variances[:, 0] > LEAST_RATIO * variances[:, 2]
+    sound &= variances[:, 2] < LARGEST_SIGMA_RAD**2
+    norm = np.linalg.norm(quaternion[sound], axis=1, keepdims=True)
+    kept = AttitudeMeasurements(tai_ns[sound], quaternion[sound] / norm, full[sound])
+    return kept, int(np.count_nonzero(~sound))
+
+
+def attitudes_where(given: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
+    """Some of the attitudes."""
+    return AttitudeMeasurements(
+        given.tai_ns[places], given.quaternion[places], given.covariance_rad2[places]
+    )
+
+
+def directions_where(given: DirectionMeasurements, places: Any) -> DirectionMeasurements:
+    """Some of the directions."""
+    return DirectionMeasurements(
+        given.tai_ns[places], given.body[places], given.inertial[places], given.sigma_rad[places]
+    )
 
 
 def cut(recorded: Recorded, mission: Mission) -> Cut:
@@ -129,3 +205,58 @@ def _without_gyro(
                 left_a & _within(attitude_ns, first, last),
                 left_d & _within(direction_ns, first, last),
             )
+
+
+# From a mission and its recorded gyro samples to what the filter takes.
+#
+# This is the one place where recorded rates are converted: to body axes, to mean rates, and to
+# samples that the gyro can have measured.
+
+GAP_IN_STEPS = 1.5
+"""Of the median step: a longer one is a gap, where the mission says nothing else."""
+NS = 1e-9
+
+
+def believed(settings: GyroSettings, rates_rad_s: Vector) -> npt.NDArray[np.bool_]:
+    """Which of the rates (n, 3) about the gyro's axes are within the mission's largest, as (n,).
+
+    Blocks beyond it are refused on arrival; the mission may have named another number since.
+    """
+    largest = math.radians(settings.largest_rate_deg_per_s)
+    return np.asarray((np.abs(rates_rad_s) <= largest).all(axis=1))
+
+
+def gyro_samples(
+    settings: GyroSettings, tai_ns: Nanoseconds, rates_rad_s: Vector
+) -> tuple[GyroModel, GyroSamples]:
+    """The model and the samples of a stretch: mean rates since the sample before, in body axes.
+
+    `tai_ns` (n,) rise, and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.
+    """
+    step_s = np.diff(tai_ns) * NS
+    largest_step_s = settings.largest_step_s
+    if largest_step_s is None:
+        largest_step_s = GAP_IN_STEPS * float(np.median(step_s)) if len(step_s) else 1.0
+    body = rates_rad_s @ settings.body_from_gyro.T
+    if settings.samples == "instant":
+        # Across a gap the filter itself takes the mean of both sides.
+        between = 0.5 * (body[1:] + body[:-1])
+        body = np.vstack([body[:1], np.where(step_s[:, None] > largest_step_s, body[1:], between)])
+    widest = float(np.abs(settings.body_from_gyro).sum(axis=1).max())
+    model = GyroModel(
+        sigma_v_rad_s0_5=settings.sigma_v_rad_s0_5,
+        sigma_u_rad_s1_5=settings.sigma_u_rad_s1_5,
+        bias_sigma_rad_s=settings.bias_sigma_rad_s,
+        scale=settings.scale,
+        misalignment_rad=settings.misalignment_arcsec / ARCSEC_PER_RADIAN,
+        largest_step_s=largest_step_s,
+        # The mission's is about each axis of the gyro, the filter's about each of the body.
+        largest_rate_rad_s=math.radians(settings.largest_rate_deg_per_s) * widest * (1.0 + 1e-9),
+    )
+    return model, GyroSamples(tai_ns, body)
+
+
+def constant_rate(settings: MotionSettings | None) -> ConstantRateModel:
+    """The model of a body without a gyro."""
+    settings = settings or MotionSettings()
+    return ConstantRateModel(settings.rate_walk_rad_s1_5, settings.rate_sigma_rad_s)

@@ -1,16 +1,23 @@
-"""The picture of a frame with what was made of it: stars, names, residual arrows."""
+"""Pictures with what was made of them: stars, names, residual arrows; and residuals alone."""
 
 import io
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.imaging.overlay_marks import Mark
+from service.missions.camera import Camera
+from service.missions.mission import Tracker
+from service.observations.batch import ObservationBatch
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import apparent, observer_velocity
+from service.vectors import Vector, matrix_from_quaternion
 
 if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
+
 
 LEAST_SIDE_PX = 768
 ARROW_PX = 28.0
@@ -31,6 +38,77 @@ COLORS: Mapping[str, Color] = {
 _ARROW: Color = (110, 200, 255)
 _TEXT: Color = (225, 225, 225)
 _WORDS = {"left_out": "not in the batch", "sharp": "hot pixel or cosmic ray"}
+
+
+@dataclass(frozen=True)
+class Mark:
+    """A place on a frame, in its pixels.
+
+    `kind` is the star's outcome, `left_out` for one that is in no batch, or `sharp` for
+    a hot pixel or cosmic ray.  `predicted_px` is where the catalog and the attitude have
+    the star, None where either is missing.
+    """
+
+    u_px: float
+    v_px: float
+    kind: str
+    label: str = ""
+    predicted_px: tuple[float, float] | None = None
+
+
+def marks_of(
+    answer: Any,
+    batch: ObservationBatch,
+    tracker: Tracker,
+    camera: Camera,
+    detections: Mapping[str, Any],
+    run_catalog: RunCatalog | None,
+) -> list[Mark]:
+    """The marks of a recorded `Answer`; without a run catalog no star has a predicted place."""
+    found = [star for star in detections["stars"] if star["u_px"] is not None]
+    used = [star for star in found if star["used"]]
+    told = next(each.stars for each in answer.observations if each.tracker == tracker.name)
+    names = [None if each.star is None else str(each.star.id) for each in told]
+    predicted = _predicted(names, answer, batch, tracker, camera, run_catalog)
+    marks = [
+        Mark(
+            star["u_px"],
+            star["v_px"],
+            each.outcome,
+            name or "",
+            place if each.outcome == "unique" else None,
+        )
+        for star, each, name, place in zip(used, told, names, predicted, strict=True)
+    ]
+    marks += [Mark(star["u_px"], star["v_px"], "left_out") for star in found if not star["used"]]
+    return marks + [Mark(u, v, "sharp") for u, v in detections["hot_or_cosmic_px"]]
+
+
+def _predicted(
+    names: Sequence[str | None],
+    answer: Any,
+    batch: ObservationBatch,
+    tracker: Tracker,
+    camera: Camera,
+    run_catalog: RunCatalog | None,
+) -> list[tuple[float, float] | None]:
+    attitude = answer.attitude
+    # Without a calibration the lens that was fitted to the frame is not known any more.
+    if attitude is None or run_catalog is None or not camera.calibrated:
+        return [None] * len(names)
+    wanted = set(names)
+    rows = {name: row for row, name in enumerate(run_catalog.star_id) if name in wanted}
+    row = np.array([-1 if name is None else rows.get(name, -1) for name in names])
+    direction = run_catalog.direction_at(batch.time)[row]
+    if batch.aberration == "to_correct":
+        velocity_c = observer_velocity(batch.time, batch.velocity_km_per_s)
+        direction = apparent(direction, velocity_c, batch.time)
+    body = direction @ matrix_from_quaternion(attitude.quaternion).T
+    u, v = camera.places(body @ tracker.body_from_tracker)
+    return [
+        (at_u, at_v) if known >= 0 and np.isfinite(at_u) else None
+        for known, at_u, at_v in zip(row.tolist(), u.tolist(), v.tolist(), strict=True)
+    ]
 
 
 def draw_overlay(preview: bytes, step: int, marks: Sequence[Mark], title: str) -> bytes:
@@ -119,3 +197,44 @@ def _draw_foot(
     if factor:
         text = f"arrows: from the expected to the measured place, {factor:,.0f} times enlarged"
         draw.text((6, top + 4 + 2 * LINE_PX), text, _ARROW, font=font)  # type: ignore[arg-type]
+
+
+SIDE_PX, MAP_FOOT_PX = 900, 24
+MAP_ARROW_PX = 22.0
+"""The length of the arrow of the reference residual."""
+_GROUND, _STAR, _MAP_ARROW, _MAP_TEXT = (
+    (12, 14, 20),
+    (90, 120, 150),
+    (110, 200, 255),
+    (225, 225, 225),
+)
+
+
+def draw_residuals(
+    place_px: Vector,
+    residual_px: Vector,
+    size_px: tuple[int, int],
+    arrow_of_px: float,
+    title: str,
+) -> bytes:
+    """A PNG of residuals (n, 2) at places (n, 2) of a sensor; `arrow_of_px` has a usual arrow."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    scale = SIDE_PX / max(size_px)
+    width, height = (max(1, round(side * scale)) for side in size_px)
+    image = Image.new("RGB", (width, height + MAP_FOOT_PX), _GROUND)
+    draw, font = ImageDraw.Draw(image), ImageFont.load_default(13)
+    factor = MAP_ARROW_PX / max(arrow_of_px, 1e-9)
+    ends = (place_px + 0.5) * scale + residual_px * factor
+    for (x, y), (u, v) in zip(((place_px + 0.5) * scale).tolist(), ends.tolist(), strict=True):
+        draw.ellipse((x - 1, y - 1, x + 1, y + 1), fill=_STAR)
+        draw.line((x, y, u, v), fill=_MAP_ARROW)
+    rms = math.sqrt(float(np.mean(residual_px**2))) if residual_px.size else 0.0
+    text = f"{title}: {rms:.3f} px rms per axis; this bar is {arrow_of_px:.3f} px"
+    draw.rectangle((0, height, width, height + MAP_FOOT_PX), fill=(0, 0, 0))
+    draw.text((6, height + 4), text, fill=_MAP_TEXT, font=font)
+    end = draw.textlength(text, font=font) + 14
+    draw.line((end, height + 12, end + MAP_ARROW_PX, height + 12), fill=_MAP_ARROW, width=2)
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue()

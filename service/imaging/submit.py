@@ -4,6 +4,7 @@ The batch holds all that the answer follows from, so that a what-if needs no fra
 """
 
 import hashlib
+import io
 import json
 import math
 from dataclasses import replace
@@ -12,29 +13,30 @@ from time import perf_counter_ns as clock_ns
 from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import AfterValidator, Field, ValidationError
 
 from service.errors import BadBatch, Fault
 from service.imaging.centroids.record import Flag
 from service.imaging.frames.files import read_frame
-from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
-from service.imaging.frames.preview import preview_of
+from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import Aberration
 from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
-from service.observations.numbers import Number, UnitVector
 from service.observations.schema import (
     APrioriIn,
     BatchIn,
     BodyRate,
     Key,
+    Number,
     OptionsIn,
     Position,
     RunName,
     Speed,
     Submission,
+    UnitVector,
     Wire,
     is_time,
     submission_from_model,
@@ -45,6 +47,7 @@ from service.vectors import Vector
 if TYPE_CHECKING:
     from service.imaging.detection.detect import Detections
     from service.imaging.detection.measure import MeasuredStar
+
 
 LEAST_SIGMA_ARCSEC = 1e-3
 BLENDED_SHARE = 0.15
@@ -113,7 +116,7 @@ def submission_of_frame(
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
     if known.exposure_s is not None:
-        frame = with_exposure(frame, known.exposure_s)
+        frame = replace(frame, exposure_s=known.exposure_s)
     clock.append(clock_ns())
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
@@ -176,11 +179,6 @@ def choices_of(frame: Frame) -> list[str]:
     """What was chosen of a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
-
-
-def with_exposure(frame: Frame, exposure_s: float) -> Frame:
-    """The same frame, exposed for a time that its file does not tell."""
-    return replace(frame, exposure_s=exposure_s)
 
 
 def batch_of_stars(
@@ -282,3 +280,39 @@ def _told(star: "MeasuredStar") -> dict[str, Any]:
 
 def _rounded(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
+
+
+MAX_SIDE_PX = 1024
+BLACK_SIGMAS = 2.0
+WHITE_SIGMAS = 400.0
+GREYS = 48
+"""Few greys, and black where there is only noise, make a small file."""
+
+
+def preview_of(found: "Detections") -> tuple[bytes, int]:
+    """A PNG of a frame, and how many of its pixels a side make one of the picture's."""
+    return preview_png(np.where(found.good, found.light, 0.0), found.noise_counts)
+
+
+def preview_png(light: CountArray, noise_counts: float) -> tuple[bytes, int]:
+    """A PNG of light (rows, columns) above its background, and how many pixels a side make one.
+
+    The brightest of the pixels that become one counts, so that no star is lost.
+    """
+    from PIL import Image
+
+    rows, columns = light.shape
+    step = -(-max(rows, columns) // MAX_SIDE_PX)
+    light = np.pad(light, ((0, -rows % step), (0, -columns % step)))
+    blocks = light.reshape(light.shape[0] // step, step, light.shape[1] // step, step)
+    image = Image.fromarray(_greys(blocks.max(axis=(1, 3)) / noise_counts))
+    file = io.BytesIO()
+    image.save(file, "PNG")
+    return file.getvalue(), step
+
+
+def _greys(sigmas: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
+    """Light in sigmas of the noise as greys, by the inverse hyperbolic sine."""
+    above = np.clip(sigmas - BLACK_SIGMAS, 0.0, WHITE_SIGMAS)
+    share = np.arcsinh(above / 4.0) / np.arcsinh(WHITE_SIGMAS / 4.0)
+    return np.asarray(np.round(share * GREYS) * (255.0 / GREYS), dtype=np.uint8)

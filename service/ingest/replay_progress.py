@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 
 from service.errors import AcquisitionError, Stopping, problem_of
 from service.packets.reader import PacketTotals
-from service.storage.gyro.blocks import Recorded
+from service.storage.gyro import Recorded
 from service.storage.models.base import FieldFault
 from service.storage.models.runs import (
     LineProblem,

@@ -25,9 +25,8 @@ from service.missions.mission import Mission
 from service.observations.schema import BatchIn, OptionsIn, Submission, submission_from_model
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
-from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.statements import insert_runs
-from service.storage.sql.tables import batches, results, runs
+from service.storage.sql.tables import archived_batches, batches, results, runs
 from service.storage.store import Store
 from service.times import utc_now
 

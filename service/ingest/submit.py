@@ -1,4 +1,4 @@
-"""From a submission to its stored answer: compute first, then one transaction, then answer."""
+"""From a submission to its stored answer: compute, one transaction, answer; and gyro blocks."""
 
 import asyncio
 import logging
@@ -17,6 +17,7 @@ from service.access.tokens import Caller, own_key
 from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.errors import AcquisitionError, Busy
+from service.gyro import GyroBlock, require_rates_within
 from service.ingest.outcomes import (
     Answers,
     Observer,
@@ -30,10 +31,13 @@ from service.ingest.outcomes import (
 from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.ingest.tracking import last_results, with_prediction
+from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission
 from service.sky.model import SkyModel
+from service.storage.gyro import Recorded as RecordedBlock
+from service.storage.gyro import find_block, record_block, row_of
 from service.storage.queries.recorded_batch import batch_with_options
 from service.storage.queries.results import read_parent
 from service.storage.recording.answer import answer_of
@@ -46,15 +50,17 @@ from service.storage.recording.identity import (
     look_up,
     remember_key,
 )
+from service.storage.recording.ids import Ulids
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
 from service.storage.store import Store
 from service.times import utc_now
 
+log = logging.getLogger(__name__)
+
 YIELD_S = 0.002
 """The longest wait of each bulk batch for single posts."""
 
-log = logging.getLogger(__name__)
 
 AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
 
@@ -431,3 +437,32 @@ class SubmissionService:
             except Exception:
                 # The batch is recorded and its answer due, whatever an observer does.
                 log.exception("an observer failed")
+
+
+class GyroIntake:
+    """Records gyro blocks, each once, however often it is sent."""
+
+    def __init__(self, missions: Mapping[str, Mission], store: Store) -> None:
+        self._missions = missions
+        self._store = store
+        self._ids = Ulids()
+
+    def begin(self, block: GyroBlock) -> Callable[[], RecordedBlock]:
+        """Queue a block for the writer; to call what it gives waits until it is recorded.
+
+        Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
+        mission, `Busy` where too much is waiting.  Both raise `Conflict` where another body has
+        its name, and `SampleTaken` where another block of the spacecraft and the run holds one
+        of its times.
+        """
+        mission = mission_in_input(self._missions, block.spacecraft)
+        require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
+        row = row_of(block, self._ids.new(), utc_now())
+        # Looked up here as well: an error in the writer's transaction would make it begin anew.
+        with self._store.reading_record() as connection:
+            found = find_block(connection, block, row)
+        if found is not None:
+            recorded = RecordedBlock(found, replayed=True)
+            return lambda: recorded
+        change = self._store.writer.change(lambda connection: record_block(connection, block, row))
+        return change.result

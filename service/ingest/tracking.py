@@ -21,16 +21,14 @@ from service.filtering.prediction import (
     predict_by_gyro,
     unknown_rate,
 )
-from service.grades.models import believed, gyro_samples
+from service.grades.stretches import believed, gyro_samples
 from service.missions.gyro import MotionSettings
 from service.missions.mission import Mission
 from service.missions.tracking import TrackingSettings
 from service.observations.batch import ObservationBatch
-from service.observations.prediction import NoPrediction, RateSource
-from service.observations.schema import Submission, submission_from_json
-from service.storage.grades.inputs import gyro_in
-from service.storage.grades.last_attitudes import RecordedAttitude, last_attitudes
-from service.storage.gyro.blocks import BlockFilter
+from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
+from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes
+from service.storage.gyro import BlockFilter
 from service.times import shifted
 from service.vectors import ARCSEC_PER_RADIAN
 

@@ -6,9 +6,11 @@ same words.  The pydantic models are also what `openapi.yaml` shows.
 
 import codecs
 import hashlib
-from collections.abc import Iterable
+import math
+from collections.abc import Iterable, Sequence
 from typing import Annotated, Any, Literal, Self
 
+import numpy as np
 from msgspec import Struct
 from pydantic import (
     AfterValidator,
@@ -36,13 +38,6 @@ from service.observations.batch import (
 from service.observations.decode import batch_from_canonical, prior_from_canonical
 from service.observations.faults import PRIOR_KINDS, faults_of
 from service.observations.frame_record import FrameRecord
-from service.observations.measurement import (
-    MeasurementIn,
-    no_options_beside_measurement,
-    none_beside_measurement,
-)
-from service.observations.numbers import Number, Quaternion, ReferenceFrame, UnitVector
-from service.observations.prediction import PredictionIn
 from service.times import parse_utc
 
 
@@ -59,6 +54,27 @@ Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
 ]
+
+
+NORM_TOLERANCE = 1e-3
+
+ReferenceFrame = Literal["EME2000", "ICRF", "GCRF"]
+
+
+def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
+    norm = math.hypot(*components)
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        raise ValueError(f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}")
+    return components
+
+
+Number = Annotated[float, Field(strict=True)]
+"""Strict: JSON's true and "5.3" are no numbers, though pydantic would take them for some."""
+Components = tuple[Number, Number, Number]
+UnitVector = Annotated[Components, AfterValidator(_near_unit)]
+Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
+
+
 BodyRate = Annotated[Number, Field(ge=-360, le=360)]
 Speed = Annotated[Number, Field(ge=-100, le=100)]
 Distance = Annotated[Number, Field(ge=-1e9, le=1e9)]
@@ -163,6 +179,59 @@ class SunPointedIn(Wire):
     frame: ReferenceFrame = "EME2000"
 
 
+Row = Components
+NoPrediction = Literal["no_good_attitude", "too_uncertain", "flip"]
+RateSource = Literal["gyro", "body_rates", "attitudes", "unknown"]
+
+
+def _positive_definite(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+    matrix = np.array(rows)
+    try:
+        np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        raise ValueError("must be positive definite") from None
+    if not np.array_equal(matrix, matrix.T):
+        raise ValueError("must be symmetric")
+    return rows
+
+
+PositiveDefinite = Annotated[tuple[Row, Row, Row], AfterValidator(_positive_definite)]
+
+
+class PredictionIn(BaseModel):
+    """The attitude that was predicted for a batch, or why there was none.
+
+    The service adds it when it records a batch.  A batch that is sent with it is searched about it.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    quaternion: tuple[Number, Number, Number, Number] | None = None
+    """Inertial to body, scalar last."""
+    covariance_arcsec2: PositiveDefinite | None = None
+    """Of the rotation about the body axes."""
+    margin_deg: Annotated[Number, Field(gt=0, le=60)] | None = None
+    """By which the zone reaches beyond the field of view."""
+    result: Annotated[str, Field(max_length=26)] | None = None
+    """The result whose attitude it came from."""
+    age_s: Annotated[Number, Field(ge=0)] | None = None
+    rate: RateSource | None = None
+    """What told how the body turned since then."""
+    reason: NoPrediction | None = None
+    """Why nothing was predicted."""
+
+    @model_validator(mode="after")
+    def _whole(self) -> Self:
+        if self.reason is not None:
+            if self.quaternion is not None:
+                raise ValueError("takes either quaternion or reason, not both")
+        elif None in (self.quaternion, self.covariance_arcsec2, self.margin_deg):
+            raise ValueError("needs reason, or quaternion, covariance_arcsec2 and margin_deg")
+        if self.quaternion is not None and abs(np.linalg.norm(self.quaternion) - 1.0) > 1e-3:
+            raise ValueError("quaternion: must have norm 1 within 0.001")
+        return self
+
+
 class FromLastIn(Wire):
     """The attitude predicted from the last good one of the spacecraft and the run."""
 
@@ -262,6 +331,76 @@ def _stars_of_different_trackers(
     if not any(each.stars or each.column_counts for each in observations):
         raise ValueError("there are no stars; at least one is needed")
     return observations
+
+
+LEAST_SIGMA_ARCSEC, LARGEST_SIGMA_ARCSEC = 1e-3, 36_000.0
+LEAST_RATIO = 1e-10
+"""Of the least variance to the largest: a covariance of less is no better than singular."""
+
+
+def _of_a_tracker(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+    variances = np.linalg.eigvalsh(np.array(rows)).tolist()
+    least, largest = LEAST_SIGMA_ARCSEC**2, LARGEST_SIGMA_ARCSEC**2
+    if variances[0] < least or variances[-1] > largest:
+        raise ValueError(
+            f"must have sigmas from {LEAST_SIGMA_ARCSEC:g} to {LARGEST_SIGMA_ARCSEC:g} arcsec "
+            "about every axis"
+        )
+    _require_ratio(variances)
+    return rows
+
+
+def _of_one_tracker(sigmas: tuple[float, float, float]) -> tuple[float, float, float]:
+    _require_ratio([sigma**2 for sigma in sigmas])
+    return sigmas
+
+
+def _require_ratio(variances: Sequence[float]) -> None:
+    if min(variances) < LEAST_RATIO * max(variances):
+        raise ValueError(f"must have no sigma below {LEAST_RATIO**0.5:g} of the largest")
+
+
+def none_beside_measurement(prior: Any, info: ValidationInfo) -> Any:
+    """The a priori knowledge of a batch, which must be null if it holds a measured attitude."""
+    if prior is not None and info.data.get("measurement") is not None:
+        raise ValueError("must be null: a measured attitude needs no a priori knowledge")
+    return prior
+
+
+def no_options_beside_measurement(options: Any, info: ValidationInfo) -> Any:
+    """The options of a batch, which must be left out if it holds a measured attitude."""
+    if options.model_fields_set and info.data.get("measurement") is not None:
+        raise ValueError("must be left out: a measured attitude is not searched for")
+    return options
+
+
+Sigma = Annotated[Number, Field(ge=LEAST_SIGMA_ARCSEC, le=LARGEST_SIGMA_ARCSEC)]
+
+
+class MeasurementIn(BaseModel):
+    """An attitude that a star tracker measured itself, with its covariance or its sigmas."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    quaternion: Quaternion
+    """Scalar last, inertial to the axes of `tracker`, or to the body without it."""
+    tracker: Annotated[
+        str | None, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")
+    ] = None
+    """Whose axes are meant; the mission's alignment turns them into the body's."""
+    sigma_arcsec: Annotated[tuple[Sigma, Sigma, Sigma], AfterValidator(_of_one_tracker)] | None = (
+        None
+    )
+    """One sigma of the rotation about each of the same axes."""
+    covariance_arcsec2: Annotated[PositiveDefinite, AfterValidator(_of_a_tracker)] | None = None
+    """Of the small rotation about the same axes, in place of the sigmas."""
+    frame: ReferenceFrame = "EME2000"
+
+    @model_validator(mode="after")
+    def _one_accuracy(self) -> Self:
+        if (self.sigma_arcsec is None) == (self.covariance_arcsec2 is None):
+            raise ValueError("needs either sigma_arcsec or covariance_arcsec2")
+        return self
 
 
 class BatchIn(Wire):

@@ -1,21 +1,30 @@
-"""Packets to batches: the stars of a packet with what the packets before it said."""
+"""Packets to batches: stars with what earlier packets carried, and measured attitudes."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from pydantic import ValidationError
 
 from service.errors import Fault
+from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
 from service.observations.faults import faults_of
-from service.observations.schema import BatchIn, checked_from_model
-from service.packets.carried import GyroRates, Held, PacketAttitude, quaternion_in
-from service.packets.clock import NS, Moment, moment_of, names_of
+from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
+from service.packets.clock import (
+    NS,
+    Moment,
+    finite,
+    finite_all,
+    moment_of,
+    names_of,
+    number,
+    text,
+    whole,
+)
 from service.packets.definition import PacketFault
-from service.packets.mapping import PacketMap, TrackerColumns
+from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns
 from service.packets.stream import SpacePacket
-from service.packets.values import finite, finite_all, number, text, whole
 
 CARRIED_WITHIN_S = 10.0
 """Rates, velocity and position of another packet serve stars that are so near in time."""
@@ -37,6 +46,90 @@ class StarBatch:
     def has_stars(self) -> bool:
         """Whether a slot of any tracker held a star."""
         return any(self.slots)
+
+
+@dataclass(frozen=True, slots=True)
+class PacketAttitude:
+    """An a priori attitude: scalar last, inertial to body, and its time."""
+
+    moment: Moment
+    quaternion: tuple[float, float, float, float]
+
+
+def quaternion_in(
+    values: Mapping[str, Any], names: Sequence[str], table: PacketPrior | PacketMeasurement
+) -> tuple[float, float, float, float] | None:
+    """The quaternion of a packet; None where it is zero or not finite: there is no attitude.
+
+    Raises `PacketFault` for a norm other than 1.
+    """
+    numbers = [number(values, name) for name in names]
+    if not all(map(math.isfinite, numbers)) or not any(numbers):
+        return None
+    norm = math.hypot(*numbers)
+    if abs(norm - 1.0) > NORM_TOLERANCE:
+        raise PacketFault(
+            ", ".join(names), f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
+        )
+    if table.scalar == "first":
+        numbers = [*numbers[1:], numbers[0]]
+    x, y, z, scalar = numbers
+    if table.direction == "body_to_inertial":
+        return -x, -y, -z, scalar
+    return x, y, z, scalar
+
+
+def counted_change(counts: int, turn: int) -> int:
+    """The change nearest to zero of a counter that starts again after `turn` counts."""
+    half = turn // 2
+    return (counts + half) % turn - half
+
+
+class GyroRates:
+    """Body rates from the counts of a gyro."""
+
+    def __init__(self, gyro: PacketGyro, names: Sequence[str]) -> None:
+        self._gyro = gyro
+        self._names = names
+        self._turn = 1 << gyro.counter_bits
+        self._last: tuple[int, tuple[int, ...]] | None = None
+
+    def add(self, values: Mapping[str, Any], moment: Moment) -> list[float] | None:
+        """The rates in deg/s at a packet; None where an angle has no packet just before."""
+        gyro = self._gyro
+        if gyro.kind == "rate":
+            counts = finite_all(values, self._names)
+            return [count * scale for count, scale in zip(counts, gyro.scale_deg, strict=True)]
+        angles = tuple(whole(values, name) for name in self._names)
+        before, self._last = self._last, (moment.tai_ns, angles)
+        if before is None:
+            return None
+        passed_s = (moment.tai_ns - before[0]) / NS
+        if not 0.0 < passed_s <= gyro.max_gap_s:
+            return None
+        return [
+            counted_change(now - then, self._turn) * scale / passed_s
+            for now, then, scale in zip(angles, before[1], gyro.scale_deg, strict=True)
+        ]
+
+
+class Held:
+    """Values of the latest packet that had them, with their time."""
+
+    def __init__(self, within_s: float) -> None:
+        self._within_ns = round(within_s * NS)
+        self._moment: Moment | None = None
+        self._values: list[float] | None = None
+
+    def hold(self, moment: Moment, values: list[float] | None) -> None:
+        """Take values in place of those before; None: there are none any more."""
+        self._moment, self._values = moment, values
+
+    def near(self, moment: Moment) -> list[float] | None:
+        """The values, if their time is near enough to a moment."""
+        if self._moment is None or abs(self._moment.tai_ns - moment.tai_ns) > self._within_ns:
+            return None
+        return self._values
 
 
 class BatchMaker:
@@ -204,17 +297,8 @@ class BatchMaker:
         return slots, stars
 
     def json_of(self, batch: StarBatch) -> bytes:
-        """A batch as canonical JSON; raises `PacketFault` naming the parameter of the first fault.
-
-        The checks are those of every batch.
-        """
-        try:
-            model = BatchIn.model_validate(batch.body)
-        except ValidationError as error:
-            fault = faults_of(error)[0]
-            name = self._parameter_of(batch, fault)
-            raise PacketFault(name, f"{fault.field}: {fault.message}", fault.value) from None
-        return checked_from_model(model).text.encode()
+        """A batch as canonical JSON; raises `PacketFault` naming the parameter of a fault."""
+        return _json_of(batch.body, lambda fault: self._parameter_of(batch, fault))
 
     def _parameter_of(self, batch: StarBatch, fault: Fault) -> str:
         """The parameter from which a field of a batch was made."""
@@ -244,8 +328,85 @@ class BatchMaker:
         return ", ".join(directions)
 
 
+def _json_of(body: dict[str, Any] | None, parameters_of: Callable[[Fault], str]) -> bytes:
+    """A body as canonical JSON, with the checks of every batch."""
+    try:
+        model = BatchIn.model_validate(body)
+    except ValidationError as error:
+        fault = faults_of(error)[0]
+        message = f"{fault.field}: {fault.message}"
+        raise PacketFault(parameters_of(fault), message, fault.value) from None
+    return checked_from_model(model).text.encode()
+
+
 def _shift(stars: list[dict[str, Any]], later_s: float) -> None:
     """Times of stars from a packet that is later than the batch's first."""
     if later_s:
         for star in stars:
             star["time_offset_s"] = star.get("time_offset_s", 0.0) + later_s
+
+
+@dataclass(frozen=True)
+class MeasuredBatch:
+    """A measured attitude of a packet; `body` is None where the packet says that there is none."""
+
+    packet: SpacePacket
+    columns: MeasurementColumns
+    body: dict[str, Any] | None
+
+
+class MeasurementMaker:
+    """Makes batches of measured attitudes of one spacecraft from the values of packets."""
+
+    def __init__(self, spacecraft: str, mapped: PacketMap) -> None:
+        self._spacecraft = spacecraft
+        self._mapped = mapped
+
+    def add(self, packet: SpacePacket, values: Mapping[str, Any]) -> Iterator[MeasuredBatch]:
+        """The measured attitudes of a packet; raises `PacketFault`."""
+        for columns in self._mapped.measurements:
+            if columns.quaternion[0] in values:
+                yield MeasuredBatch(packet, columns, self._body(columns, packet, values))
+
+    def json_of(self, batch: MeasuredBatch) -> bytes:
+        """A batch as canonical JSON; raises `PacketFault` naming the parameters of a fault."""
+        return _json_of(batch.body, lambda fault: self._parameters_of(batch.columns, fault))
+
+    def _parameters_of(self, columns: MeasurementColumns, fault: Fault) -> str:
+        names = columns.quaternion
+        if fault.field.startswith(("measurement.sigma", "measurement.covariance")):
+            names = columns.sigma or columns.covariance or names
+        elif fault.field == "time":
+            names = names_of(columns.table.time or self._mapped.table.time)
+        return ", ".join(names)
+
+    def _body(
+        self, columns: MeasurementColumns, packet: SpacePacket, values: Mapping[str, Any]
+    ) -> dict[str, Any] | None:
+        table = columns.table
+        if table.valid is not None and not number(values, table.valid):
+            return None
+        quaternion = quaternion_in(values, columns.quaternion, table)
+        if quaternion is None:
+            return None
+        moment = moment_of(table.time or self._mapped.table.time, values)
+        measured: dict[str, Any] = {"quaternion": quaternion, "frame": table.frame}
+        if table.tracker is not None:
+            measured["tracker"] = table.tracker
+        if columns.covariance:
+            scale = columns.arcsec**2
+            p11, p12, p13, p22, p23, p33 = finite_all(values, columns.covariance, scale)
+            rows = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+            measured["covariance_arcsec2"] = rows
+        else:
+            measured["sigma_arcsec"] = table.sigma_arcsec or finite_all(
+                values, columns.sigma, columns.arcsec
+            )
+        axes = table.tracker or "body"
+        return {
+            "spacecraft": self._spacecraft,
+            "batch": f"{packet.apid}-{moment.text}-{packet.sequence_count}-{axes}",
+            "time": moment.text,
+            "a_priori": None,
+            "measurement": measured,
+        }

@@ -1,6 +1,7 @@
-"""Times of packets: CCSDS day segmented and unsegmented codes to UTC (CCSDS 301.0-B-4)."""
+"""Values of packets as numbers, and CCSDS day segmented and unsegmented times (301.0-B-4)."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, date, datetime, timedelta
 from functools import lru_cache
@@ -9,7 +10,6 @@ from typing import Any
 from service.errors import BadInput
 from service.missions.packets import CdsTime, CucTime, PacketTime
 from service.packets.definition import PacketFault
-from service.packets.values import whole
 from service.times import DAY_S, FIRST_YEAR, LAST_YEAR, parse_utc, recorded_utc
 
 NS = 1_000_000_000
@@ -124,3 +124,61 @@ def _text(day: _Day, passed_ns: int) -> str:
         minute, second = divmod(rest, 60)
     decimals = f"{nanoseconds:09d}".rstrip("0").ljust(3, "0") if nanoseconds else "000"
     return f"{day.text}T{hour:02d}:{minute:02d}:{second:02d}.{decimals}Z"
+
+
+EXACT = 1 << 53
+"""Whole numbers up to this are exact as a float."""
+
+
+def number(values: Mapping[str, Any], name: str) -> float:
+    """A value as a float, NaN and infinity included; raises `PacketFault` where it is no number."""
+    value = _present(values, name)
+    if not isinstance(value, int | float):
+        raise PacketFault(name, "must be a number", value)
+    try:
+        return float(value)
+    except OverflowError:
+        raise PacketFault(name, "is beyond every number of a batch") from None
+
+
+def finite(values: Mapping[str, Any], name: str) -> float:
+    """A value that is a number; raises `PacketFault` for NaN and infinity too."""
+    value = number(values, name)
+    if not math.isfinite(value):
+        raise PacketFault(name, "must be finite", value)
+    return value
+
+
+def finite_all(values: Mapping[str, Any], names: Sequence[str], scale: float = 1.0) -> list[float]:
+    """Several values, each times `scale`."""
+    return [finite(values, name) * scale for name in names]
+
+
+def whole(values: Mapping[str, Any], name: str) -> int:
+    """A value that is a whole number; a float without a fraction is one."""
+    value = _present(values, name)
+    if isinstance(value, int):
+        return int(value)
+    if isinstance(value, float) and value.is_integer() and abs(value) <= EXACT:
+        return int(value)
+    raise PacketFault(name, "must be a whole number", value)
+
+
+def text(values: Mapping[str, Any], name: str) -> str:
+    """A value as text: a string without its padding, or a whole number in digits."""
+    value = _present(values, name)
+    if isinstance(value, bytes):
+        try:
+            value = value.decode("ascii")
+        except UnicodeDecodeError:
+            raise PacketFault(name, "must be text", value) from None
+    if isinstance(value, str):
+        return value.rstrip("\0 ").rstrip()
+    return str(whole(values, name))
+
+
+def _present(values: Mapping[str, Any], name: str) -> Any:
+    try:
+        return values[name]
+    except KeyError:
+        raise PacketFault(name, "is not in the packet") from None

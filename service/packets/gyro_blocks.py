@@ -11,12 +11,11 @@ import msgspec
 from service.errors import shown_value
 from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
-from service.packets.carried import counted_change
-from service.packets.clock import NS, Moment, moment_of
+from service.packets.batches import counted_change
+from service.packets.clock import NS, Moment, finite, moment_of, whole
 from service.packets.definition import PacketFault
 from service.packets.mapping import PacketMap
 from service.packets.stream import SpacePacket
-from service.packets.values import finite, whole
 from service.times import parse_utc, shifted
 
 MOST_SAMPLES = 10_000

@@ -82,13 +82,13 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
         table=table,
         trackers=tuple(_columns(each) for each in table.trackers),
         measurements=tuple(_measurement(each) for each in table.measurements),
-        quaternion=_triple(prior.quaternion, 4) if prior and prior.quaternion else (),
-        rates=_triple(table.rates.components, 3) if table.rates else (),
-        gyro=_triple(table.gyro.counts, 3) if table.gyro else (),
+        quaternion=element_names(prior.quaternion, 4) if prior and prior.quaternion else (),
+        rates=element_names(table.rates.components, 3) if table.rates else (),
+        gyro=element_names(table.gyro.counts, 3) if table.gyro else (),
         gyro_values=_gyro_columns(table.gyro_blocks, "values"),
         gyro_offsets=next(iter(_gyro_columns(table.gyro_blocks, "time_offset_s")), ()),
-        velocity=_triple(table.velocity.components, 3) if table.velocity else (),
-        position=_triple(table.position.components, 3) if table.position else (),
+        velocity=element_names(table.velocity.components, 3) if table.velocity else (),
+        position=element_names(table.position.components, 3) if table.position else (),
     )
     faults = [
         Fault(f"packets.{key}", _missing(name, definition), shown_value(name))
@@ -118,10 +118,6 @@ def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission
         why = "is missing: " + ("no mission has" if not able else "several missions have")
         raise BadInput(Fault("spacecraft", f"{why} a table [packets]; there is {known}"))
     return able[0]
-
-
-def _triple(names: str | tuple[str, ...], count: int) -> tuple[str, ...]:
-    return element_names(names, count)
 
 
 def _gyro_columns(

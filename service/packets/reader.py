@@ -10,13 +10,17 @@ from msgspec import Struct
 
 from service.errors import BadFile, BadInput, Fault
 from service.missions.mission import Mission
-from service.observations.readers.lines import Line
-from service.packets.batches import BatchMaker, StarBatch
-from service.packets.carried import PacketAttitude
+from service.observations.readers.decompress import Line
+from service.packets.batches import (
+    BatchMaker,
+    MeasuredBatch,
+    MeasurementMaker,
+    PacketAttitude,
+    StarBatch,
+)
 from service.packets.definition import PacketDefinition, PacketFault, UnknownPacket
 from service.packets.gyro_blocks import GyroBlockMaker, PacketBlock
 from service.packets.mapping import packet_map
-from service.packets.measurements import MeasuredBatch, MeasurementMaker
 from service.packets.stream import (
     IDLE_APID,
     ApidCounts,

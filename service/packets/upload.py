@@ -14,7 +14,7 @@ from typing import IO
 
 from service.errors import BadFile, BadInput, Fault, shown_value
 from service.missions.mission import Mission
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.packets.definition import PacketDefinition
 from service.packets.mapping import packet_mission
 from service.packets.reader import PacketReader, PacketTotals

@@ -108,31 +108,31 @@ def _read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
 
 
 def _json(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.json_file import write_json
+    from service.products.attitude_table import write_json
 
     return write_json(series)
 
 
 def _aem(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm.aem import KVN, write_aem
+    from service.products.adm import KVN, write_aem
 
     return write_aem(series, KVN)
 
 
 def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm.aem import XML, write_aem
+    from service.products.adm import XML, write_aem
 
     return write_aem(series, XML)
 
 
 def _apm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm.apm import write_apm
+    from service.products.adm import write_apm
 
     return write_apm(series)
 
 
 def _acm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm.acm import write_acm
+    from service.products.adm import write_acm
 
     return write_acm(series)
 
@@ -144,13 +144,13 @@ def _ck(series: "AttitudeSeries") -> Iterator[bytes]:
 
 
 def _parquet(table: Table) -> Iterator[bytes]:
-    from service.products.parquet import write_parquet
+    from service.products.table_files import write_parquet
 
     return write_parquet(table)
 
 
 def _fits(table: Table) -> Iterator[bytes]:
-    from service.products.fits_file import write_fits
+    from service.products.table_files import write_fits
 
     return write_fits(table)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from service.errors import NotFound
 from service.products.attitudes import AttitudeBlock, AttitudeRows, SeriesInfo, series_of
-from service.products.reading.known_attitudes import between
+from service.products.reading.known import between
 from service.times import Utc
 from service.vectors import Vector
 

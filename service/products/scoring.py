@@ -12,7 +12,7 @@ import numpy as np
 
 from service.attitude.rotations import rotation_vectors
 from service.products.attitudes import AttitudeBlock, Integers
-from service.products.reading.known_attitudes import KnownAttitudes
+from service.products.reading.known import KnownAttitudes
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 AXES = ("x", "y", "z")

@@ -3,10 +3,16 @@
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
+
+import msgspec
 
 from service.csv_cells import neutralised
-from service.products.number_texts import number_texts
+
+if TYPE_CHECKING:
+    # numpy takes long to load, and `acquire --help` names the formats.
+    from service.vectors import Vector
+
 
 Kind = Literal["number", "integer", "flag", "text", "utc"]
 Page = Sequence[Sequence[Any]]
@@ -75,3 +81,23 @@ def _csv_texts(values: Sequence[object]) -> list[str]:
 
 def _in_quotes(text: str) -> str:
     return '"{}"'.format(text.replace('"', '""'))
+
+
+_ENCODER = msgspec.json.Encoder()
+
+
+def number_texts(values: Sequence[float | None], unknown: str = "null") -> list[str]:
+    """Each number as the shortest such text; `unknown` for None and NaN.
+
+    In one piece this takes a fifth of the time of `repr`.
+    """
+    if not values:
+        return []
+    text = _ENCODER.encode(values).decode()[1:-1]
+    return text.replace("null", unknown).split(",")
+
+
+def rows_of_texts(values: "Vector") -> list[tuple[str, ...]]:
+    """The numbers of an array (n, k) as texts, a row each, k > 0."""
+    texts = iter(number_texts(values.ravel().tolist()))
+    return list(zip(*[texts] * values.shape[1], strict=True))

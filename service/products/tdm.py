@@ -7,8 +7,7 @@ EME2000; a time is that of the point itself.
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
-from service.products.adm.forms import Pairs, kvn, one_line, time_text
-from service.products.adm.header import ORIGINATOR, TIME_SYSTEM
+from service.products.adm import ORIGINATOR, TIME_SYSTEM, Pairs, kvn, one_line, time_text
 
 REFERENCE_FRAME = "EME2000"
 

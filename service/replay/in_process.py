@@ -7,8 +7,8 @@ import msgspec
 
 from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
-from service.gyro.block import GyroBlock
-from service.replay.carry_attitude import AttitudeCarrier, reporting_to_carrier
+from service.gyro import GyroBlock
+from service.replay.from_file import AttitudeCarrier, reporting_to_carrier
 from service.replay.items import Item, LineOutcome, Pace, Report
 
 CHUNK = 500

@@ -8,9 +8,8 @@ from typing import Any
 from pydantic import TypeAdapter, ValidationError
 
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
-from service.gyro.block import GyroBlock
-from service.gyro.schema import block_from_line, is_gyro_line
-from service.observations.readers.lines import Line
+from service.gyro import GyroBlock, block_from_line, is_gyro_line
+from service.observations.readers.decompress import Line
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import RunName, Submission, submission_from_json
 from service.packets.reader import PacketReader, file_lines

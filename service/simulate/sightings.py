@@ -7,20 +7,25 @@ lies where the attitude of the epoch puts it.
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from erfa import ufunc
 
-from service.missions.mission import Band, Mission, Tracker
+from service.missions.mission import Band, Mission, RunCatalogSettings, Tracker
+from service.missions.scan import CrossScan, Sweep
 from service.observations.batch import Aberration
 from service.observations.calibrate import measured_magnitudes
 from service.observations.focal_plane import measured_angles_deg
 from service.simulate.motion import across, random_axis, turned_by
-from service.simulate.real_sky import RealSky
-from service.simulate.scans import readings
 from service.simulate.stretches import Stretch
-from service.sky.ephemeris import apparent
+from service.sky.catalog.blending import Rows, merged_into
+from service.sky.catalog.proper_motion import moved
+from service.sky.catalog.run_catalog import J2000_YEAR, RunCatalog, instrument_magnitude
+from service.sky.catalog.star_catalog import Catalog
+from service.sky.ephemeris import KM_PER_AU, apparent
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about, unit
 
@@ -39,6 +44,88 @@ class Seen:
     magnitude: Vector
     star: npt.NDArray[np.intp]
     """Rows of the run catalog, -1 for a spurious star."""
+
+
+# The sky as it is at one time and place, whatever a run catalog says of it.
+#
+# The service identifies with a catalog that serves a whole step of years, as
+# seen from the solar system's barycentre.  The stars themselves have moved by
+# then, and shift with the year; samples are drawn from these, so that what the
+# service leaves out is in the errors that its answers are judged by.
+#
+# Light is not bent by the Sun here (4 mas at right angles to it), and stars
+# that the run catalog rejects are never among those that a tracker picks.
+
+
+@dataclass(frozen=True, eq=False)
+class RealSky:
+    """The stars of a run catalog with the real ones behind each: one, or those seen as a blend.
+
+    A tracker cannot separate what the mission merges: it sees one star, in the
+    components' centre of light and as bright as all of them.
+    """
+
+    catalog: Catalog
+    run: RunCatalog
+    component: Rows
+    """Rows of the catalog, those of one star beside each other, in the run catalog's order."""
+    first: Rows
+    """Where each star's components begin; one entry more than there are stars."""
+    light: Vector
+    """Of each component, in the mission's instrument."""
+    magnitude_mag: Vector
+    """Of each star, all its components together."""
+
+    def directions(self, star: Rows, time: Utc, position_km: Vector) -> Vector:
+        """Unit vectors (n, 3), ICRS, from a spacecraft at a geocentric position to some stars.
+
+        Proper motion to the very time, and parallax; aberration is not in them.
+        """
+        count = self.first[star + 1] - self.first[star]
+        start = np.cumsum(count) - count
+        place = np.arange(count.sum()) + np.repeat(self.first[star] - start, count)
+        row, known = self.component[place], self.catalog
+        geometric = moved(
+            known.ra_deg[row],
+            known.dec_deg[row],
+            known.pm_ra_mas_per_year[row],
+            known.pm_dec_mas_per_year[row],
+            time.julian_year - J2000_YEAR,
+        )
+        # What is not known, or measured below zero, is as good as at infinity.
+        parallax = np.fmax(known.parallax_mas[row], 0.0) / (1000.0 * ARCSEC_PER_RADIAN)
+        seen = unit(geometric - parallax[:, None] * observer_position_au(time, position_km))
+        return unit(np.add.reduceat(self.light[place, None] * seen, start) if len(star) else seen)
+
+
+@lru_cache(maxsize=4)
+def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) -> RealSky:
+    """What stands behind the stars of a run catalog that was made with these settings."""
+    alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
+    then = moved(
+        catalog.ra_deg,
+        catalog.dec_deg,
+        catalog.pm_ra_mas_per_year,
+        catalog.pm_dec_mas_per_year,
+        run.epoch_year - J2000_YEAR,
+    )
+    leader = merged_into(then, alone, catalog.light_elsewhere, settings.merge_within_arcsec)
+    star_of = np.full(len(catalog), -1)
+    star_of[run.catalog_row] = np.arange(len(run))
+    star = star_of[leader]
+    itself = leader == np.arange(len(catalog))
+    component = np.flatnonzero((star >= 0) & (itself | ~catalog.light_elsewhere))
+    component = component[np.argsort(star[component], kind="stable")]
+    first = np.searchsorted(star[component], np.arange(len(run) + 1))
+    light = 10.0 ** (-0.4 * alone[component])
+    magnitude = -2.5 * np.log10(np.add.reduceat(light, first[:-1]))
+    return RealSky(catalog, run, component, first, light, magnitude)
+
+
+def observer_position_au(time: Utc, position_km: Vector) -> Vector:
+    """Position (3,) from the solar system's barycentre of a spacecraft at a geocentric position."""
+    _, barycentric, _ = ufunc.epv00(*time.tt)
+    return np.asarray(barycentric["p"] + position_km / KM_PER_AU)
 
 
 @dataclass(frozen=True)
@@ -135,3 +222,80 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
     aside, above = across(direction)
     noise = rng.normal(0.0, sigma_rad, (len(direction), 2))
     return unit(direction + noise[:, :1] * aside + noise[:, 1:] * above)
+
+
+IMAGE_SIGMA_SAMPLES = 1.2
+LIGHT_OVER_NOISE = 300.0
+"""Of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
+LIGHT_AT_MAG, FAINTEST_MAG = 5.0, 7.5
+FULL_SHARE = 0.8
+MOST_STEPS_OFF = 2.0
+_ROUNDS = 20
+
+
+def readings(
+    tracker: Tracker,
+    direction: Vector,
+    rates_rad_per_s: Vector,
+    magnitude_mag: float,
+    rng: np.random.Generator,
+) -> dict[str, Any] | None:
+    """The fields of a star that the tracker's scan gives, with their noise.
+
+    `direction` (3,) is in tracker axes, at the star's time; a sweep begins then, and the body
+    turns on with `rates_rad_per_s` (3,), about the tracker's axes.  None where the scan does not
+    reach the star, and for a raster, which has no stars by themselves.
+    """
+    if isinstance(tracker.scan, CrossScan):
+        return _counts(tracker, tracker.scan, direction, magnitude_mag, rng)
+    if isinstance(tracker.scan, Sweep):
+        return _times(tracker, tracker.scan, direction, rates_rad_per_s, rng)
+    return None
+
+
+def _counts(
+    tracker: Tracker,
+    scan: CrossScan,
+    direction: Vector,
+    magnitude_mag: float,
+    rng: np.random.Generator,
+) -> dict[str, Any]:
+    angles = measured_angles_deg(direction[None], tracker.calibration)[0]
+    step_deg = scan.step_arcsec / 3600.0
+    nominal = np.round(angles + rng.uniform(-MOST_STEPS_OFF, MOST_STEPS_OFF, 2) * step_deg, 6)
+    brightness = 10.0 ** (0.4 * (LIGHT_AT_MAG - min(magnitude_mag, FAINTEST_MAG)))
+    light = LIGHT_OVER_NOISE * scan.noise_counts * brightness
+    if scan.saturation_counts is not None:
+        room = FULL_SHARE * (scan.saturation_counts - scan.background_counts)
+        light = min(light, room * IMAGE_SIGMA_SAMPLES * math.sqrt(math.tau))
+    samples = np.arange(scan.samples) - scan.samples // 2
+    star: dict[str, Any] = {"h_deg": float(nominal[0]), "v_deg": float(nominal[1])}
+    for axis, off in zip("hv", (angles - nominal) / step_deg, strict=True):
+        image = np.exp(-0.5 * ((samples - off) / IMAGE_SIGMA_SAMPLES) ** 2)
+        counts = scan.background_counts + light * image / image.sum()
+        variance = np.full(scan.samples, scan.noise_counts**2)
+        if scan.gain_e_per_count is not None:
+            variance += counts / scan.gain_e_per_count
+        noisy = counts + rng.normal(0.0, np.sqrt(variance))
+        star[f"{axis}_counts"] = np.maximum(np.round(noisy, 1), 0.0).tolist()
+    return star
+
+
+def _times(
+    tracker: Tracker, scan: Sweep, direction: Vector, rates: Vector, rng: np.random.Generator
+) -> dict[str, Any] | None:
+    star: dict[str, Any] = {}
+    for axis, after_s in ((0, 0.0), (1, scan.v_after_s)):
+        seconds = []
+        for wire_deg in scan.wires_deg:
+            passed_s = 0.0
+            # The star moves much slower than the sweep: a fixed point is reached in a few rounds.
+            for _ in range(_ROUNDS):
+                turned = rotate_about(-rates * (after_s + passed_s), direction[None])
+                angle_deg = measured_angles_deg(turned, tracker.calibration)[0, axis]
+                passed_s = (angle_deg + wire_deg - scan.start_deg) / scan.rate_deg_per_s
+            seconds.append(passed_s + rng.normal(0.0, scan.time_sigma_s))
+        if not 0.0 <= min(seconds) <= max(seconds) <= scan.duration_s:
+            return None
+        star[f"{'hv'[axis]}_times"] = [round(each / scan.time_unit_s, 6) for each in seconds]
+    return star

@@ -6,25 +6,31 @@ and only their names are its own.  The truth is kept beside the batch and never
 enters it.
 """
 
+import json
 import math
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, cast
+from pathlib import Path
+from typing import Any, TextIO, cast
 
 import numpy as np
 
+from service.errors import BadFile, Fault
 from service.missions.mission import Band, Mission
 from service.observations.batch import Aberration
+from service.observations.readers.csv_rows import write_batches_csv
+from service.observations.readers.telemetry import telemetry_format
+from service.observations.schema import BatchIn
 from service.simulate.motion import (
     body_rates_deg_per_s,
+    orbit_of,
     pointed,
     random_axis,
     slewing_attitudes,
     tilted,
 )
-from service.simulate.orbits import orbit_of
-from service.simulate.real_sky import real_sky
-from service.simulate.sightings import BatchScene, Seen
+from service.simulate.sightings import BatchScene, Seen, real_sky
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
 from service.sky.model import SkyModel
@@ -200,3 +206,59 @@ def _truth(
             for each in seen
         ],
     }
+
+
+def truth_path(telemetry: Path) -> Path:
+    """Where the truth of a telemetry file stands: OUT.truth.ndjson beside OUT.ndjson."""
+    return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
+
+
+def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
+    """Write batches (NDJSON, or CSV by the name) and their truth; how many there were.
+
+    NDJSON also gets the gyro blocks, each after its batch.
+    Both files appear when they are whole: a pass cut short leaves the old ones.
+    """
+    count = 0
+
+    def told() -> Iterator[DrawnBatch]:
+        nonlocal count
+        for each in drawn:
+            truth.write(_line(each.truth))
+            count += 1
+            yield each
+
+    with ExitStack() as stack:
+        truth = stack.enter_context(_appearing(truth_path(telemetry)))
+        out = stack.enter_context(_appearing(telemetry))
+        if telemetry_format(telemetry) == "csv":
+            write_batches_csv(
+                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in told()), out
+            )
+        else:
+            out.writelines(_line(line) for each in told() for line in (each.batch, *each.gyro))
+    return count
+
+
+def read_objects(path: Path) -> Iterator[dict[str, Any]]:
+    """The JSON objects of a file of the service's own making, one a line."""
+    with path.open("rb") as file:
+        for line in file:
+            yield json.loads(line)
+
+
+def _line(thing: dict[str, Any]) -> str:
+    return json.dumps(thing, separators=(",", ":")) + "\n"
+
+
+@contextmanager
+def _appearing(path: Path) -> Iterator[TextIO]:
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("w", encoding="utf-8", newline="") as file:
+            yield file
+        part.replace(path)
+    except OSError as error:
+        raise BadFile(Fault(str(path), f"cannot be written: {error.strerror}")) from None
+    finally:
+        part.unlink(missing_ok=True)

@@ -11,10 +11,11 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
+from service.storage.recording.events import HeardEvents
 from service.storage.recording.transaction import may_pass
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, remove_probe
 from service.storage.sql.connections import PersistentConnection
-from service.storage.sql.database_file import DatabaseFile
+from service.storage.sql.database_file import DatabaseFile, FileLock
 from service.storage.sql.engines import (
     LONGEST_WAIT_S,
     TO_COMMIT,
@@ -26,8 +27,6 @@ from service.storage.sql.engines import (
     reading_engine,
     writing_engine,
 )
-from service.storage.sql.file_lock import FileLock
-from service.storage.sql.heard_events import HeardEvents
 from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
 from service.storage.sql.projector_lock import ProjectorLock
 

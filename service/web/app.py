@@ -1,6 +1,7 @@
 """The app, put together in one place."""
 
 import asyncio
+import json
 import logging
 import os
 import socket
@@ -10,6 +11,7 @@ from contextlib import asynccontextmanager
 
 import anyio
 import anyio.to_thread
+import yaml
 from fastapi import APIRouter, Depends, FastAPI
 from fastapi.routing import APIRoute
 from starlette.exceptions import HTTPException
@@ -21,60 +23,52 @@ from service.app.factory import App
 from service.errors import AcquisitionError
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
-    advice,
     alarms,
-    annotations,
     batches,
     calibrations,
-    compare,
     events,
     frames,
-    grades,
     gyro,
-    overview,
     probes,
     products,
     runs,
     spacecraft,
-    tracks,
     webhooks,
     zones,
 )
 from service.web.api import tokens as access
-from service.web.conditional import ConditionalAnswers
 from service.web.console import console_router
 from service.web.console.rendering import page_or_problem
 from service.web.event_stream import Live
-from service.web.middleware import AroundRequests, BelowPath
+from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
 from service.web.openapi.document import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
 from service.web.requests.problems import add_error_handlers
 from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLimits
-from service.web.warm_request import warm_request
 
 log = logging.getLogger(__name__)
 
 WORKER_THREADS = 64
 """Handlers run in threads; those of repeated frames wait there for the first."""
 
+# The order of the routes in `openapi.yaml`.
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
     frames.router,
     spacecraft.router,
     products.router,
-    grades.router,
     gyro.router,
-    tracks.router,
-    advice.router,
-    compare.router,
+    products.tracks_router,
+    spacecraft.advice_router,
+    batches.compare_router,
     calibrations.router,
     zones.router,
     runs.router,
-    overview.router,
+    spacecraft.overview_router,
     alarms.router,
-    annotations.router,
+    alarms.annotations_router,
     events.router,
     webhooks.router,
     access.router,
@@ -239,3 +233,22 @@ def _is_ready(app: App) -> bool:
     except Exception:  # the warm-up logs why, and the next call tries again
         return False
     return True
+
+
+class _Dumper(yaml.SafeDumper):
+    """Writes text of several lines as it stands."""
+
+
+def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
+    style = "|" if "\n" in text else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", text, style=style)
+
+
+_Dumper.add_representer(str, _text)
+
+
+def openapi_yaml() -> str:
+    """The text of `openapi.yaml`, made without a running service."""
+    # Once through JSON: YAML would mark what is shared between places.
+    plain = json.loads(json.dumps(bare_app().openapi()))
+    return str(yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

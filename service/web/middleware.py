@@ -1,15 +1,18 @@
-"""Middleware: host check, HEAD, timing, audit entries, and errors that nothing else answered."""
+"""Middleware: host check, HEAD, timing, audit, unanswered errors, and conditional requests."""
 
+import json
 import logging
 import re
 import time
 from collections.abc import Mapping
+from hashlib import blake2b
 from random import getrandbits
 from urllib.parse import parse_qs
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 from fastapi.routing import APIRoute
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.requests import Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -23,11 +26,11 @@ from service.web.requests.metrics import Metrics
 from service.web.requests.problem_types import WRONG_HOST, ProblemType
 from service.web.requests.problems import error_response, internal_error, problem_response
 from service.web.requests.request_body import BodyBudget
-from service.web.warm_request import WARM_REQUEST
+
+log = logging.getLogger(__name__)
 
 NOT_FOUND = ProblemType(404, "Not Found")
 
-log = logging.getLogger(__name__)
 requests = logging.getLogger("service.requests")
 
 PROBES = ("/livez", "/readyz", "/metrics")
@@ -260,3 +263,125 @@ def _host(scope: Scope) -> str | None:
     if host.startswith("["):
         return host[1:].partition("]")[0]
     return host.partition(":")[0]
+
+
+WARM_REQUEST = "service.warm_request"
+"""Key in the scope of the request that `warm_request` makes; metrics and logs leave it out."""
+
+_PATH = "/api/v1/batches"
+# Its form is right, but there is no such spacecraft.
+_STARS = [{"vector": [0.0, 0.01 * k, 1.0 - 5e-5 * k * k], "magnitude": 5.0} for k in range(5)]
+_BATCH = {
+    "spacecraft": "none:warm-up",
+    "batch": "warm-up",
+    "time": "2000-01-01T00:00:00Z",
+    "a_priori": {"quaternion": [0.0, 0.0, 0.0, 1.0]},
+    "velocity_km_per_s": [7.5, 0.0, 0.0],
+    "observations": [{"tracker": "1", "stars": _STARS}],
+}
+_BODY = json.dumps(_BATCH).encode()
+
+
+async def warm_request(app: ASGIApp) -> int:
+    """Send the app a batch of an unknown spacecraft; gives the status of the answer.
+
+    It is checked, queued and refused by the writer's thread; where tokens are
+    required, by the check of access.
+    """
+    head = (
+        ("host", "localhost"),
+        ("content-type", "application/json"),
+        ("content-length", str(len(_BODY))),
+    )
+    scope: Scope = {
+        "type": "http",
+        "asgi": {"version": "3.0"},
+        "http_version": "1.1",
+        "scheme": "http",
+        "method": "POST",
+        "path": _PATH,
+        "raw_path": _PATH.encode(),
+        "root_path": "",
+        "query_string": b"",
+        "headers": [(name.encode(), value.encode()) for name, value in head],
+        "client": None,
+        "server": None,
+        WARM_REQUEST: True,
+    }
+    status = 0
+
+    async def receive() -> Message:
+        return {"type": "http.request", "body": _BODY, "more_body": False}
+
+    async def send(message: Message) -> None:
+        nonlocal status
+        status = message.get("status", status)
+
+    await app(scope, receive, send)
+    return status
+
+
+API = "/api/"
+DIGEST_BYTES = 16
+KEPT_ON_304 = frozenset({b"cache-control", b"content-location", b"etag", b"link", b"vary"})
+"""Headers that an answer without a body repeats."""
+
+
+class ConditionalAnswers:
+    """Gives the answers to GET under `/api/` an ETag, and answers 304 where the client has it.
+
+    Only whole answers in one piece have one: streams are passed on.  The ETag is weak, for it is
+    the same whether the answer is compressed or not.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one request; HEAD comes as GET (`AroundRequests`)."""
+        if scope["type"] != "http" or scope["method"] != "GET" or not scope["path"].startswith(API):
+            await self.app(scope, receive, send)
+            return
+        start: Message | None = None
+
+        async def sent(message: Message) -> None:
+            nonlocal start
+            if _is_whole(message):
+                start = message
+                return
+            if start is not None:
+                start, message = _tagged(start, message, Headers(scope=scope))
+                await send(start)
+                start = None
+            await send(message)
+
+        await self.app(scope, receive, sent)
+
+
+def _is_whole(message: Message) -> bool:
+    """Whether a message begins an answer that comes in one piece; streams tell no length."""
+    return (
+        message["type"] == "http.response.start"
+        and message["status"] == 200
+        and any(name == b"content-length" for name, _ in message["headers"])
+    )
+
+
+def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, Message]:
+    """The answer with its ETag, or without its body where the client names that ETag."""
+    digest = blake2b(message.get("body", b""), digest_size=DIGEST_BYTES).hexdigest()
+    headers = MutableHeaders(raw=list(start["headers"]))
+    headers["ETag"] = tag = f'W/"{digest}"'
+    # It may be the caller's alone, and is asked for again each time: a session may have ended.
+    headers.setdefault("Cache-Control", "private, no-cache")
+    if not _names(asked, tag):
+        return {**start, "headers": headers.raw}, message
+    kept = [each for each in headers.raw if each[0] in KEPT_ON_304]
+    return {**start, "status": 304, "headers": kept}, {**message, "body": b""}
+
+
+def _names(asked: Headers, tag: str) -> bool:
+    """Whether `If-None-Match` names a tag; weak and strong ones of one name are the same."""
+    opaque = tag.removeprefix("W/")
+    named = [each.strip() for line in asked.getlist("if-none-match") for each in line.split(",")]
+    return any(each == "*" or each.removeprefix("W/") == opaque for each in named)

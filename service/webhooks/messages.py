@@ -1,7 +1,14 @@
 """Which events a webhook wants, the messages that they become, and what comes of sending them."""
 
+import base64
 import hashlib
+import hmac
+import logging
+import secrets
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import msgspec
 
@@ -9,6 +16,8 @@ from service.alarms.limits import Severity
 from service.storage.recording.events import Event
 from service.storage.sql.columns import Row
 from service.storage.webhooks.registered import Registered
+
+log = logging.getLogger(__name__)
 
 TEST_KIND = "test"
 TOTAL_S = 10.0
@@ -112,3 +121,96 @@ def test_message(id: str, now: str) -> tuple[str, bytes]:
     body = {"type": TEST_KIND, "timestamp": now, "data": {"webhook": id}}
     digest = hashlib.sha256(f"{id} {now}".encode()).hexdigest()
     return f"test_{digest[:16]}", msgspec.json.encode(body)
+
+
+PREFIX = "whsec_"
+SECRET_BYTES = 32
+
+
+def new_webhook_secret() -> str:
+    """A new random secret, as receivers are given it."""
+    return PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
+
+
+def signed_headers(
+    secrets: Sequence[str], message_id: str, unix_s: int, body: bytes
+) -> dict[str, str]:
+    """The headers of an attempt at a time, with a signature by each secret."""
+    signed = f"{message_id}.{unix_s}.".encode() + body
+    return {
+        "webhook-id": message_id,
+        "webhook-timestamp": str(unix_s),
+        "webhook-signature": " ".join(_signature(secret, signed) for secret in secrets),
+    }
+
+
+def _signature(secret: str, signed: bytes) -> str:
+    key = base64.b64decode(secret.removeprefix(PREFIX))
+    return "v1," + base64.b64encode(hmac.digest(key, signed, hashlib.sha256)).decode()
+
+
+# Counts attempts by webhook, and logs where deliveries begin to fail, recover or stop.
+#
+# One line for each change: what fails for a day is tried hundreds of times.
+
+Result = Literal["delivered", "failed", "dead"]
+RESULTS: tuple[Result, ...] = ("delivered", "failed", "dead")
+
+
+@dataclass
+class _Failing:
+    """The attempts since the last one that succeeded."""
+
+    failed: int = 0
+    dead: int = 0
+
+
+class DeliveryLog:
+    """What became of the attempts to deliver, since the start."""
+
+    def __init__(self) -> None:
+        self.counts: Counter[tuple[str, str, Result]] = Counter()
+        """Attempts by the webhook's id and name and by their result."""
+        self._failing: dict[str, _Failing] = {}
+        self._states: dict[str, str] = {}
+
+    def listed(self, webhooks: Iterable[Registered]) -> None:
+        """Note the webhooks that there are, and log where the state of one has changed."""
+        for webhook in webhooks:
+            for result in RESULTS:
+                self.counts[webhook.id, webhook.name, result] += 0
+            before = self._states.get(webhook.id, "active")
+            if webhook.state != before:
+                if webhook.state == "active":
+                    log.info("webhook %s: active again", webhook.name)
+                else:
+                    log.warning("webhook %s: %s: %s", webhook.name, webhook.state, webhook.reason)
+            self._states[webhook.id] = webhook.state
+
+    def delivered(self, webhook: Registered, events: int) -> None:
+        """Count deliveries; after failures, log that they go on."""
+        if not events:
+            return
+        self.counts[webhook.id, webhook.name, "delivered"] += events
+        failing = self._failing.pop(webhook.id, None)
+        if failing is not None:
+            log.info(
+                "webhook %s: delivers again after %d failed attempts; dead letters: %d",
+                webhook.name,
+                failing.failed + failing.dead,
+                failing.dead,
+            )
+
+    def failed(self, webhook: Registered, event: int, fault: str | None, is_dead: bool) -> None:
+        """Count a failed attempt; log the first one, and the first dead letter."""
+        self.counts[webhook.id, webhook.name, "dead" if is_dead else "failed"] += 1
+        failing = self._failing.get(webhook.id)
+        if failing is None:
+            failing = self._failing[webhook.id] = _Failing()
+            log.warning("webhook %s: event %d was not delivered: %s", webhook.name, event, fault)
+        if is_dead:
+            failing.dead += 1
+            if failing.dead == 1:
+                log.error("webhook %s: event %d is a dead letter: %s", webhook.name, event, fault)
+        else:
+            failing.failed += 1

@@ -1,6 +1,7 @@
 """`acquire simulate paper`: every table of the paper, theirs beside ours."""
 
 import json
+import os.path
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,9 +10,8 @@ from typing import TextIO
 from service.errors import BadInput, Fault
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Identifier
-from studies.paper_1994.document import document
 from studies.paper_1994.experiments import run_experiments
-from studies.paper_1994.plots import draw
+from studies.paper_1994.plots import PICTURES, PLACES, draw
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.report import (
     PAPER_IDENTIFIER,
@@ -122,3 +122,112 @@ def write_json(rows: Sequence[Row], path: Path) -> None:
     """Write rows as a JSON array, one a line."""
     lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
     path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")
+
+
+_RATE_TABLES = range(2, 11)
+
+_INTRODUCTION = """\
+The simulator of the paper, made anew, sends its views through the same code as any batch: a view
+is a batch whose a priori attitude has its boresight (cap) or its pole (band) on the zone's axis.
+Every run of a table sees the same zones, stars and draws, as in the paper; only the errors differ.
+`acquire simulate paper --identifier starid --plots docs/plots --report docs/paper.md` makes this
+page again, with `--seed` and `--stars` of your choice.
+
+How the paper was read, where it leaves a choice:
+
+- the position error is one Gaussian radius in a random direction, not two Gaussian axes;
+- the attitude error turns phi about Z first, theta about Y, psi about X last, in body axes; in a
+  cap body X is the tracker's boresight, in a band it is the pole and Z the boresight;
+- where the magnitudes of a pair do not tell its order, no magnitude is compared at all;
+- where the angles to the pole tell the order, no cross product follows;
+- where both orders of a pair pass the cross product, which needs a CAPMAX or BANMAX above 90 deg,
+  a vote is cast for each pairing;
+- a magnitude error beyond RCMAG is drawn again, not cut to it;
+- SEPTOL is applied at the search, in an index of exact separations; the prototype also had it in
+  its hashing tables, whose "invalid indexing" is not repeated;
+- the prototype computes in REAL*4, the service in double precision but for the differences of the
+  angles to the pole (single, widened for its rounding), without a visible effect;
+- the views come of numpy's PCG64 generator, not of the paper's linear congruential one;
+- Table 8: 24 zones an experiment, about the Sun at seven dates by turns, not six fixed bands in
+  four runs;
+- one vote is enough; the paper's "ambiguous" counts stars without any vote;
+- the prototype read "all stars down to" a magnitude: of a double only components that bright are
+  merged. The service lets fainter ones add their light, as a tracker sees it
+  ([decision 5](decisions/0005-the-papers-run-catalogs.md)).
+
+Misprints taken as such: the angles of Table 2 that are not varied are 40, 40 and 60 arcsec, not
+degrees; in Table 9 the desert at 12 arcsec has 1820 stars right, not 1803; runs 3 and 4 of Table 7
+do not add up to 495 stars and are compared by their ambiguous and misidentified stars.
+
+A printed run is *inside* when its counts of stars not identified and misidentified lie in the 95 %
+region of experiments of the paper's size, drawn from our rates. The *reference* is an independent
+implementation of the same reading, 40 such experiments a run. The runs of a table share their
+stars, so that they fall inside or outside together.
+"""
+
+_OUTSIDE = """\
+The printed counts are one draw, so that about 1 run in 20 is expected outside even if everything
+were the same. The run catalogs of 1994 are not at hand, and ours differ from them by some percent
+of the stars (NCAP and NTOT in Tables 11 and 12). Of the rates a few differ from the reference's by
+more than three standard errors; no cause other than chance was found. The lines *Outside* and
+*Other than the reference* above name the runs.
+"""
+
+
+def document(
+    tallies: Sequence[Tally],
+    seeds: Sequence[int],
+    time_rows: Sequence[Row],
+    plots: Path,
+    file: Path,
+) -> str:
+    """Markdown: how the paper was read, pictures, Tables 2 to 14, and what differs.
+
+    The pictures are those that `plots.draw` made in the folder `plots`, linked
+    as seen from the document's own `file`.  `time_rows` are those of
+    Tables 11 to 14.  Of the identifiers beyond the paper's, Tables 2 to 10 follow.
+    """
+    mine = [tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER]
+    if not mine:
+        return _beyond(tallies, seeds)
+    # The report's own heading would stand where the section's does.
+    tables = report(mine, PAPER_IDENTIFIER, list(TITLES), time_rows).split("\n", 2)[2]
+    links = [
+        f"![Rates against errors]({os.path.relpath(path, file.parent)})"
+        for path in (plots / f"{name}.svg" for name in (*PICTURES, PLACES))
+        if path.exists()
+    ]
+    written = (
+        "For astronomers who know the paper: its tables beside those that this service gives.\n"
+        f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
+    )
+    parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *links, tables]
+    if mine:
+        parts.append(_OUTSIDE)
+    parts += [report(tallies, name, _RATE_TABLES) for name in _others(tallies)]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _beyond(tallies: Sequence[Tally], seeds: Sequence[int]) -> str:
+    """The page of identifiers that the paper has not."""
+    names = _others(tallies)
+    command = f"acquire simulate paper --identifier {' '.join(names)}"
+    parts = [
+        "# The runs of Fink & Shoup 1994, verified",
+        (
+            f"Seeds {', '.join(map(str, seeds))}, from {_least(tallies):,} stars a run: the views "
+            "that [paper.md](paper.md) shows for the votes, and what the paper printed for them. "
+            f"`{command} --report FILE` makes this page."
+        ),
+        *(report(tallies, name, _RATE_TABLES) for name in names),
+    ]
+    return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _others(tallies: Sequence[Tally]) -> list[Identifier]:
+    names = dict.fromkeys(tally.identifier for tally in tallies)
+    return [name for name in names if name != PAPER_IDENTIFIER]
+
+
+def _least(tallies: Sequence[Tally]) -> int:
+    return min((tally.stars for tally in tallies), default=0)

@@ -6,8 +6,7 @@ from service.missions.mission import Identifier
 from studies.paper_1994 import tables, time_tables
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.tally import Tally
-from studies.paper_1994.time_tables import Row
-from studies.paper_1994.timings import measure
+from studies.paper_1994.time_tables import Row, measure
 
 PAPER_IDENTIFIER: Identifier = "starid"
 TIMES, PROPORTIONS = (11, 12), (13, 14)

@@ -21,7 +21,6 @@ from service.identify.triangles.ptp import explained
 from service.simulate.scenes import Conditions, Scene, SceneSky, draw_scenes
 from service.sky.geometry.triangles import REACH_DEG
 from service.sky.whole_sky.guide import Guide, build_guide
-from studies.ptp_2015.case import LIMIT_MAG, Case
 from studies.ptp_2015.projections import Projections, projections_of
 from studies.ptp_2015.rivals.liebe import build_liebe
 from studies.ptp_2015.rivals.p_vector import build_p_vector
@@ -29,7 +28,7 @@ from studies.ptp_2015.rivals.planar_triangle import build_planar_triangle
 from studies.ptp_2015.rivals.proposed import Algorithm, Build
 from studies.ptp_2015.rivals.ptp import build_ptp
 from studies.ptp_2015.rivals.pyramid import build_pyramid
-from studies.ptp_2015.tally import COLUMNS, Tally
+from studies.ptp_2015.tally import COLUMNS, LIMIT_MAG, Case, Tally
 
 ALGORITHMS: Mapping[str, Build] = {
     "PTP": build_ptp,

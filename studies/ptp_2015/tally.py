@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from studies.ptp_2015.case import Case
+from service.simulate.scenes import Conditions
 
 COLUMNS = ("stars", "named", "named_right", "unique", "unique_right", "own_us", "check_us")
 """Of a field: stars; those that the algorithm names, those named rightly; after the check likewise;
@@ -43,6 +43,35 @@ class FieldShare:
     def __str__(self) -> str:
         low, high = self.interval
         return f"{self.percent:.2f} ({low:.2f}-{high:.2f})"
+
+
+LIMIT_MAG = 6.0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One condition and the algorithms that see its fields.
+
+    `adds`: noise of magnitude lifts stars fainter than the limit into the field
+    as well as it drops brighter ones; without it the sky ends at the limit.
+    """
+
+    name: str
+    algorithms: tuple[str, ...]
+    position_px: float
+    magnitude_sigma_mag: float = 0.0
+    adds: bool = True
+    fewest: int = 6
+
+    @property
+    def conditions(self) -> Conditions:
+        """The same for the simulator."""
+        return Conditions(
+            position_px=self.position_px,
+            magnitude_sigma_mag=self.magnitude_sigma_mag,
+            limit_mag=LIMIT_MAG,
+            fewest=self.fewest,
+        )
 
 
 @dataclass(frozen=True, eq=False)

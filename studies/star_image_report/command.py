@@ -10,15 +10,8 @@ from typing import TextIO
 from tqdm import tqdm
 
 from service.errors import BadInput, Fault
-from studies.star_image_report import (
-    estimating,
-    locating,
-    mesh,
-    optics,
-    plots,
-    recognising,
-    scanning,
-)
+from service.simulate.drawing import pictures_in
+from studies.star_image_report import estimating, locating, mesh, optics, recognising, scanning
 from studies.star_image_report.claims import Claim, Row, Study
 
 ROWS: Mapping[str, Callable[[Study], Row]] = {
@@ -117,7 +110,7 @@ def run_imaging(
     if json_path is not None:
         json_path.write_text(as_json(rows), encoding="utf-8")
     if plots_folder is not None:
-        plots.draw(rows, plots_folder)
+        draw(rows, plots_folder)
     if report_path is None:
         print("\n\n".join(table(row) for row in rows), file=out)
     else:
@@ -185,3 +178,17 @@ def as_json(rows: Sequence[Row]) -> str:
         for claim in row.claims
     ]
     return "[\n" + ",\n".join(lines) + "\n]\n"
+
+
+def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
+    """Draw every picture of the rows; the files written.
+
+    Raises `NotAvailable` where matplotlib is not installed.
+    """
+    with pictures_in(folder, "imaging") as pictures:
+        for row in rows:
+            for name, picture in row.pictures.items():
+                figure = pictures.figure(*picture.size)
+                picture.draw(figure)
+                pictures.save(figure, name)
+    return pictures.written

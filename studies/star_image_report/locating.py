@@ -5,12 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.centroids.sampled_psf import airy_psf, wired_psf
+from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Array
 from service.imaging.detection.star_image import AIRY_OVER_SIGMA
-from service.imaging.optics.pupil import behind_wires, disc
-from service.imaging.optics.transfer import image_by_fft
+from service.imaging.optics import behind_wires, disc, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.correlate import (

@@ -5,9 +5,14 @@ from typing import Any
 import numpy as np
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics.pupil import Pupil, between_wires, centres
-from service.imaging.optics.spectrum import thermal
-from service.imaging.optics.transfer import image_at, image_by_fft
+from service.imaging.optics import (
+    Pupil,
+    between_wires,
+    centres,
+    image_at,
+    image_by_fft,
+    thermal,
+)
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.further import wires_and_lines
 from studies.star_image_report.optics import DIAMETER_M, LASER_M

@@ -8,9 +8,14 @@ import numpy.typing as npt
 from scipy.special import j1, jn_zeros
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics.pupil import disc
-from service.imaging.optics.spectrum import LIGHT_SPEED_M_PER_S, gaussian_line
-from service.imaging.optics.transfer import autocorrelation, image_by_fft, image_by_functional
+from service.imaging.optics import (
+    LIGHT_SPEED_M_PER_S,
+    autocorrelation,
+    disc,
+    gaussian_line,
+    image_by_fft,
+    image_by_functional,
+)
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.wires import INCH_M
 

@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.centroids.window import Array
-from service.imaging.optics.pupil import Pupil, between_wires, disc
-from service.imaging.optics.transfer import image_at, image_by_fft
+from service.imaging.optics import Pupil, between_wires, disc, image_at, image_by_fft
 
 INCH_M = 0.0254
 Wires = Sequence[tuple[float, float]]

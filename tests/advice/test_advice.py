@@ -12,8 +12,8 @@ from service.advice.advice import WorkLimit
 from service.advice.statements import alignment_statement, noise_statement
 from service.advice.tolerances import rounded_up, tolerance_findings
 from service.advice.trackers import alignment_findings, magnitude_findings, noise_findings
-from service.app.advice_record import advice_record
-from service.cli.advice_text import advice_text
+from service.app.advice import advice_record
+from service.cli.texts import advice_text
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
 from service.storage.queries.recorded_batch import BatchSample

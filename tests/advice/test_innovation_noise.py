@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.advice.innovation_statements import innovation_findings
-from service.advice.innovations import LEAST, InnovationNoise, innovation_noise
+from service.advice.innovations import LEAST, InnovationNoise, innovation_findings, innovation_noise
 from service.advice.intervals import Interval
 from service.advice.trackers import NoiseFinding
 from service.filtering.filter import filter_attitude

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import select
 
 from service.access.tokens import Caller
-from service.app.calibrations.estimates import CalibrationRequest
+from service.app.calibration_estimates import CalibrationRequest
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json
 from service.settings import Settings

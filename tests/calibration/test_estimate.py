@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from service.calibration.elimination import eliminate
-from service.calibration.estimate import calibrate
-from service.calibration.held_out import calibrate_with_chosen_degree
+from service.calibration.estimate import calibrate, calibrate_with_chosen_degree
 from service.calibration.linearise import linearised, prepared, residuals, turned_attitudes
 from service.calibration.unknowns import Model, unknowns_of
 from service.errors import BadInput

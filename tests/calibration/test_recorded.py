@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from service.app.calibrations.estimates import CalibrationRequest
+from service.app.calibration_estimates import CalibrationRequest
 from service.errors import NotFound, WrongState
 from service.observations.schema import submission_from_json
 from tests.calibration.wrong_file import TURNED_ARCSEC, true_batches, write_mission_files
@@ -95,7 +95,7 @@ def test_reprocessing_uses_what_was_adopted_and_the_record_stays_as_it_was(app):
     before = app.spacecraft.history("TWO", quantities=["suspect_share"], strategy="latest").series
     assert sum(before["suspect_share"].value) > 0.8 * BATCHES
     adopted = app.adoptions.adopt(found.id, WHO)
-    progress, _ = app.runs.reprocess("calibrated", spacecraft="TWO", processes=1)
+    progress = app.runs.reprocess("calibrated", spacecraft="TWO", processes=1)
     assert (progress.recorded, progress.refused) == (BATCHES, 0)
     after = app.spacecraft.history(
         "TWO",

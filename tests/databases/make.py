@@ -39,8 +39,7 @@ from sqlalchemy.pool import NullPool
 from tqdm import tqdm
 
 from service.missions.mission import load_missions
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache

@@ -17,7 +17,7 @@ from nats.errors import NoServersError
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration
-from service.follow.jetstream import ACK_WAIT_S, DELIVERED, SEQUENCE, Follower, Metrics, Source
+from service.follow import ACK_WAIT_S, DELIVERED, SEQUENCE, Follower, Metrics, Source
 from service.storage.sql.tables import batches
 from tests.fresh_databases import sqlite_at
 from tests.gyro.blocks import body as gyro_block

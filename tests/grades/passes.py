@@ -11,7 +11,7 @@ from service.filtering.samples import (
     no_directions,
 )
 from service.grades.day import grade_day
-from service.grades.measured import Recorded
+from service.grades.stretches import Recorded
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.tracking import LiveFilterSettings, SmoothingSettings
 from service.times import DAY_S, parse_utc

@@ -3,7 +3,7 @@
 import numpy as np
 from sqlalchemy import insert
 
-from service.gyro.schema import GyroBlockIn, block_from_model
+from service.gyro import GyroBlockIn, block_from_model
 from service.storage.sql.tables import solutions
 from service.times import shifted
 from service.vectors import ARCSEC_PER_RADIAN

@@ -12,12 +12,12 @@ import httpx
 import numpy as np
 import pytest
 
-from service.app.telemetry.live_filter import LiveFilter
+from service.app.live_filter import LiveFilter
 from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import grade_day, window_of
-from service.grades.measured import attitudes_where
+from service.grades.stretches import attitudes_where
 from service.observations.schema import submission_from_json
 from service.storage.grades.inputs import recorded_in
 from service.storage.upkeep.archiving import archive

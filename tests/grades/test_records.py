@@ -9,7 +9,7 @@ from sqlalchemy import func, select, update
 from service.cli import main
 from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
-from service.grades.packing import packed, unpacked
+from service.grades.day import packed, unpacked
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.storage.upkeep.archiving import archive
 from service.storage.upkeep.prune import prune

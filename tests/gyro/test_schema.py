@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from service.errors import BadBatch
-from service.gyro.block import texts_of
-from service.gyro.schema import (
+from service.gyro import (
     MAX_SAMPLES,
     block_from_json,
     block_from_line,
     require_rates_within,
+    texts_of,
 )
 from service.times import parse_utc, shifted
 from tests.gyro.blocks import START, body

@@ -8,7 +8,7 @@ from pydantic import ValidationError
 from scipy.ndimage import gaussian_filter
 
 from service.imaging.centroids.centroid import METHODS
-from service.imaging.centroids.sampled_psf import airy_psf, wired_psf
+from service.imaging.centroids.psf import airy_psf, wired_psf
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
 from service.imaging.detection.star_image import psf_of, still_psf

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadFile
-from service.imaging.detection.points import find_points
-from service.imaging.frames.dark import hot_pixels, without_dark
+from service.imaging.detection.points import find_points, hot_pixels, without_dark
 from service.imaging.frames.frame import Frame
 
 SHAPE = (300, 400)

@@ -8,10 +8,9 @@ import pytest
 from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Detector
-from service.imaging.detection.cosmic_rays import hits_under
+from service.imaging.detection.cosmic_rays import hits_under, is_sharp
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
-from service.imaging.detection.shapes import is_sharp
 from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
 from studies.star_image_report.windows import draw_window

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from service.imaging.overlay import draw_overlay
-from service.imaging.overlay_marks import Mark
+from service.imaging.overlay import Mark, draw_overlay
 
 SIDE_PX = 256
 ARROW = (110, 200, 255)

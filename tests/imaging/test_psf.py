@@ -5,8 +5,7 @@ import pytest
 
 from service.errors import BadInput
 from service.imaging.centroids.centroid import centroid
-from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.centroids.sampled_psf import SampledPsf, airy_psf, wired_psf
+from service.imaging.centroids.psf import GaussianPsf, SampledPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Detector
 from studies.star_image_report.optics import airy
 from studies.star_image_report.windows import draw_stars

@@ -7,14 +7,18 @@ import pytest
 from scipy.special import j1
 
 from service.errors import BadInput
-from service.imaging.optics.pupil import Pupil, disc
-from service.imaging.optics.spectrum import Spectrum, gaussian_line, monochromatic, thermal
-from service.imaging.optics.transfer import (
+from service.imaging.optics import (
+    Pupil,
+    Spectrum,
     autocorrelation,
+    disc,
+    gaussian_line,
     image_at,
     image_by_fft,
     image_by_functional,
     image_of,
+    monochromatic,
+    thermal,
 )
 from studies.star_image_report.optics import (
     airy,

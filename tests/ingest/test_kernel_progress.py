@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numba
 
-from service.ingest import kernel_progress as progress
+from service.acquire import kernel_build as progress
 from tests.waiting import wait_until
 
 

@@ -74,7 +74,8 @@ def recorded(app, noisy):
 
 @pytest.mark.both_databases
 def test_with_the_same_settings_everything_comes_out_alike(app, recorded):
-    progress, compared = app.runs.reprocess("again", processes=1)
+    progress = app.runs.reprocess("again", processes=1)
+    compared = app.runs.compare("live", "again")
     assert (progress.total, progress.before, progress.recorded, progress.refused) == (
         BATCHES,
         0,
@@ -106,7 +107,8 @@ def test_another_mission_file_decides_and_the_comparison_counts_star_by_star(
     record(first, noisy)
     first.close()
     app = opened(mission=wider(missions))
-    _, compared = app.runs.reprocess("wider", processes=1)
+    app.runs.reprocess("wider", processes=1)
+    compared = app.runs.compare("live", "wider")
     before, after = answers_of(app, "live"), answers_of(app, "wider")
     assert {each["provenance"]["mission"] for each in after.values()} == {wider(missions).digest}
     stars = {"unique": 0, "ambiguous": 0, "unmatched": 0}
@@ -159,11 +161,12 @@ def test_what_was_stopped_goes_on_where_it_was(app, recorded):
     for _ in range(2):
         with pytest.raises(_Stopped):
             app.runs.reprocess("again", processes=1, step=stop_after_one)
-    progress, compared = app.runs.reprocess("again", processes=1)
+    progress = app.runs.reprocess("again", processes=1)
+    compared = app.runs.compare("live", "again")
     assert seen == [0, CHUNK, CHUNK, 2 * CHUNK]
     assert (progress.before, progress.recorded) == (2 * CHUNK, BATCHES - 2 * CHUNK)
     assert compared.batches == len(answers_of(app, "again")) == BATCHES
-    progress, _ = app.runs.reprocess("again", processes=1)
+    progress = app.runs.reprocess("again", processes=1)
     assert (progress.before, progress.recorded) == (BATCHES, 0)
 
 
@@ -235,10 +238,10 @@ def test_a_run_without_a_name_is_named_after_the_settings(opened, missions, make
     """The same settings find it again, others do not."""
     first = opened()
     first.submissions.submit(make())
-    names = [first.runs.reprocess(None, processes=1)[0].run for _ in range(2)]
+    names = [first.runs.reprocess(None, processes=1).run for _ in range(2)]
     first.close()
     other = opened(mission=wider(missions))
-    names.append(other.runs.reprocess(None, processes=1)[0].run)
+    names.append(other.runs.reprocess(None, processes=1).run)
     assert names[0] == names[1] != names[2]
     assert len(answers_of(other, names[0])) == 1
 
@@ -253,7 +256,8 @@ def test_a_batch_that_no_longer_fits_is_refused_by_name_and_the_rest_goes_on(
     settings = missions["XTE"].model_dump()
     settings["trackers"][0]["name"] = "OTHER"
     renamed = opened(mission=Mission.model_validate(settings))
-    progress, compared = renamed.runs.reprocess("again", processes=1)
+    progress = renamed.runs.reprocess("again", processes=1)
+    compared = renamed.runs.compare("live", "again")
     assert (progress.recorded, progress.refused) == (0, 2)
     assert progress.refusals[0].startswith("b1: observations.0.tracker: XTE has OTHER")
     assert compared.batches == 0

@@ -21,13 +21,13 @@ from sqlalchemy import select
 from service.acquire.kernel_build import SIGNALS
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput
+from service.ingest.bulk import identity_in
 from service.ingest.local_workers import (
     MOST_DEATHS,
     ChunkEndsWorkers,
     LocalWorkers,
     WorkerLost,
 )
-from service.ingest.telemetry_lines import identity_in
 from service.ingest.worker_process import WorkerConfig
 from service.observations.schema import submission_from_json
 from service.settings import Settings

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from service.errors import BadBatch, BadConfiguration
-from service.gyro.schema import GyroBlockIn, block_from_model
-from service.ingest.gyro import GyroIntake
+from service.gyro import GyroBlockIn, block_from_model
+from service.ingest.submit import GyroIntake
 from service.missions.mission import load_missions, parse_mission
 from tests.gyro.blocks import body
 from tests.missions.without_gyro import text_without_gyro

@@ -35,7 +35,7 @@ import httpx
 from service.acquire import acquire
 from service.app.factory import open_app
 from service.cli import main
-from service.cli.parser import build_parser
+from service.cli import build_parser
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
 from service.observations.schema import submission_from_json
 from service.settings import Settings

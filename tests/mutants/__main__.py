@@ -57,7 +57,6 @@ AREAS = {
         "service/web/requests",
         "service/observations/readers",
         "service/observations/decode.py",
-        "service/observations/measurement.py",
         "service/observations/schema.py",
     ),
 }

@@ -14,7 +14,7 @@ from service.csv_cells import neutralised, original
 from service.errors import BadFile
 from service.observations.readers import csv_table
 from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.observations.readers.telemetry import read_lines, require_telemetry
 from service.observations.schema import BatchIn, submission_from_json
 

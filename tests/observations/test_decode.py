@@ -13,8 +13,7 @@ from msgspec.structs import fields
 from service.observations import decode as canonical
 from service.observations import schema as wire
 from service.observations.decode import batch_from_canonical
-from service.observations.measurement import MeasurementIn
-from service.observations.prediction import PredictionIn
+from service.observations.schema import MeasurementIn, PredictionIn
 from tests.observations.example import BATCH
 
 ALIKE = [

@@ -9,7 +9,7 @@ import pytest
 
 from service.acquire import acquire
 from service.acquire.result import Path
-from service.alarms.measurements import a_priori_angle_deg
+from service.alarms.quantities import a_priori_angle_deg
 from service.errors import BadBatch, BadConfiguration, BadFile
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
@@ -20,7 +20,7 @@ from service.observations.readers.telemetry import read_lines
 from service.observations.scans.reduce import reduced
 from service.observations.scans.sun import sun_body
 from service.observations.schema import BatchIn, submission_from_json
-from service.simulate.scans import readings
+from service.simulate.sightings import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import sun_direction

@@ -10,7 +10,7 @@ import pytest
 from service.app.factory import open_app
 from service.cli import main
 from service.errors import BadConfiguration, BadInput
-from service.gyro.schema import block_from_line
+from service.gyro import block_from_line
 from service.missions.mission import SHIPPED_FOLDER
 from service.packets.definition import PacketDefinition
 from service.packets.reader import PacketReader

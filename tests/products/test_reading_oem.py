@@ -8,7 +8,7 @@ import pytest
 from brahe.ccsds import OEM
 
 from service.errors import BadFile, BadInput
-from service.products.reading.ephemerides import read_ephemeris
+from service.products.reading.files import read_ephemeris
 from service.products.reading.oem import read_oem
 from service.times import parse_utc, shifted
 from tests.products.orbits import START, oem_text, orbit

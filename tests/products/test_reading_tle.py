@@ -12,7 +12,7 @@ from astropy.utils import iers
 
 from service.errors import BadFile, NotAvailable
 from service.products.reading import tle
-from service.products.reading.ephemerides import read_ephemeris
+from service.products.reading.files import read_ephemeris
 from service.products.reading.tle import eme2000_from_teme, read_tle
 from service.times import parse_utc, shifted
 from tests.products.orbits import ISS, ISS_EPOCH, with_checksum

@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.attitude.rotations import turned_quaternion
-from service.cli.score_picture import picture
+from service.cli.charts import errors_picture
 from service.products.reading.aem import read_aem
 from service.products.scoring import errors_of, histogram, statistics
 from service.vectors import ARCSEC_PER_RADIAN
@@ -81,13 +81,13 @@ def test_an_exact_attitude_has_no_error_and_a_picture():
     errors = errors_of(series(page).blocks, truth_of(page))
     assert errors.total_arcsec.max() < 1e-9
     assert sum(histogram(errors)["x"]) == 20
-    ET.fromstring(picture(errors, "attitudes of <XTE> & others"))
+    ET.fromstring(errors_picture(errors, "attitudes of <XTE> & others"))
 
 
 def test_the_picture_shows_every_axis_and_stays_small(drawn):
     true, page, _ = drawn
     errors = errors_of(series(page).blocks, truth_of(rows(true)))
-    text = picture(errors, "good attitudes of XTE")
+    text = errors_picture(errors, "good attitudes of XTE")
     ET.fromstring(text)
     assert text.count("<circle") <= 9_000
     for axis in "xyz":

@@ -14,15 +14,14 @@ import pyarrow.parquet
 import pytest
 
 from service.alarms.quantities import QUANTITIES
-from service.app import history_table
+from service.app import spacecraft
 from service.errors import NotAvailable
 from service.products.attitude_table import COLUMNS, ESTIMATED_COLUMNS
-from service.products.fits_file import write_fits
 from service.products.formats import OUTPUT_FORMATS
-from service.products.parquet import write_parquet
+from service.products.table_files import write_fits, write_parquet
 from service.products.tables import Column, Table, write_csv
-from service.storage.gyro import samples_table
-from service.storage.queries.tables import result_tables
+from service.storage import gyro
+from service.storage.queries import result_tables
 from service.times import parse_utc
 from tests.products.series import GOLDEN, random_quaternions, rows, whole, written
 
@@ -120,7 +119,7 @@ def test_fits_has_units_that_astropy_knows(tmp_path):
     """Those of every table: a warning is an error here."""
     quantities = [Column(name, unit=each.unit) for name, each in QUANTITIES.items()]
     of_tables = [*COLUMNS, *ESTIMATED_COLUMNS, *quantities]
-    for module in (history_table, result_tables, samples_table):
+    for module in (spacecraft, result_tables, gyro):
         for each in vars(module).values():
             if isinstance(each, tuple) and each and isinstance(each[0], Column):
                 of_tables += each

@@ -8,8 +8,7 @@ import pytest
 from service.errors import BadInput
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
-from service.simulate.frame_files import write_frames
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, write_frames
 
 
 @pytest.fixture

@@ -14,12 +14,10 @@ from service.missions.corrections import Calibration
 from service.observations.calibrate import correct
 from service.observations.focal_plane import measured_angles_deg, tracker_vectors
 from service.observations.schema import submission_from_json
-from service.simulate.files import read_objects, truth_path, write_pass
-from service.simulate.orbits import HaloOrbit, orbit_of
-from service.simulate.real_sky import real_sky
-from service.simulate.sightings import BatchScene, Seen, anywhere, shaken
+from service.simulate.motion import HaloOrbit, orbit_of
+from service.simulate.sightings import BatchScene, Seen, anywhere, real_sky, shaken
 from service.simulate.stretches import NO_TROUBLES, Pass, Stretch, Trouble, Troubles
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import draw_pass, read_objects, truth_path, write_pass
 from service.sky.ephemeris import apparent, observer_velocity, sun_direction
 from service.times import parse_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, angle_between_deg, matrix_from_quaternion, unit

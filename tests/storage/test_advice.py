@@ -9,8 +9,8 @@ from sqlalchemy import func, select
 
 from service.acquire import acquire
 from service.advice.advice import advise
-from service.advice.zone_statements import zone_statements
-from service.app.advice_record import advice_record
+from service.advice.statements import zone_statements
+from service.app.advice import advice_record
 from service.errors import BadBatch, Busy, NotFound
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
 from service.simulate.stretches import Pass

@@ -16,9 +16,9 @@ from service.storage.archive import folder, rows
 from service.storage.archive.opened import WHOLE, Opened, columns_of
 from service.storage.archive.reading import Archive
 from service.storage.projections import rollups
-from service.storage.sql.archive_tables import archived_batches
 from service.storage.sql.columns import metadata
 from service.storage.sql.tables import (
+    archived_batches,
     batches,
     frames,
     idempotency_keys,

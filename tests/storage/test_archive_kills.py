@@ -11,8 +11,7 @@ import pytest
 from sqlalchemy import select
 
 from service.storage.archive import folder
-from service.storage.sql.archive_tables import archived_batches
-from service.storage.sql.tables import batches, results
+from service.storage.sql.tables import archived_batches, batches, results
 from service.storage.upkeep import archiving
 from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify

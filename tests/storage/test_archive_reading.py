@@ -9,9 +9,9 @@ from sqlalchemy import inspect
 from service.errors import Busy, NotAvailable, WrongState
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder
+from service.storage.queries import compare_runs
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.with_archive import both_runs
-from service.storage.queries.with_archive.rows import count
+from service.storage.queries.with_archive import count
 from service.storage.sql.tables import batches, results
 from service.storage.upkeep import archiving
 from service.storage.upkeep.restoring import PartFilter, restore
@@ -212,7 +212,7 @@ def test_comparisons_are_the_same_wherever_the_batches_are(filled, place, monkey
     archiving.archive(filled.store, place, LATER)
     assert compared_of(filled) == before
     restore(filled.store, place, PartFilter(run="r"))
-    monkeypatch.setattr(both_runs, "GROUP", 2)
+    monkeypatch.setattr(compare_runs, "GROUP", 2)
     assert compared_of(filled) == before
 
 
@@ -222,7 +222,7 @@ def test_runs_in_the_archive_are_joined_by_the_indexes_of_the_record(filled, pla
     archiving.archive(filled.store, place, LATER)
     with filled.store.reading() as connection:
         archive, live = filled.store.archive, ResultFilter(run="live")
-        (group,) = both_runs.both_runs(connection, archive, live, "r", None)
+        (group,) = compare_runs.both_runs(connection, archive, live, "r", None)
         with group.reading() as of_group:
             for table in (batches, results):
                 there = {each["name"] for each in inspect(of_group).get_indexes(table.name)}

@@ -21,7 +21,7 @@ from service.settings import Settings
 from service.storage.sql import migrations
 from service.storage.sql.columns import metadata
 from service.storage.sql.engines import database_url, writing_engine
-from service.storage.sql.prepared import execute
+from service.storage.sql.statements import execute
 from service.storage.sql.tables import batches
 from service.storage.store import Store
 from service.storage.upkeep.backup import back_up

@@ -9,8 +9,7 @@ import sys
 import pytest
 
 from service.errors import BadConfiguration
-from service.storage.sql.database_file import DatabaseFile
-from service.storage.sql.file_lock import FileLock, is_written
+from service.storage.sql.database_file import DatabaseFile, FileLock, is_written
 from service.storage.sql.migrations import revision_of, upgrade
 from service.storage.store import Store
 from tests.fresh_databases import sqlite_at
@@ -19,7 +18,7 @@ from tests.scale import size
 HOLDING = """
 import sys
 from pathlib import Path
-from service.storage.sql.file_lock import FileLock
+from service.storage.sql.database_file import FileLock
 from service.storage.sql.database_file import DatabaseFile
 lock = FileLock(DatabaseFile(Path(sys.argv[1])))
 lock.take()

@@ -5,12 +5,15 @@ from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, NotFound
 from service.storage.sql.access_tables import audit
-from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import metadata
-from service.storage.sql.grade_tables import graded_days
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.rollup_tables import rollups_hourly
-from service.storage.sql.tables import batches, runs
+from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    batches,
+    rollups_hourly,
+    runs,
+)
 from service.storage.upkeep import archiving
 from service.storage.upkeep.forget import ForgetFilter, forget, found
 from service.storage.upkeep.restoring import verify_archive

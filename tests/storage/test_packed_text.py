@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from sqlalchemy import func, select
 
-from service.storage.sql.packed_text import pack, unpack
+from service.storage.sql.columns import pack, unpack
 from service.storage.sql.tables import batches, results
 
 

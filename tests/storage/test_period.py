@@ -9,8 +9,7 @@ from scipy import stats
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.queries.period.sample import sample_period
-from service.storage.queries.period.stars import period_stars
+from service.storage.queries.period import period_stars, sample_period
 from service.storage.queries.time_buckets import BucketFilter
 from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec

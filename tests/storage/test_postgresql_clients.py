@@ -13,8 +13,7 @@ from sqlalchemy import create_engine, make_url, text
 from service.errors import BadConfiguration
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
-from service.storage.upkeep.backup import back_up
-from service.storage.upkeep.restore import restore
+from service.storage.upkeep.backup import back_up, restore
 from tests.storage.test_restore import clear, rows_of
 
 NOTING = """#!{python}

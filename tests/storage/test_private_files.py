@@ -9,8 +9,7 @@ import pytest
 from service.ingest.spool import Spool, SpooledReplay
 from service.storage.sql.database_file import warn_of_readers
 from service.storage.store import Store
-from service.storage.upkeep.backup import back_up
-from service.storage.upkeep.restore import restore
+from service.storage.upkeep.backup import back_up, restore
 
 
 @pytest.fixture(autouse=True)

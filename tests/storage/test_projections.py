@@ -16,7 +16,6 @@ from service.storage.projections import projector as projecting
 from service.storage.projections.projector import Projector, rebuild_trends
 from service.storage.recording.results import next_seqs
 from service.storage.sql.alarm_tables import alarm_actions, alarms, limits, watches
-from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
 from service.storage.sql.tables import (
     batches,
     catalogs,
@@ -24,6 +23,8 @@ from service.storage.sql.tables import (
     missions,
     projector,
     results,
+    rollups_daily,
+    rollups_hourly,
     runs,
     tracker_values,
 )

@@ -11,8 +11,7 @@ from sqlalchemy.pool import NullPool
 from service.errors import BadConfiguration
 from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
-from service.storage.upkeep.backup import back_up
-from service.storage.upkeep.restore import restore
+from service.storage.upkeep.backup import back_up, restore
 from service.storage.upkeep.verify import verify
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
 

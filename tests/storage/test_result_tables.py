@@ -13,7 +13,7 @@ from service.app.factory import open_app
 from service.cli import main
 from service.products.formats import write_table
 from service.settings import Settings
-from service.storage.queries.tables import result_tables
+from service.storage.queries import result_tables
 from service.storage.sql.tables import MEASURED
 from service.times import parse_utc
 from tests.storage.samples import KINDS, submission

@@ -10,12 +10,12 @@ from service.cli import main
 from service.errors import BadInput
 from service.observations.schema import OptionsIn
 from service.storage.projections import rollups
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.tables import (
     tracker_rollups_daily,
     tracker_rollups_hourly,
     tracker_splits,
+    tracker_values,
 )
-from service.storage.sql.tables import tracker_values
 from service.storage.upkeep import split_trackers
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify

@@ -7,10 +7,8 @@ import numpy as np
 from service.missions.gyro import MotionSettings
 from service.missions.mission import Band
 from service.missions.tracking import TrackingSettings
-from service.simulate.motion import pointed, random_axis, turned_by
-from service.simulate.orbits import orbit_of
-from service.simulate.real_sky import real_sky
-from service.simulate.sightings import BatchScene
+from service.simulate.motion import orbit_of, pointed, random_axis, turned_by
+from service.simulate.sightings import BatchScene, real_sky
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import observer_velocity, sun_direction
 from service.times import parse_utc, shifted

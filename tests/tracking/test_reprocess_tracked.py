@@ -6,7 +6,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadBatch
-from service.gyro.schema import block_from_json
+from service.gyro import block_from_json
 from service.ingest.reprocess import ReprocessProgress
 from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
@@ -46,7 +46,8 @@ def test_late_batches_are_tracked_in_order_of_time(app, flown):
     assert in_order["b00004"] == "b00001"
     for each in flown:
         send(app, each.body, run="in-order")
-    progress, compared = app.runs.reprocess("tracked", track=True)
+    progress = app.runs.reprocess("tracked", track=True)
+    compared = app.runs.compare("live", "tracked")
     assert (progress.total, progress.recorded, progress.refused) == (10, 10, 0)
     assert compared.batches == 10
     assert answers_of(app, "tracked") == answers_of(app, "in-order")
@@ -70,7 +71,7 @@ def test_what_was_stopped_goes_on_as_if_it_had_not_been(app, flown, monkeypatch)
         app.runs.reprocess("parts", track=True, step=stop)
     with pytest.raises(BadBatch, match="was begun with --track"):
         app.runs.reprocess("parts", processes=1)
-    progress, _ = app.runs.reprocess("parts", track=True)
+    progress = app.runs.reprocess("parts", track=True)
     assert (progress.before, progress.recorded) == (4, 6)
     assert answers_of(app, "parts") == answers_of(app, "whole")
 
@@ -86,7 +87,7 @@ def test_a_run_without_tracking_does_not_continue_with_it(app, flown, tmp_path):
         app.runs.reprocess_into_archive("tracked", tmp_path, processes=1)
     # Without a name the two are two runs.
     assert (
-        len({app.runs.reprocess(None, track=track, processes=1)[0].run for track in (False, True)})
+        len({app.runs.reprocess(None, track=track, processes=1).run for track in (False, True)})
         == 2
     )
     assert len(app.runs.all()) == 5

@@ -11,7 +11,7 @@ import pytest
 from service.acquire import acquire
 from service.app.factory import open_app
 from service.errors import BadBatch
-from service.gyro.schema import block_from_json
+from service.gyro import block_from_json
 from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
 from service.observations.readers.csv_columns import batch_cells, batch_fields

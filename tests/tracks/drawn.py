@@ -10,8 +10,7 @@ import numpy as np
 
 from service.acquire import acquire
 from service.observations.schema import BatchIn, submission_from_model
-from service.simulate.real_sky import real_sky
-from service.simulate.sightings import BatchScene, anywhere, shaken
+from service.simulate.sightings import BatchScene, anywhere, real_sky, shaken
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.planets import PLANETS, planet_place

@@ -7,7 +7,7 @@ from contextlib import closing
 import httpx
 import pytest
 
-from service.app.calibrations.estimates import CalibrationRequest
+from service.app.calibration_estimates import CalibrationRequest
 from service.app.factory import open_app
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded

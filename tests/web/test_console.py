@@ -19,8 +19,7 @@ from service.vectors import angle_between_deg, matrix_from_quaternion
 from service.web.app import create_app
 from service.web.console import formatting, options
 from service.web.console.charts import sky_chart
-from service.web.console.charts.heat_map import packed
-from service.web.console.charts.sparkline import HEIGHT, PAD, WIDTH, common_top, sparkline
+from service.web.console.charts.sparkline import HEIGHT, PAD, WIDTH, common_top, packed, sparkline
 from tests.web.console_pages import console_addresses
 from tests.web.markup import Markup
 from tests.web.serving import Server, in_process_settings

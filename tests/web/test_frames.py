@@ -10,8 +10,7 @@ import pytest
 from PIL import Image
 
 from service.missions.mission import load_missions
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.web.test_bodies import raw
 

@@ -10,9 +10,9 @@ import pytest
 from service.app.factory import open_app
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import checked_from_json
-from service.replay.bulk_upload import replay_in_bulk
 from service.replay.in_process import replay_in_process
 from service.replay.items import packet_items
+from service.replay.over_http import replay_in_bulk
 from service.replay.summary import ReplaySummary
 from service.web.app import create_app
 from tests.packets.packing import ANGLES, TABLE, mission_of_pass, packed, packet, xtce

@@ -11,14 +11,13 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from service.sky.zones import SearchRegion
-from service.storage.models.period import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
+from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
 from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix
-from service.web.console.charts.period.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer
-from service.web.console.charts.period.attitude import attitude_charts
-from service.web.console.charts.period.focal_plane import focal_plane_map
-from service.web.console.charts.period.histogram import residual_histogram
-from service.web.console.charts.period.magnitudes import magnitude_chart
+from service.web.console.charts.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer
+from service.web.console.charts.attitude import attitude_charts
+from service.web.console.charts.focal_plane import focal_plane_map
+from service.web.console.charts.histogram import magnitude_chart, residual_histogram
 
 START = parse_utc("1999-03-01T00:00:00Z")
 ARCSEC = np.radians(1 / 3600)

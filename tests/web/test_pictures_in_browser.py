@@ -8,8 +8,7 @@ import pytest
 from PIL import Image
 
 from service.missions.mission import load_missions
-from service.simulate.frame_files import frame_bytes
-from service.simulate.frames import FrameSettings, draw_frames
+from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
 from tests.web.test_frames import PLEIADES

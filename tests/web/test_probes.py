@@ -18,7 +18,7 @@ from service.app.factory import open_app
 from service.errors import Busy, Stopping
 from service.storage.projections import projector
 from service.web.app import create_app
-from service.web.warm_request import warm_request
+from service.web.middleware import warm_request
 from tests.fresh_databases import sqlite_at
 from tests.scale import draws
 from tests.waiting import wait_until

@@ -14,7 +14,7 @@ import pytest
 import zstandard
 
 from service.app.factory import open_app
-from service.ingest import replay_lines
+from service.ingest import replays as replays_module
 from service.ingest.replays import RunningReplay
 from service.observations.readers import decompress
 from service.web.app import create_app
@@ -43,8 +43,8 @@ def begun(client, run, data, coding="identity", **headers):
 @pytest.fixture
 def few_blank_lines(monkeypatch):
     """The bound of blank lines, set so low that reading up to it takes no time."""
-    monkeypatch.setattr(replay_lines, "MAX_BLANK_LINES", 20_000)
-    return replay_lines.MAX_BLANK_LINES
+    monkeypatch.setattr(replays_module, "MAX_BLANK_LINES", 20_000)
+    return replays_module.MAX_BLANK_LINES
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from service.storage.webhooks.registered import Registered
-from service.webhooks.delivery_log import DeliveryLog
+from service.webhooks.messages import DeliveryLog
 
 HOOK = Registered(
     id="01JD0000000000000000000001",

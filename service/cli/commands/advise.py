@@ -59,7 +59,7 @@ def run(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.app.factory import open_app
-    from service.cli.advice_text import advice_text
+    from service.cli.texts import advice_text
     from service.observations.schema import tolerances_from_text
 
     start, end = period_of(parsed)

@@ -17,7 +17,7 @@ from service.cli.configuration import period_of, settings_of, settings_of_existi
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.app.calibrations.estimates import CalibrationRun
+    from service.app.calibration_estimates import CalibrationRun
 
 RECORDED_BY = "acquire calibrate"
 """The author of a calibration that the command records."""
@@ -90,9 +90,9 @@ def run(parsed: Namespace) -> int:
     """Estimate, print, and write the mission file if asked to."""
     from tqdm import tqdm
 
-    from service.app.calibrations.estimates import CalibrationRequest
+    from service.app.calibration_estimates import CalibrationRequest
     from service.app.factory import open_app
-    from service.cli.calibration_text import calibration_json, calibration_text
+    from service.cli.texts import calibration_json, calibration_text
     from service.missions.mission import mission_named
 
     start, end = period_of(parsed)

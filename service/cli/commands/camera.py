@@ -129,7 +129,7 @@ def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
 
 def _write_maps(output: Path, found: "CameraCalibration") -> list[Path]:
     """Write the residuals before and after as pictures beside the mission file."""
-    from service.imaging.residual_map import draw_residuals
+    from service.imaging.overlay import draw_residuals
 
     size, usual_px = (found.lens.width_px, found.lens.height_px), max(found.rms_px[1], 1e-3)
     # Before, the places are of all stars; after, without those that were left out.

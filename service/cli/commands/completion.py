@@ -35,7 +35,7 @@ def run(parsed: Namespace) -> int:
     """Print the script of a shell."""
     import shtab
 
-    from service.cli.parser import build_parser
+    from service.cli import build_parser
 
     parser = build_parser()
     _complete_files(parser, shtab.FILE)

@@ -11,7 +11,7 @@ from service.cli.configuration import service_url, settings_of
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.follow.jetstream import Metrics
+    from service.follow import Metrics
 
 DEFAULT_CONCURRENCY = 16
 SCHEMES = ("nats", "tls")
@@ -78,7 +78,7 @@ def run(parsed: Namespace) -> int:
     from acquire_client import AsyncClient
     from prometheus_client import start_http_server
 
-    from service.follow.jetstream import Follower, Metrics, Source
+    from service.follow import Follower, Metrics, Source
     from service.replay.over_http import checked_url, translated
 
     servers, stream = _server_and_stream(parsed.source)

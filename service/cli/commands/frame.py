@@ -4,20 +4,22 @@ import json
 import math
 import sys
 from argparse import ArgumentParser, Namespace
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from service.cli.arguments import (
     CAMERA_MISSION,
-    SERVICE,
     add_command,
     add_database,
+    add_url_or_in_process,
     degrees,
     positive,
 )
-from service.cli.configuration import settings_of
-from service.cli.frame_submitters import FrameRefused, frame_submitter
-from service.errors import BadInput, Fault, shown_value
+from service.cli.configuration import service_url, settings_of
+from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
+from service.settings import Settings
 
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for
@@ -75,13 +77,7 @@ def add(commands: Any) -> None:
         help="which image of a file with several: name or number of a FITS unit, :2 for the second "
         "plane of a cube, the number of a TIFF page",
     )
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", help=SERVICE)
-    way.add_argument(
-        "--in-process",
-        action="store_true",
-        help="process the files in this process, without a server",
-    )
+    add_url_or_in_process(parser)
     parser.add_argument(
         "--overlay",
         type=Path,
@@ -193,3 +189,102 @@ def _write_overlay(parsed: Namespace, file: Path, picture: bytes) -> None:
         target.mkdir(parents=True, exist_ok=True)
         target = target / f"{file.stem}.png"
     target.write_bytes(picture)
+
+
+FRAME_TYPE = "application/octet-stream"
+TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid", "image")
+TIMEOUT_S = 120.0
+
+
+class FrameSubmitter(Protocol):
+    """Takes frames: a running service, or this process."""
+
+    def submit(self, spacecraft: str, known: dict[str, Any], file: Path) -> bytes:
+        """Submit a frame and return the answer's JSON; raises `BadInput` or `FrameRefused`."""
+
+    def overlay(self, id: str) -> bytes:
+        """The overlay of a result as PNG."""
+
+
+class FrameRefused(AcquisitionError):
+    """The service refused a frame; the message is its own."""
+
+
+@contextmanager
+def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubmitter]:
+    """The way that the arguments choose, open while the block runs."""
+    if parsed.in_process:
+        from service.app.factory import open_app
+
+        app = open_app(settings)
+        try:
+            app.service.ready()
+            yield _InProcess(app)
+        finally:
+            app.close()
+    else:
+        import httpx
+
+        headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
+        # The service may listen to this machine alone, where no proxy reaches it.
+        with httpx.Client(
+            base_url=service_url(parsed), timeout=TIMEOUT_S, trust_env=False, headers=headers
+        ) as client:
+            yield _OverHttp(client)
+
+
+class _InProcess:
+    def __init__(self, app: Any) -> None:
+        self._app = app
+
+    def submit(self, spacecraft: str, known: dict[str, Any], file: Path) -> bytes:
+        from service.imaging.submit import read_known
+
+        with file.open("rb") as opened:
+            answered = self._app.frames.submit(spacecraft, read_known(known), opened)
+        body: bytes = answered.body
+        return body
+
+    def overlay(self, id: str) -> bytes:
+        picture: bytes = self._app.frames.overlay(id)
+        return picture
+
+
+class _OverHttp:
+    def __init__(self, client: Any) -> None:
+        self._client = client
+
+    def submit(self, spacecraft: str, known: dict[str, Any], file: Path) -> bytes:
+        query = {
+            name: value if name in TEXTS else json.dumps(value) for name, value in known.items()
+        }
+        return self._request(
+            "POST",
+            f"/api/v1/spacecraft/{spacecraft}/frames",
+            params=query,
+            content=file.read_bytes(),
+            headers={"Content-Type": FRAME_TYPE},
+        )
+
+    def overlay(self, id: str) -> bytes:
+        return self._request("GET", f"/api/v1/batches/{id}/overlay")
+
+    def _request(self, method: str, url: str, **arguments: Any) -> bytes:
+        import httpx
+
+        try:
+            response = self._client.request(method, url, **arguments)
+        except (httpx.TransportError, httpx.InvalidURL) as error:
+            raise Busy(
+                f"no service answers at {self._client.base_url} ({error}); "
+                "start one with `acquire serve`, or work with --in-process"
+            ) from None
+        if response.is_success:
+            return bytes(response.content)
+        if response.status_code == 401:
+            raise Unauthenticated("the service asks for a token: set ACQUIRE_TOKEN")
+        try:
+            detail = str(response.json()["detail"])
+        except (ValueError, KeyError, TypeError):
+            detail = f"HTTP {response.status_code}: {response.text[:200]}"
+        raise FrameRefused(detail)

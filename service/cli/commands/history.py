@@ -5,9 +5,15 @@ from argparse import Namespace
 from collections.abc import Iterator
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_output, add_period
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_output,
+    add_period,
+    written_to,
+)
 from service.cli.configuration import period_of, settings_of_existing
-from service.cli.output import written_to
 from service.products.formats import table_formats, write_table
 from service.products.tables import Table
 
@@ -36,7 +42,7 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Write the table, page by page."""
     from service.app.factory import open_app
-    from service.app.history_table import batch_table
+    from service.app.spacecraft import batch_table
 
     start, end = period_of(parsed)
     app = open_app(settings_of_existing(parsed), reads_only=True)

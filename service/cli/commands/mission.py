@@ -1,12 +1,18 @@
 """`acquire mission`: mission files, for their authors."""
 
 from argparse import Namespace
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.cli import mission_estimate
 from service.cli.arguments import add_command, add_group, add_json, print_json
-from service.errors import BadConfiguration
+from service.errors import BadConfiguration, BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.advice.zone_estimate import ZoneEstimate
+    from service.missions.mission import Mission
+
 
 NOTES = """\
 The exit code is 1 if the file has an error. Unusual settings are allowed, but rarely intended.
@@ -42,12 +48,12 @@ def add(commands: Any) -> None:
         "--picture", type=Path, metavar="OUT.svg", help="draw the zones and their pairs, as SVG"
     )
     add_json(parser, "findings and counts")
-    mission_estimate.add(group)
+    add_estimate(group)
 
 
 def check(parsed: Namespace) -> int:
     """Print what is wrong and unusual, and the zones; 1 where something is wrong."""
-    from service.cli.mission_picture import picture
+    from service.cli.charts import zones_picture
     from service.cli.mission_report import examined, refusals, report_json, report_text
     from service.missions.mission import read_mission
     from service.settings import Settings
@@ -68,7 +74,7 @@ def check(parsed: Namespace) -> int:
     catalog = open_catalog(Settings.from_environment().catalog)
     report = examined(mission, catalog, parsed.epoch)
     if parsed.picture is not None and report.zones:
-        parsed.picture.write_text(picture(report), encoding="utf-8")
+        parsed.picture.write_text(zones_picture(report), encoding="utf-8")
     if parsed.json:
         print_json({"file": str(parsed.file), **report_json(report)})
     else:
@@ -76,3 +82,160 @@ def check(parsed: Namespace) -> int:
         if parsed.picture is not None and report.zones:
             print(f"picture: {parsed.picture}")
     return 1 if any(each.level == "wrong" for each in report.findings) else 0
+
+
+ESTIMATE_NOTES = """\
+NCAP is counted, NTOT predicted: NTOT = k_g (NCAP^2 - NCAP) / 2 with the k_g of the place and
+the shape of the zone. "counted" is the most NTOT that a zone anywhere in the sky holds. The bound
+is that of Fink & Shoup (1994): k_g of the areas (equation 2) in equation 1, with the most stars of
+any zone. It is a bound for stars spread evenly; the text names the zones that exceed it.
+Memory is that of the largest zone as the service caches it, grown by the zone's grid."""
+
+
+def add_estimate(group: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        group,
+        "estimate",
+        "Predict the stars, pairs and memory of a mission's zones over the whole sky before one "
+        "is built, for one or more sizes, largest separations and limits of magnitude.",
+        """
+        acquire mission estimate mine.toml
+        acquire mission estimate XTE --size 6 8 10.66 15
+        acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
+        """,
+        estimate,
+        ESTIMATE_NOTES,
+    )
+    parser.add_argument(
+        "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
+    )
+    parser.add_argument(
+        "--size",
+        type=float,
+        nargs="+",
+        metavar="DEG",
+        help="radius of a cap (CCAP), half width of a band (WBAND); default: the mission's",
+    )
+    parser.add_argument(
+        "--pair-separation-max",
+        type=float,
+        nargs="+",
+        metavar="DEG",
+        help="HMAX; default: the mission's",
+    )
+    parser.add_argument(
+        "--magnitude-limit",
+        type=float,
+        nargs="+",
+        metavar="MAG",
+        help="of the run catalog; default: the mission's",
+    )
+    parser.add_argument(
+        "--epoch", type=float, metavar="YEAR", help="of the run catalog; default: this year"
+    )
+    add_json(parser, "the estimates")
+
+
+def estimate(parsed: Namespace) -> int:
+    """Print the estimates."""
+    from service.advice.zone_estimate import neighbours_of, zone_estimates
+    from service.cli.configuration import mission_of_file_or_name
+    from service.cli.mission_report import epoch_of
+    from service.settings import Settings
+    from service.sky.catalog.run_catalog import build_run_catalog
+    from service.sky.catalog.star_catalog import open_catalog
+
+    mission = mission_of_file_or_name(parsed.mission)
+    epoch_year = mission.catalog.epoch_of(epoch_of(parsed.epoch))
+    size_key = "half_width_deg" if mission.zone.kind == "band" else "radius_deg"
+    # Everything is checked before anything is counted.
+    limited = [
+        _changed(mission, "catalog", "magnitude_limit_mag", each, "--magnitude-limit")
+        for each in parsed.magnitude_limit or [mission.catalog.magnitude_limit_mag]
+    ]
+    separations = parsed.pair_separation_max or [mission.tolerances.pair_separation_max_deg]
+    name = "pair_separation_max_deg"
+    paired = [
+        _changed(mission, "tolerances", name, each, "--pair-separation-max").tolerances
+        for each in separations
+    ]
+    zones = [
+        _changed(mission, "zone", size_key, each, "--size").zone
+        for each in parsed.size or [getattr(mission.zone, size_key)]
+    ]
+    catalog = open_catalog(Settings.from_environment().catalog)
+    found = []
+    for of_catalog in limited:
+        run_catalog = build_run_catalog(catalog, of_catalog.catalog, epoch_year)
+        if len(run_catalog) == 0:
+            message = "leaves no star in the run catalog"
+            limit_mag = of_catalog.catalog.magnitude_limit_mag
+            raise BadInput(Fault("--magnitude-limit", message, shown_value(limit_mag)))
+        for tolerances in paired:
+            near = neighbours_of(run_catalog.direction, tolerances.pair_separation_max_deg)
+            for zone in zones:
+                update = {"tolerances": tolerances, "zone": zone}
+                sized = of_catalog.model_copy(update=update)
+                found += zone_estimates(sized, run_catalog, near)
+    if parsed.json:
+        rows = [asdict(each) for each in found]
+        print_json({"mission": mission.name, "epoch_year": epoch_year, "zones": rows})
+    else:
+        print(_text(mission, epoch_year, found))
+    return 0
+
+
+def _changed(mission: "Mission", table: str, key: str, value: float, option: str) -> "Mission":
+    """The mission with another value; raises `BadInput` naming the option where it is no value."""
+    from pydantic import ValidationError
+
+    old: Any = getattr(mission, table)
+    try:
+        new = type(old).model_validate({**old.model_dump(), key: value})
+    except ValidationError as error:
+        raise BadInput(Fault(option, error.errors()[0]["msg"], shown_value(value))) from None
+    return mission.model_copy(update={table: new})
+
+
+def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") -> str:
+    from service.sky.geometry.pairs import MAX_PAIRS
+    from studies.paper_1994.tables import markdown
+
+    header = (
+        *("zone", "HMAX", "to mag", "NCAP least", "median", "most", "NTOT least", "median"),
+        *("most", "counted", "k_g", "k_g, areas", "bound", "memory, most"),
+    )
+    rows = [tuple(_cells(each).values()) for each in found]
+    lines = [
+        f"{mission.name}: zones with their axis anywhere in the sky, run catalog of {epoch_year:g}",
+        "",
+        markdown(header, rows),
+    ]
+    richest = dict.fromkeys(
+        f"{each.of} about RA {each.richest_deg[0]:.2f}, Dec {each.richest_deg[1]:+.2f} deg"
+        for each in found
+    )
+    lines += ["counted: NTOT of the richest zone: " + "; ".join(richest)]
+    exceeding = dict.fromkeys(each.of for each in found if each.pairs_counted > each.pairs_bound)
+    if exceeding:
+        lines.append(f"counted exceeds the bound: {'; '.join(exceeding)}")
+    if any(each.pairs_counted > MAX_PAIRS for each in found):
+        lines.append(f"A zone of more than {MAX_PAIRS:,} pairs is refused.")
+    return "\n".join(lines)
+
+
+def _cells(each: "ZoneEstimate") -> Mapping[str, str]:
+    stars, pairs = each.stars, each.pairs
+    return {
+        "zone": each.of,
+        "hmax": f"{each.pair_separation_max_deg:g}",
+        "limit": f"{each.magnitude_limit_mag:g}",
+        **{f"stars {k}": f"{v:,}" for k, v in asdict(stars).items()},
+        **{f"pairs {k}": f"{v:,}" for k, v in asdict(pairs).items()},
+        "counted": f"{each.pairs_counted:,}",
+        "k_g": f"{each.k_g:.4f}",
+        "k_g_areas": f"{each.k_g_areas:.4f}",
+        "bound": f"{each.pairs_bound:,}",
+        "memory": f"{each.most_bytes / 1e6:.2f} MB",
+    }

@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
 
 def run(parsed: Namespace) -> int:
     """Print, write or check the API's description."""
-    from service.web.openapi.text import openapi_yaml
+    from service.web.app import openapi_yaml
 
     checked = None if parsed.check is None else parsed.check.read_text(encoding="utf-8")
     text = openapi_yaml()

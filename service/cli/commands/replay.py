@@ -5,10 +5,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli.arguments import (
-    SERVICE,
     add_command,
     add_database,
     add_json,
+    add_url_or_in_process,
     count,
     print_json,
     speed,
@@ -64,13 +64,7 @@ def add(commands: Any) -> None:
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
     _add_packets(parser)
-    way = parser.add_mutually_exclusive_group()
-    way.add_argument("--url", help=SERVICE)
-    way.add_argument(
-        "--in-process",
-        action="store_true",
-        help="process the files in this process, without a server",
-    )
+    add_url_or_in_process(parser)
     parser.add_argument(
         "--run", help="the run for every batch; default: the first file's name without its ending"
     )
@@ -154,7 +148,7 @@ def run(parsed: Namespace) -> int:
     """Send files through the service and print what became of them."""
     from msgspec import to_builtins
 
-    from service.replay.carry_attitude import AttitudeCarrier
+    from service.replay.from_file import AttitudeCarrier
     from service.replay.items import Pace, items_of, packet_items, run_name
     from service.replay.summary import ReplaySummary
 
@@ -184,8 +178,7 @@ def run(parsed: Namespace) -> int:
         finally:
             app.close()
     else:
-        from service.replay.bulk_upload import replay_in_bulk
-        from service.replay.over_http import replay_over_http
+        from service.replay.over_http import replay_in_bulk, replay_over_http
 
         if parsed.database is not None:
             message = "goes with --in-process; a running service has its own"
@@ -231,8 +224,7 @@ def run(parsed: Namespace) -> int:
 
 def _sources(parsed: Namespace) -> list["FromFile"]:
     """The files that add something to each batch."""
-    from service.products.reading.ephemerides import read_ephemeris
-    from service.products.reading.files import read_attitudes
+    from service.products.reading.files import read_attitudes, read_ephemeris
     from service.replay.from_file import FileEphemeris, FilePrior
 
     sources: list[FromFile] = []

@@ -91,7 +91,7 @@ def run(parsed: Namespace) -> int:
 
     from service.app.context import checked_run_name
     from service.app.factory import open_app
-    from service.cli.run_comparison import comparison_text, progress_text
+    from service.cli.texts import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
     from service.missions.mission import load_missions, mission_named, read_mission
 
@@ -130,7 +130,7 @@ def run(parsed: Namespace) -> int:
             period |= {"start": start, "end": end}
             processes = parsed.processes or 0
             if parsed.archive is None:
-                progress = app.runs.reprocess_recorded(
+                progress = app.runs.reprocess(
                     parsed.run, **period, processes=processes, track=parsed.track, step=step
                 )
             else:

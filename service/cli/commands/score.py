@@ -47,8 +47,8 @@ def add(commands: Any) -> None:
 def run(parsed: Namespace) -> int:
     """Score the attitudes and print the statistics."""
     from service.app.factory import open_app
-    from service.cli.output import written_to
-    from service.cli.score_picture import picture
+    from service.cli.arguments import written_to
+    from service.cli.charts import errors_picture
     from service.products.reading.files import read_attitudes
     from service.products.scoring import errors_of, statistics
 
@@ -68,7 +68,7 @@ def run(parsed: Namespace) -> int:
         raise BadInput(Fault("FILE", message, shown_value(str(parsed.truth))))
     found = statistics(errors)
     if parsed.plot is not None:
-        written_to(parsed.plot, iter([picture(errors, series.about.described()).encode()]))
+        written_to(parsed.plot, iter([errors_picture(errors, series.about.described()).encode()]))
     if parsed.json:
         print_json({"truth": str(parsed.truth), "spacecraft": parsed.spacecraft, **found})
     else:

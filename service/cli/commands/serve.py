@@ -60,7 +60,7 @@ def run(parsed: Namespace) -> int:
         # A fault in compiled code ends the process; this says where.
         faulthandler.enable()
     from service import logs
-    from service.web.ports import require_free
+    from service.settings import require_free
 
     require_free(settings.host, settings.port)
     logs.configure(settings.logs, "server")
@@ -75,9 +75,8 @@ def prepare(parsed: Namespace) -> int:
     import logging
     import time
 
-    from service.acquire.kernel_build import KernelBuild
+    from service.acquire.kernel_build import KernelBuild, progress_logged
     from service.acquire.prewarm import prewarm_sky
-    from service.ingest.kernel_progress import progress_logged
     from service.missions.mission import load_missions
     from service.sky.cache import LruCache
     from service.sky.catalog.star_catalog import open_catalog

@@ -44,7 +44,7 @@ def run(parsed: Namespace) -> int:
     from tqdm import tqdm
 
     from service.app.factory import open_app
-    from service.app.telemetry.grades import SmoothProgress
+    from service.app.grades import SmoothProgress
 
     start, end = period_of(parsed)
     settings = settings_of_existing(parsed)

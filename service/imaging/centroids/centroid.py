@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from typing import Literal
 
 from service.errors import BadInput, Fault
-from service.imaging.centroids.blending import is_blended
-from service.imaging.centroids.moments import by_moments
+from service.imaging.centroids.moments import by_moments, is_blended
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.record import (
     CentroidRecord,
@@ -22,20 +21,18 @@ from service.imaging.centroids.record import (
     refusal,
     too_faint,
 )
-from service.imaging.centroids.region import brightest_pixel, square_about
 from service.imaging.centroids.sequential import diffuse
 from service.imaging.centroids.shape_fit import (
     ENOUGH_SIGMAS,
-    FARTHEST_IN_HALF_WIDTHS,
-    MOVE_BEYOND_PX,
     Fit,
     first_flux,
     fit,
     linearised,
+    region_after_step,
     stepped,
     with_level_error,
 )
-from service.imaging.centroids.window import Window
+from service.imaging.centroids.window import Window, brightest_pixel, square_about
 from service.observations.scans.profile import BREAKDOWN_RATIO
 
 Method = Literal["window", "scan", "matched", "recursive"]
@@ -142,12 +139,9 @@ def recursive_fit(
         estimate = start_of_pass.replayed(seen.rows, seen.left, seen.variance)
         converged = not recentre or seen.sigmas_of(estimate.state) < ENOUGH_SIGMAS
         u, v, flux = stepped(u, v, flux, estimate.state)
-        if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+        moved = region_after_step(window, region, (u, v), start, half_width_px, recentre)
+        if moved is None:
             return None
-        if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
-            moved = square_about(window, round(u), round(v), half_width_px)
-            if moved is None:
-                return None
-            region = moved
+        region = moved
     covariance = with_level_error(estimate.covariance, seen, window.background_sigma_counts)
     return Fit(u, v, flux, covariance, region, passes, converged)

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.region import Region, square_about
-from service.imaging.centroids.window import Array, Window
+from service.imaging.centroids.window import Array, Region, Window, square_about
 
 MOST_STEPS = 30
 ENOUGH_SIGMAS = 0.01
@@ -108,18 +107,35 @@ def fit(
             return None
         converged = seen.sigmas_of(step) < ENOUGH_SIGMAS
         u, v, flux = stepped(u, v, flux, step)
-        if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+        moved = region_after_step(window, region, (u, v), start, half_width_px, recentre)
+        if moved is None:
             return None
-        if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
-            moved = square_about(window, round(u), round(v), half_width_px)
-            if moved is None:
-                return None
-            region = moved
+        region = moved
     seen = linearised(region, psf, u, v, flux)
     covariance = _covariance(seen, window.background_sigma_counts)
     if covariance is None:
         return None
     return Fit(u, v, flux, covariance, region, taken, converged)
+
+
+def region_after_step(
+    window: Window,
+    region: Region,
+    place: tuple[float, float],
+    start: tuple[float, float],
+    half_width_px: int,
+    recentre: bool,
+) -> Region | None:
+    """The region of the next step: another one where a step led far from the middle of this one.
+
+    None where the place is too far from the start, or its region not within the window.
+    """
+    u, v = place
+    if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
+        return None
+    if recentre and max(abs(u - region.column), abs(v - region.row)) > MOVE_BEYOND_PX:
+        return square_about(window, round(u), round(v), half_width_px)
+    return region
 
 
 def stepped(u: float, v: float, flux: float, step: Array) -> tuple[float, float, float]:

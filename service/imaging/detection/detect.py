@@ -16,8 +16,7 @@ import sep
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Detector
 from service.imaging.detection.background import take_background_off
-from service.imaging.detection.cosmic_rays import stars_behind
-from service.imaging.detection.shapes import is_sharp
+from service.imaging.detection.cosmic_rays import is_sharp, stars_behind
 from service.imaging.detection.star_image import PsfAt, psf_of
 from service.imaging.detection.star_images import ImageSearch, StarImages
 from service.imaging.frames.frame import CountArray, Frame, bad_frame

@@ -13,7 +13,7 @@ import numpy.typing as npt
 import sep
 from scipy import fft
 
-from service.imaging.frames.frame import CountArray
+from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.vectors import Vector, read_only
 
 MESH_PX = 32
@@ -302,3 +302,29 @@ def _moments(
     sigma = np.sqrt(1.0 / np.clip(1.0 / size - 1.0 / weight_px**2, 0.01, 25.0))
     stretch = np.hypot(uu - vv, 2.0 * uv) / (2.0 * size)
     return _Shapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0))
+
+
+HOT_SIGMAS = 8.0
+"""Above the median of a dark frame: such a pixel's own noise hides what falls on it."""
+
+
+def without_dark(frame: Frame, dark: Frame) -> Frame:
+    """A frame less its dark frame, of the same exposure; hot pixels hold no number.
+
+    Raises `BadFile` for a dark frame of another size.
+    """
+    if dark.counts.shape != frame.counts.shape:
+        size = f"{dark.width_px} x {dark.height_px} px"
+        wanted = f"{frame.width_px} x {frame.height_px} px"
+        raise bad_frame(f"must have the size of its dark frame, {size}", wanted)
+    counts = np.array(frame.counts - dark.counts)
+    counts[hot_pixels(dark.counts)] = np.nan
+    return replace(frame, counts=counts)
+
+
+def hot_pixels(dark: CountArray) -> CountArray:
+    """Whether a pixel (rows, columns) of a dark frame stands out, or holds no number."""
+    middle = np.nanmedian(dark)
+    # Counts are whole numbers: a quiet sensor may have a spread of none.
+    spread = max(1.48 * float(np.nanmedian(np.abs(dark - middle))), 0.5)
+    return np.asarray(~(dark < middle + HOT_SIGMAS * spread))

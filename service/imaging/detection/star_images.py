@@ -17,7 +17,7 @@ import numpy.typing as npt
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.shape_fit import fit
 from service.imaging.centroids.window import Array, Detector, Mask, Window, cutout
-from service.imaging.detection.shapes import is_sharp
+from service.imaging.detection.cosmic_rays import is_sharp
 from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera

@@ -1,4 +1,4 @@
-"""The time of a picture from its EXIF, which is read only where it is small.
+"""EXIF of pictures, read only where it is small: their time, and the way a viewer turns them.
 
 Pillow turns every number of an EXIF directory into an object, twenty times as large as the
 number in the file.
@@ -9,9 +9,12 @@ import re
 import struct
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from typing import IO, Any, NamedTuple
 
-from service.imaging.frames.frame import bad_frame
+import numpy as np
+
+from service.imaging.frames.frame import AS_STORED, CountArray, Frame, bad_frame
 
 MAX_EXIF_BYTES = 1 << 20
 _TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 8, 8, 8, 8, 8)
@@ -157,3 +160,55 @@ def _is_small(image: Any) -> bool:
         return True
     total = sum(entry.size_bytes for entry in entries)
     return total + bytes_beyond(file, order, entries) <= MAX_EXIF_BYTES
+
+
+TAG = 274
+_TURNS: Mapping[int, str] = {
+    2: "left and right exchanged",
+    3: "turned by 180 deg",
+    4: "top and bottom exchanged",
+    5: "rows and columns exchanged",
+    6: "turned by 90 deg clockwise",
+    7: "rows and columns exchanged, then turned by 180 deg",
+    8: "turned by 90 deg counterclockwise",
+}
+"""From the order of the stored pixels to the picture that is shown (EXIF 2.32, 4.6.4)."""
+
+
+def as_shown(counts: CountArray, tag: object) -> tuple[CountArray, str]:
+    """Stored counts (rows, columns) as they are shown, and what was done, in words.
+
+    A tag that is none of the eight counts as 1, as in viewers.
+    """
+    if not isinstance(tag, int) or tag not in _TURNS:
+        return counts, AS_STORED
+    shown = counts.T if tag in (5, 7) else counts
+    if tag in (3, 7):
+        shown = shown[::-1, ::-1]
+    elif tag in (2, 4):
+        shown = shown[:, ::-1] if tag == 2 else shown[::-1]
+    elif tag in (6, 8):
+        shown = np.rot90(shown, -1 if tag == 6 else 1)
+    return np.ascontiguousarray(shown), f"as shown: {_TURNS[tag]} (orientation tag {tag})"
+
+
+def is_by_rows(frame: Frame) -> bool:
+    """True if the mirror image of a frame has its rows in reverse order, not its columns.
+
+    FITS files whose first row is the lowest one are mirrored by a reader that begins at the top.
+    """
+    return frame.file_format == "FITS"
+
+
+def mirrored(frame: Frame) -> Frame:
+    """The mirror image of a frame, which says so."""
+    by_rows = is_by_rows(frame)
+    counts = frame.counts[::-1] if by_rows else frame.counts[:, ::-1]
+    how = "top and bottom" if by_rows else "left and right"
+    before = f"{frame.orientation}; " if frame.is_turned else ""
+    return replace(
+        frame,
+        counts=np.ascontiguousarray(counts),
+        orientation=f"{before}mirrored: {how} exchanged, because the sky fits only so",
+        is_mirrored=True,
+    )

@@ -11,8 +11,15 @@ import numpy as np
 
 from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, exactly
-from service.imaging.frames.fits_header import BLOCK, CARD, TYPES, Header, Unit, units_of
-from service.imaging.frames.fits_time import time_of_header
+from service.imaging.frames.fits_header import (
+    BLOCK,
+    CARD,
+    TYPES,
+    Header,
+    Unit,
+    time_of_header,
+    units_of,
+)
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
 ABSENT = (

@@ -9,10 +9,9 @@ import numpy.typing as npt
 
 from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, exactly, full_scale_of
-from service.imaging.frames.exif import exif_of, exposure_of, require_small_exif
+from service.imaging.frames.exif import TAG, as_shown, exif_of, exposure_of, require_small_exif
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
-from service.imaging.frames.orientation import TAG, as_shown
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "F")
 """Pillow's words for one channel of light."""

@@ -19,14 +19,15 @@ from service.errors import BadFile
 from service.imaging.frames.arrays import as_counts, full_scale_of
 from service.imaging.frames.exif import (
     MAX_EXIF_BYTES,
+    TAG,
     Entry,
+    as_shown,
     bytes_beyond,
     directory,
     told_exposure,
 )
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
-from service.imaging.frames.orientation import TAG, as_shown
 
 MAX_TAGS, MAX_PAGES = 256, 256
 MAX_TAG_BYTES = 1 << 20
@@ -65,7 +66,7 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
                 if page.compression == _JPEG:
                     _require_whole_segments(page, file, limits)
                 # Pillow turns what it decodes by itself.
-                counts, full_scale = _by_pillow(file, page, number)
+                counts, full_scale = _by_pillow(file, number)
                 _, orientation = as_shown(np.zeros((1, 1)), tag)
             else:
                 stored, full_scale = _light(page, file)
@@ -271,7 +272,7 @@ def _undone(data: bytes, page: Any) -> bytes:
     return numbers.astype(page.parent.byteorder + f"f{item}").tobytes()
 
 
-def _by_pillow(file: IO[bytes], page: Any, number: int) -> tuple[CountArray, float]:
+def _by_pillow(file: IO[bytes], number: int) -> tuple[CountArray, float]:
     """The sums of red, green and blue of a page of 8 bits, turned by its orientation."""
     from PIL import Image
 
@@ -317,7 +318,7 @@ def _subfiles(file: IO[bytes]) -> list[Subfile]:
             if len(subfiles) == MAX_PAGES:
                 raise bad_frame(f"holds more than {MAX_PAGES} images, or its directories loop")
             entries = directory(file, order, at, big)
-            _require_small(file, order, entries)
+            _require_small(order, entries)
             (at,) = struct.unpack(order + ("Q" if big else "L"), file.read(8 if big else 4))
             values = {entry.tag: entry.whole(order) for entry in reversed(entries)}
             subfiles.append(
@@ -331,7 +332,7 @@ def _subfiles(file: IO[bytes]) -> list[Subfile]:
     return subfiles
 
 
-def _require_small(file: IO[bytes], order: str, entries: list[Entry]) -> None:
+def _require_small(order: str, entries: list[Entry]) -> None:
     """Raise `BadFile` for a directory of many or great tags, or with great tiles."""
     if len(entries) > MAX_TAGS:
         raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))

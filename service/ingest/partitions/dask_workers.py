@@ -21,8 +21,14 @@ from service import __version__
 from service.acquire.prewarm import prewarm_kernels
 from service.errors import BadConfiguration, BadInput, Fault
 from service.extras import require_extra
-from service.ingest.partitions.tasks import PartitionResult, PartitionTask
-from service.ingest.partitions.workers import Outcome, Wait, attempt, result_of
+from service.ingest.partitions.tasks import (
+    Outcome,
+    PartitionResult,
+    PartitionTask,
+    Wait,
+    attempt,
+    result_of,
+)
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole

@@ -7,8 +7,8 @@ the same JSON as that of an NDJSON file, so that the same checks hold for it.
 
 import csv
 import json
-from collections.abc import Iterable, Iterator
-from typing import Any, TextIO
+from collections.abc import Iterable, Iterator, Mapping
+from typing import Any, ClassVar, TextIO
 
 from service.csv_cells import neutralised
 from service.errors import Fault
@@ -32,7 +32,7 @@ from service.observations.readers.csv_columns import (
     star_of,
 )
 from service.observations.readers.csv_table import CsvRow, Row, RowKind
-from service.observations.readers.lines import Line
+from service.observations.readers.decompress import Line
 from service.observations.schema import BatchIn
 
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS
@@ -47,95 +47,132 @@ BATCH_ROWS = RowKind(
 )
 
 
-class _BatchRows:
-    """The rows of one batch as they come in: its own fields once, then a star a row."""
+class JoinedRows:
+    """The rows of one batch or gyro block as they come in; a bad cell refuses all of them."""
 
-    def __init__(self, number: int, key: tuple[str, ...], fault: Fault | None = None) -> None:
-        self.number, self.key, self.fault = number, key, fault
+    key_columns: ClassVar[tuple[str, ...]]
+    """The columns that these rows have in common."""
+    may_lack: ClassVar[str]
+    """What may be missing where a row beside these cannot be read."""
+    refuses_faulty_rows: ClassVar[bool]
+    """Whether a row with a fault refuses the rows of its key alone, or those beside it."""
+
+    def __init__(self, number: int, key: tuple[str, ...]) -> None:
+        self.number, self.key = number, key
+        self.fault: Fault | None = None
         self.fault_at = number
+
+    def add(self, number: int, row: CsvRow) -> None:
+        """Take a row with its number in the file."""
+        if self.fault is None:
+            try:
+                self.take(row)
+            except BadCell as bad:
+                self.refuse(number, bad.fault(number))
+
+    def take(self, row: CsvRow) -> None:
+        """Take the cells of a row; raises `BadCell`."""
+        raise NotImplementedError
+
+    def body(self) -> Mapping[str, Any]:
+        """The JSON object of all rows."""
+        raise NotImplementedError
+
+    def refuse(self, number: int, fault: Fault) -> None:
+        """Refuse all rows for a fault, unless they are refused already."""
+        if self.fault is None:
+            self.fault, self.fault_at = fault, number
+
+    def refuse_beside(self, number: int, damaged: int) -> None:
+        """Refuse all rows for a damaged one beside them, which may have been one of them."""
+        message = f"{self.may_lack}: the row beside it, line {damaged}, cannot be read"
+        self.refuse(number, Fault(f"line {self.number}", message))
+
+    def line(self) -> Line:
+        """The rows as a line of JSON, or their fault."""
+        if self.fault is not None:
+            return Line(self.fault_at, None, self.fault)
+        return Line(self.number, json.dumps(self.body(), separators=(",", ":")).encode())
+
+
+def joined_lines(rows: Iterator[Row], kind: type[JoinedRows]) -> Iterator[Line]:
+    """The batches or gyro blocks of the rows of a CSV file.
+
+    One with a bad cell is refused whole, by the line and column of the first such cell.  A row
+    too damaged to tell whose it is refuses those on both sides of it: one of them lacks a row.
+    """
+    joined: JoinedRows | None = None
+    stray: int | None = None
+    for row in rows:
+        if row.cells is None or (row.fault is not None and not kind.refuses_faulty_rows):
+            if joined is not None:
+                joined.refuse_beside(row.number, row.number)
+                yield joined.line()
+            yield Line(row.number, None, row.fault)
+            joined, stray = None, row.number
+            continue
+        key = tuple(row.cells.get(column, "") for column in kind.key_columns)
+        if joined is None or key != joined.key:
+            if joined is not None:
+                yield joined.line()
+            joined = kind(row.number, key)
+            if stray is not None:
+                joined.refuse_beside(row.number, stray)
+            stray = None
+        if row.fault is not None:
+            joined.refuse(row.number, row.fault)
+        joined.add(row.number, row.cells)
+    if joined is not None:
+        yield joined.line()
+
+
+class BatchRows(JoinedRows):
+    """The rows of one batch: its own fields once, then a star a row."""
+
+    key_columns = KEY
+    may_lack = "the batch may lack a star"
+    refuses_faulty_rows = True
+
+    def __init__(self, number: int, key: tuple[str, ...]) -> None:
+        super().__init__(number, key)
         self.first: CsvRow = {}
         self.fields: dict[str, Any] = {}
         self.trackers: dict[str, list[dict[str, Any]]] = {}
         self.rasters: dict[str, dict[str, list[float]]] = {}
         self.rows = 0
 
-    def add(self, number: int, row: CsvRow) -> None:
-        if self.fault is not None:
+    def take(self, row: CsvRow) -> None:
+        """Take the cells of a row; raises `BadCell`."""
+        self.rows += 1
+        if self.rows > MAX_ROWS:
+            raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
+        if self.rows == 1:
+            self.first, self.fields = row, batch_fields(row)
+        for column in BATCH_COLUMNS:
+            if row.get(column, "") != self.first.get(column, ""):
+                message = f"differs from line {self.number}, the first of the batch"
+                raise BadCell(column, message, row[column])
+        if "measurement" in self.fields:
+            if self.rows > 1:
+                raise BadCell("batch", "has a second measured attitude", self.key[-1])
+            if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
+                raise BadCell("batch", "has stars beside a measured attitude", cell)
             return
-        try:
-            self.rows += 1
-            if self.rows > MAX_ROWS:
-                raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
-            if self.rows == 1:
-                self.first, self.fields = row, batch_fields(row)
-            for column in BATCH_COLUMNS:
-                if row.get(column, "") != self.first.get(column, ""):
-                    message = f"differs from line {self.number}, the first of the batch"
-                    raise BadCell(column, message, row[column])
-            if "measurement" in self.fields:
-                if self.rows > 1:
-                    raise BadCell("batch", "has a second measured attitude", self.key[-1])
-                if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
-                    raise BadCell("batch", "has stars beside a measured attitude", cell)
-                return
-            stars = self.trackers.setdefault(row["tracker"], [])
-            if any(row.get(column) for column in STAR_COLUMNS[1:]):
-                stars.append(star_of(row))
-            if lines := lines_of(row):
-                if row["tracker"] in self.rasters:
-                    raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
-                self.rasters[row["tracker"]] = lines
-        except BadCell as bad:
-            self.refuse(number, bad.fault(number))
+        stars = self.trackers.setdefault(row["tracker"], [])
+        if any(row.get(column) for column in STAR_COLUMNS[1:]):
+            stars.append(star_of(row))
+        if lines := lines_of(row):
+            if row["tracker"] in self.rasters:
+                raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
+            self.rasters[row["tracker"]] = lines
 
-    def refuse(self, number: int, fault: Fault) -> None:
-        if self.fault is None:
-            self.fault, self.fault_at = fault, number
-
-    def line(self) -> Line:
-        if self.fault is not None:
-            return Line(self.fault_at, None, self.fault)
+    def body(self) -> Mapping[str, Any]:
+        """The JSON object of the batch."""
         observations = [
             {"tracker": name, "stars": stars, **self.rasters.get(name, {})}
             for name, stars in self.trackers.items()
         ]
-        body = {**self.fields, "observations": observations} if observations else self.fields
-        return Line(self.number, json.dumps(body, separators=(",", ":")).encode())
-
-
-def batches_of_rows(rows: Iterator[Row]) -> Iterator[Line]:
-    """The batches of the rows of a CSV file.
-
-    A batch with a bad cell is refused whole, by the line and column of the
-    first such cell.  A row too damaged to tell whose it is refuses the batches
-    on both sides of it: one of them lacks a star.
-    """
-    batch: _BatchRows | None = None
-    stray: int | None = None
-    for row in rows:
-        if row.cells is None:
-            if batch is not None:
-                batch.refuse(row.number, _beside(batch.number, row.number))
-                yield batch.line()
-            yield Line(row.number, None, row.fault)
-            batch, stray = None, row.number
-            continue
-        key = tuple(row.cells.get(column, "") for column in KEY)
-        if batch is None or key != batch.key:
-            if batch is not None:
-                yield batch.line()
-            beside = None if stray is None else _beside(row.number, stray)
-            batch, stray = _BatchRows(row.number, key, beside), None
-        if row.fault is not None:
-            batch.refuse(row.number, row.fault)
-        batch.add(row.number, row.cells)
-    if batch is not None:
-        yield batch.line()
-
-
-def _beside(batch: int, damaged: int) -> Fault:
-    message = f"the batch may lack a star: the row beside it, line {damaged}, cannot be read"
-    return Fault(f"line {batch}", message)
+        return {**self.fields, "observations": observations} if observations else self.fields
 
 
 def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:

@@ -1,11 +1,13 @@
-"""Bodies that come compressed: their lines, unpacked as they are read, in bounded memory."""
+"""Lines of telemetry files and of compressed bodies, read in bounded memory."""
 
+import codecs
 import gzip
 import io
 import os
 import zlib
 from collections.abc import Callable, Iterator
-from typing import IO, Any, Literal
+from dataclasses import dataclass
+from typing import IO, Any, BinaryIO, Literal
 
 from service.errors import BadBatch, Fault
 
@@ -152,3 +154,40 @@ def _zstd_error() -> type[Exception]:
     import zstandard
 
     return zstandard.ZstdError
+
+
+MAX_LINE_BYTES = 1 << 20
+
+
+@dataclass(frozen=True)
+class Line:
+    """A batch as JSON, or the fault that stands in its place.
+
+    `number` counts lines from one; a batch of a CSV file has that of its first
+    row, a fault that of the line where it lies.
+    """
+
+    number: int
+    body: bytes | None
+    fault: Fault | None = None
+
+
+def physical_lines(stream: BinaryIO, number: int = 0) -> Iterator[Line]:
+    """The lines of a stream without their ends, after the first `number` that were read already.
+
+    Blank lines are counted and left out.  A line beyond `MAX_LINE_BYTES` is passed
+    over without being held.
+    """
+    while raw := stream.readline(MAX_LINE_BYTES + 1):
+        number += 1
+        if number == 1:
+            raw = raw.removeprefix(codecs.BOM_UTF8)
+        if len(raw) > MAX_LINE_BYTES and not raw.endswith(b"\n"):
+            length = len(raw)
+            while raw and not raw.endswith(b"\n"):
+                raw = stream.readline(MAX_LINE_BYTES)
+                length += len(raw)
+            message = f"is longer than {MAX_LINE_BYTES} bytes"
+            yield Line(number, None, Fault(f"line {number}", message, f"{length} bytes"))
+        elif raw.strip():
+            yield Line(number, raw.rstrip(b"\r\n"))

@@ -1,7 +1,7 @@
 """Telemetry files as numbered lines, each holding one batch or one gyro block as JSON.
 
 Two forms are read, both in bounded memory: NDJSON, one of them a line, and CSV, one star or
-one gyro sample a row (`csv_table`, `csv_rows`, `gyro_rows`).  A line that cannot be read is
+one gyro sample a row (`csv_table`, `csv_rows`).  A line that cannot be read is
 handed on with its fault, and the next lines follow: what to make of it is the
 caller's choice.  A file that makes no sense as a whole raises `BadFile`.
 """
@@ -10,17 +10,17 @@ import codecs
 import io
 import re
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import Any, BinaryIO, Literal
 
-from service.errors import BadFile, Fault, shown_value
-from service.observations.readers.csv_columns import COLUMNS
-from service.observations.readers.csv_rows import BATCH_ROWS, batches_of_rows
-from service.observations.readers.csv_table import SEPARATORS, CsvTable
-from service.observations.readers.gyro_rows import GYRO_ROWS, blocks_of_rows
-from service.observations.readers.lines import Line, physical_lines
+from service.errors import BadFile, BadInput, Fault, shown_value
+from service.observations.readers.csv_columns import COLUMNS, BadCell, number_cell
+from service.observations.readers.csv_rows import BATCH_ROWS, BatchRows, JoinedRows, joined_lines
+from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
+from service.observations.readers.decompress import Line, physical_lines
+from service.times import parse_utc
 
 TelemetryFormat = Literal["ndjson", "csv"]
 
@@ -45,8 +45,8 @@ def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> 
     with _opened(source, form) as stream:
         if form == "csv":
             table = CsvTable(stream, (BATCH_ROWS, GYRO_ROWS))
-            of_rows = blocks_of_rows if table.kind is GYRO_ROWS else batches_of_rows
-            yield from of_rows(table.rows())
+            kind = BlockRows if table.kind is GYRO_ROWS else BatchRows
+            yield from joined_lines(table.rows(), kind)
         else:
             yield from physical_lines(stream)
 
@@ -127,3 +127,78 @@ def _opened(source: Path | BinaryIO, form: TelemetryFormat) -> Iterator[BinaryIO
                 raise BadFile(Fault(str(source), f"is damaged UTF-16: {error}")) from None
             copy.seek(0)
             yield copy
+
+
+# Gyro blocks as rows of comma-separated values, one sample a row.
+#
+# The rows of one (spacecraft, run, block) form a block; `CsvTable` gives them together.  What the
+# rows give is the same JSON as that of an NDJSON file, so that the same checks hold for it.
+
+KEY = ("spacecraft", "run", "block")
+RATES = ("rate_1_rad_per_s", "rate_2_rad_per_s", "rate_3_rad_per_s")
+REQUIRED = ("spacecraft", "block", "time", *RATES)
+GYRO_COLUMNS = (*KEY, "time", *RATES)
+MAX_ROWS = 10_000
+
+
+class BlockRows(JoinedRows):
+    """The rows of one gyro block, a sample a row."""
+
+    key_columns = KEY
+    may_lack = "the block may lack a sample"
+    refuses_faulty_rows = False
+
+    def __init__(self, number: int, key: tuple[str, ...]) -> None:
+        super().__init__(number, key)
+        self.start, self.start_ns = "", 0
+        self.times_s: list[float] = []
+        self.rates: list[list[float]] = []
+
+    def take(self, row: CsvRow) -> None:
+        """Take the cells of a row; raises `BadCell`."""
+        if len(self.rates) == MAX_ROWS:
+            raise BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
+        try:
+            time = parse_utc(row["time"])
+        except BadInput as error:
+            raise BadCell("time", error.faults[0].message, row["time"]) from None
+        if not self.rates:
+            self.start, self.start_ns = time.text, time.tai_ns
+        self.times_s.append((time.tai_ns - self.start_ns) * 1e-9)
+        self.rates.append([number_cell(row, column) for column in RATES])
+
+    def body(self) -> Mapping[str, Any]:
+        """The JSON object of the block."""
+        named = {name: value for name, value in zip(KEY, self.key, strict=True) if value}
+        times = {"start": self.start, "times_s": self.times_s}
+        return {**named, **times, "rates_rad_per_s": self.rates}
+
+
+def _check_header(names: list[str], where: str) -> None:
+    """Raise `BadFile` for a column that is unknown, missing or there twice."""
+    there_are = f"there is no such column; there are {', '.join(GYRO_COLUMNS)}"
+    faults = [
+        Fault(f"{where}, column {name or '(empty)'}", there_are)
+        for name in names
+        if name not in GYRO_COLUMNS
+    ]
+    faults += [
+        Fault(f"{where}, column {name}", "occurs twice")
+        for name in sorted({name for name in names if names.count(name) > 1})
+    ]
+    faults += [
+        Fault(f"{where}, column {name}", "is missing") for name in REQUIRED if name not in names
+    ]
+    if faults:
+        raise BadFile(faults)
+
+
+GYRO_ROWS = RowKind(
+    "block",
+    KEY,
+    GYRO_COLUMNS,
+    texts=frozenset((*KEY, "time")),
+    verbatim=frozenset(),
+    check_header=_check_header,
+    ordered_by_time=True,
+)

@@ -13,15 +13,23 @@ from typing import IO
 
 import numpy as np
 
-from service.observations.numbers import NORM_TOLERANCE
-from service.products.reading.known_attitudes import (
+from service.observations.schema import NORM_TOLERANCE
+from service.products.reading.known import (
     MOST_RECORDS,
     KnownAttitudes,
     Segment,
     known_attitudes,
 )
-from service.products.reading.metadata import INERTIAL, Metadata, read_metadata, read_version
-from service.products.reading.tokens import AEM, Source, Token, tokens_of
+from service.products.reading.tokens import (
+    AEM,
+    INERTIAL,
+    Metadata,
+    Source,
+    Token,
+    read_metadata,
+    read_version,
+    tokens_of,
+)
 
 _BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
 _V1_ONLY = {"QUATERNION_TYPE": ("FIRST", "LAST"), "ATTITUDE_DIR": ("A2B", "B2A")}

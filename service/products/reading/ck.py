@@ -16,13 +16,13 @@ import numpy as np
 
 from service.errors import BadFile, Fault
 from service.extras import require_extra
-from service.products.reading.known_attitudes import (
+from service.products.reading.known import (
     MOST_RECORDS,
     KnownAttitudes,
     Segment,
     known_attitudes,
 )
-from service.products.spice.kernels import leap_second_kernel
+from service.products.spice.ck import leap_second_kernel
 from service.products.spool import PIECE_BYTES, folder
 
 CHILD_S = 600.0

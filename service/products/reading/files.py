@@ -1,4 +1,4 @@
-"""Attitudes of a file, whatever its format."""
+"""Attitudes, or positions and velocities, of a file, whatever its format."""
 
 import zipfile
 from collections.abc import Iterable
@@ -10,7 +10,9 @@ import numpy as np
 from service.errors import BadFile, BadInput, Fault
 from service.products.reading.aem import read_aem
 from service.products.reading.ck import read_ck
-from service.products.reading.known_attitudes import KnownAttitudes, Segment, known_attitudes
+from service.products.reading.known import Ephemeris, KnownAttitudes, Segment, known_attitudes
+from service.products.reading.oem import read_oem
+from service.products.reading.tle import read_tle
 from service.times import parse_utc
 
 READ = (
@@ -62,3 +64,20 @@ def _read_truth(file: str, lines: Iterable[bytes]) -> KnownAttitudes:
     quaternion = np.array([each.quaternion for each in read])
     one = Segment(file, time_ns, quaternion, int(time_ns[0]), int(time_ns[-1]))
     return known_attitudes(file, read[0].spacecraft, [one])
+
+
+def read_ephemeris(file: Path, field: str) -> Ephemeris:
+    """The ephemeris of a file: an OEM (KVN or XML), else two-line element sets.
+
+    Raises `BadInput` naming `field` where it cannot be opened, and `BadFile` naming file, line
+    and field where it is not as its format has it.
+    """
+    try:
+        with file.open("rb") as opened:
+            start = opened.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
+            opened.seek(0)
+            if start.startswith((b"CCSDS_", b"<")):
+                return read_oem(file.name, opened)
+            return read_tle(file.name, opened, field)
+    except OSError as error:
+        raise BadInput(Fault(field, f"cannot be read: {error.strerror}", repr(str(file)))) from None

@@ -11,15 +11,23 @@ from typing import IO
 import numpy as np
 
 from service.errors import BadFile
-from service.products.reading.known_attitudes import MOST_RECORDS
-from service.products.reading.known_states import (
+from service.products.reading.known import (
+    MOST_RECORDS,
     Interpolation,
     KnownStates,
     StateSegment,
     known_states,
 )
-from service.products.reading.metadata import INERTIAL, Metadata, read_metadata, read_version
-from service.products.reading.tokens import OEM, Source, Token, tokens_of
+from service.products.reading.tokens import (
+    INERTIAL,
+    OEM,
+    Metadata,
+    Source,
+    Token,
+    read_metadata,
+    read_version,
+    tokens_of,
+)
 
 _VERSIONS = ("1.0", "2.0", "3.0")
 _HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")

@@ -15,8 +15,7 @@ import numpy as np
 from erfa import ufunc
 
 from service.extras import require_extra
-from service.products.reading.epochs import epoch_ns
-from service.products.reading.tokens import Source
+from service.products.reading.tokens import Source, epoch_ns
 from service.times import DAY_S, Utc
 from service.vectors import Matrix, Vector
 

@@ -6,18 +6,25 @@ interval is an unbroken stretch.  CSPICE is global and not safe between threads:
 process writes the file.
 """
 
+import re
 import subprocess
 import sys
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
+import erfa
 import numpy as np
 
 from service.attitude.rotations import matrices
 from service.errors import AcquisitionError, BadConfiguration
-from service.products.attitudes import AttitudeBlock, AttitudeSeries, SeriesInfo, stretches
-from service.products.spice import kernels
+from service.products.attitudes import (
+    AttitudeBlock,
+    AttitudeSeries,
+    Integers,
+    SeriesInfo,
+    stretches,
+)
 from service.products.spool import folder, pieces
 from service.vectors import Vector
 
@@ -29,22 +36,22 @@ _CHILD = Path(__file__).with_name("ck_child.py")
 def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
     """Write a zip file with the C-kernel, clock, frame, leap seconds and their list."""
     about = series.about
-    name = kernels.body_name(about).lower()
+    name = body_name(about).lower()
     with folder() as temporary:
         place = Path(temporary)
         texts = {
-            f"{name}.tls": kernels.leap_second_kernel(),
+            f"{name}.tls": leap_second_kernel(),
             f"{name}.tsc": _clock(about),
-            f"{name}.tf": kernels.frame_kernel(about),
+            f"{name}.tf": frame_kernel(about),
         }
-        texts[f"{name}.tm"] = kernels.list_of_kernels([*texts, f"{name}.bc"])
+        texts[f"{name}.tm"] = list_of_kernels([*texts, f"{name}.bc"])
         told = (f"{key}: {value}\n" for key, value in about.provenance().items())
         texts["README.txt"] = "".join(told)
         for file, text in texts.items():
             (place / file).write_text(text, encoding="utf-8", newline="")
         _keep_records(series, place)
         its_clock = [] if about.sclk_kernel is None else [f"{name}.tls", f"{name}.tsc"]
-        _run_child(place, f"{name}.bc", kernels.instrument_id(about), its_clock)
+        _run_child(place, f"{name}.bc", instrument_id(about), its_clock)
         with zipfile.ZipFile(place / "kernels.zip", "w", zipfile.ZIP_DEFLATED) as packed:
             for file in (f"{name}.bc", *texts):
                 packed.write(place / file, file)
@@ -55,7 +62,7 @@ def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
 def _clock(about: SeriesInfo) -> str:
     """The kernel of the spacecraft's clock: its own, or the one that we define."""
     if about.sclk_kernel is None:
-        return kernels.clock_kernel(about)
+        return clock_kernel(about)
     try:
         return about.sclk_kernel.read_text(encoding="utf-8", errors="replace")
     except OSError as error:
@@ -78,7 +85,7 @@ def _keep_records(series: AttitudeSeries, place: Path) -> None:
 
 def _records(part: AttitudeBlock) -> Vector:
     """Rows of encoded clock (of ours), SPICE's quaternion, and angular velocity in J2000, rad/s."""
-    ticks = kernels.clock_ticks(part.time_ns)[:, None]
+    ticks = clock_ticks(part.time_ns)[:, None]
     vector, scalar = part.quaternion[:, :3], part.quaternion[:, 3:]
     rate = np.radians(np.nan_to_num(part.rate_deg_per_s))
     inertial = np.einsum("nji,nj->ni", matrices(part.quaternion), rate)
@@ -90,3 +97,103 @@ def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) ->
     done = subprocess.run(command, capture_output=True, timeout=CHILD_S, check=False)
     if done.returncode:
         raise AcquisitionError(f"the C-kernel could not be written: {done.stderr[-500:]!r}")
+
+
+# Text kernels: a spacecraft's clock, its frame, leap seconds, and a list of all.
+#
+# The clock is our own, for missions without one: seconds and microseconds of TAI since
+# 1972-01-01T00:00:00 TAI, an encoded tick being a microsecond.
+
+_CLOCK_ZERO_S = -883_656_000
+"""TAI seconds from 2000-01-01T12:00:00 to the zero of the clock."""
+_TT_LESS_TAI_S = 32.184
+_MONTHS = {1: "JAN", 7: "JUL"}
+
+
+def clock_ticks(tai_ns: Integers) -> Vector:
+    """Encoded clock of moments given as `Utc.tai_ns`; exact for whole microseconds."""
+    return (tai_ns - _CLOCK_ZERO_S * 10**9) / 1e3
+
+
+def body_name(about: SeriesInfo) -> str:
+    """The name of the spacecraft in kernels: capitals, digits and underscores."""
+    return re.sub("[^A-Z0-9]", "_", about.spacecraft.upper())[:20]
+
+
+def frame_name(about: SeriesInfo) -> str:
+    """The name of the frame of its body."""
+    return f"{body_name(about)}_BODY"
+
+
+def instrument_id(about: SeriesInfo) -> int:
+    """The id of the structure that the C-kernel orients, and of its frame."""
+    return about.naif_id * 1000
+
+
+def clock_kernel(about: SeriesInfo) -> str:
+    """SCLK: the clock of the spacecraft."""
+    id = -about.naif_id
+    zero = f"{_CLOCK_ZERO_S + _TT_LESS_TAI_S:.3f}"
+    return _kernel(
+        "SCLK",
+        f"Clock of {body_name(about)}: seconds and microseconds since 1972-01-01T00:00:00 TAI.",
+        f"SCLK_KERNEL_ID            = ( @{about.created[:10]} )",
+        f"SCLK_DATA_TYPE_{id}       = ( 1 )",
+        f"SCLK01_TIME_SYSTEM_{id}   = ( 2 )",
+        f"SCLK01_N_FIELDS_{id}      = ( 2 )",
+        f"SCLK01_MODULI_{id}        = ( 10000000000 1000000 )",
+        f"SCLK01_OFFSETS_{id}       = ( 0 0 )",
+        f"SCLK01_OUTPUT_DELIM_{id}  = ( 1 )",
+        f"SCLK_PARTITION_START_{id} = ( 0.0 )",
+        f"SCLK_PARTITION_END_{id}   = ( 8.0E+15 )",
+        f"SCLK01_COEFFICIENTS_{id}  = ( 0.0 {zero} 1.0 )",
+    )
+
+
+def frame_kernel(about: SeriesInfo) -> str:
+    """FK: the frame of the body, whose orientation the C-kernel gives."""
+    id, name = instrument_id(about), frame_name(about)
+    return _kernel(
+        "FK",
+        f"The body axes of {body_name(about)}.",
+        f"NAIF_BODY_NAME += ( '{body_name(about)}' )",
+        f"NAIF_BODY_CODE += ( {about.naif_id} )",
+        f"FRAME_{name} = {id}",
+        f"FRAME_{id}_NAME     = '{name}'",
+        f"FRAME_{id}_CLASS    = 3",
+        f"FRAME_{id}_CLASS_ID = {id}",
+        f"FRAME_{id}_CENTER   = {about.naif_id}",
+        f"CK_{id}_SCLK = {about.naif_id}",
+        f"CK_{id}_SPK  = {about.naif_id}",
+    )
+
+
+def leap_second_kernel() -> str:
+    """LSK: leap seconds by ERFA's table, with the constants of NAIF's own kernels."""
+    steps = [
+        f"  {int(count)}, @{year}-{_MONTHS[int(month)]}-1"
+        for year, month, count in erfa.leap_seconds.get().tolist()
+        if year >= 1972
+    ]
+    return _kernel(
+        "LSK",
+        "Leap seconds by the table of ERFA.",
+        "DELTET/DELTA_T_A = 32.184",
+        "DELTET/K         = 1.657D-3",
+        "DELTET/EB        = 1.671D-2",
+        "DELTET/M         = ( 6.239996D0 1.99096871D-7 )",
+        "DELTET/DELTA_AT  = (",
+        *steps,
+        ")",
+    )
+
+
+def list_of_kernels(names: list[str]) -> str:
+    """Meta-kernel: loads all of them from the folder of the process."""
+    quoted = [f"  '{name}'" for name in names]
+    return _kernel("MK", "Load this from their folder.", "KERNELS_TO_LOAD = (", *quoted, ")")
+
+
+def _kernel(kind: str, about: str, *lines: str) -> str:
+    body = "\n".join(lines)
+    return f"KPL/{kind}\n\n{about}\n\n\\begindata\n\n{body}\n\n\\begintext\n"

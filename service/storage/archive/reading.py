@@ -13,8 +13,13 @@ from service.errors import AcquisitionError, Busy, Fault, NotAvailable
 from service.extras import require_extra
 from service.sky.cache import LruCache
 from service.storage.recording.identity import stored_answers
-from service.storage.sql.archive_tables import archived_batches, archived_parts, archived_what_ifs
-from service.storage.sql.tables import results, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    archived_what_ifs,
+    results,
+    runs,
+)
 from service.times import Utc
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.types import TypeEngine
 
-from service.storage.sql.packed_text import PackedText
+from service.storage.sql.columns import PackedText
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import (
     batches,

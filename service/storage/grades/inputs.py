@@ -1,24 +1,38 @@
-"""What the grades of a day are computed from: recorded attitudes, lone stars, and gyro samples."""
+"""What is filtered and predicted from: recorded attitudes, lone stars, and gyro samples."""
 
 import hashlib
 import json
+from collections.abc import Mapping
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
-from sqlalchemy import Connection, select
+from sqlalchemy import BigInteger, Connection, bindparam, select
 
+from service.acquire.choices import aberration_velocity
+from service.attitude.solution import NoAttitude
+from service.errors import BadInput
+from service.filtering.prediction import Known
+from service.filtering.samples import DirectionMeasurements, no_directions
 from service.grades.day import METHOD, day_bounds
-from service.grades.measured import Recorded, usable_attitudes
-from service.gyro.block import Nanoseconds, tai_ns_of
+from service.grades.stretches import Recorded, arrays_of, usable_attitudes
+from service.gyro import Nanoseconds, tai_ns_of
+from service.identify.attitude_from_matches import matched_vectors
+from service.identify.identification import Outcome
 from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import CorrectedObservations, correct
+from service.observations.schema import submission_from_json
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
-from service.storage.grades.lone_stars import lone_stars
-from service.storage.gyro.blocks import BlockFilter, rates_of, times_of
+from service.storage.gyro import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import results, solutions
-from service.times import DAY_S, Utc
-from service.vectors import Vector
+from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.sql.grade_tables import gyro_blocks
+from service.storage.sql.tables import batches, results, rollups_daily, solutions, star_results
+from service.times import DAY_S, Utc, recorded_utc
+from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 _ATTITUDES = select(
     results.c.time_ns,
@@ -84,19 +98,191 @@ def inputs_digest(recorded: Recorded, mission: Mission) -> str:
         for name, each in (("gyro", mission.gyro), ("motion", mission.motion))
     }
     digest = hashlib.sha256(json.dumps([METHOD, settings], sort_keys=True).encode())
-    attitudes, directions = recorded.attitudes, recorded.directions
     for values in (
         recorded.gyro_ns,
         recorded.rates_rad_s,
-        attitudes.tai_ns,
-        attitudes.quaternion,
-        attitudes.covariance_rad2,
-        directions.tai_ns,
-        directions.body,
-        directions.inertial,
-        directions.sigma_rad,
+        *arrays_of(recorded.attitudes, recorded.directions),
         np.array([recorded.unusable]),
     ):
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(np.ascontiguousarray(values).tobytes())
     return f"sha256:{digest.hexdigest()}"
+
+
+_SHOWN = (
+    results.c.id,
+    batches.c.time,
+    batches.c.time_ns,
+    batches.c.input,
+    *(solutions.c[name] for name in ("q1", "q2", "q3", "qc")),
+    *(solutions.c[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
+)
+_LAST = (
+    select(*_SHOWN)
+    .join_from(results, batches, results.c.batch_id == batches.c.id)
+    .join(solutions, solutions.c.result_id == results.c.id)
+    .where(
+        results.c.current,
+        results.c.spacecraft == bindparam("spacecraft"),
+        results.c.run == bindparam("run"),
+        results.c.time_ns <= bindparam("until_ns", type_=BigInteger),
+        results.c.time_ns >= bindparam("since_ns", type_=BigInteger),
+        results.c.status == "good",
+    )
+    .order_by(*(column.desc() for column in PLACE))
+    .limit(2)
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedAttitude:
+    """A good attitude, the result that it is of, and the rates (3,) that its batch carried."""
+
+    result: str
+    time: Utc
+    known: Known
+    body_rates_deg_per_s: Vector
+
+
+class _Rates(msgspec.Struct):
+    body_rates_deg_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+_RATES = msgspec.json.Decoder(_Rates)
+
+
+def last_attitudes(
+    connection: Connection, spacecraft: str, run: str, until: Utc, within_s: float
+) -> list[RecordedAttitude]:
+    """The last two good attitudes that are not after a time, nor older than so much, latest first.
+
+    A suspect attitude is none of them.
+    """
+    asked = {
+        "spacecraft": spacecraft,
+        "run": run,
+        "until_ns": until.tai_ns,
+        "since_ns": until.tai_ns - round(within_s * 1e9),
+    }
+    found = []
+    for row in connection.execute(_LAST, asked):
+        p11, p12, p13, p22, p23, p33 = row[8:]
+        covariance = np.array([[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]])
+        known = Known(row.time_ns, np.array(row[4:8]), covariance / ARCSEC_PER_RADIAN**2)
+        rates = np.array(_RATES.decode(row.input).body_rates_deg_per_s)
+        found.append(RecordedAttitude(row.id, recorded_utc(row.time), known, rates))
+    return found
+
+
+WITHOUT_ATTITUDE = (
+    str(NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS),
+    str(NoAttitude.DEGENERATE_GEOMETRY),
+)
+"""Why a batch has no attitude although stars of it are identified."""
+_READ_AT_ONCE = 100
+"""Inputs may be long: few of them are in memory at a time."""
+
+Stars = Mapping[tuple[str, int], str]
+"""The catalog star of each unique star, by tracker and place."""
+
+
+def lone_stars(
+    connection: Connection, sky: SkyModel, selected: ResultFilter
+) -> DirectionMeasurements:
+    """The unique stars of the batches without an attitude, in order of time.
+
+    The batch is calibrated with the settings that its result was made with; the inertial
+    directions are apparent ones, as attitudes are solved from.
+    """
+    missions: dict[str, Mission] = {}
+    rows_of: dict[str, dict[str, int]] = {}
+    found: list[tuple[int, Vector, Vector, Vector]] = []
+    query = (
+        select(results.c.id, results.c.batch_id, results.c.time_ns, results.c.mission_digest)
+        .where(
+            *selected.conditions(),
+            results.c.status.is_(None),
+            results.c.unique > 0,
+            results.c.reason.in_(WITHOUT_ATTITUDE),
+        )
+        .order_by(*PLACE)
+    )
+    read = connection.execute(query).all()
+    for first in range(0, len(read), _READ_AT_ONCE):
+        part = read[first : first + _READ_AT_ONCE]
+        stars = _unique_stars(connection, [row.id for row in part])
+        inputs = _inputs(connection, [row.batch_id for row in part])
+        for row in part:
+            digest = row.mission_digest
+            if digest not in missions:
+                missions[digest] = recorded_mission(connection, digest)
+            mission, batch = missions[digest], submission_from_json(inputs[row.batch_id]).batch
+            run_catalog = sky.run_catalog(mission, batch.time)
+            if run_catalog.digest not in rows_of:
+                rows_of[run_catalog.digest] = {n: k for k, n in enumerate(run_catalog.star_id)}
+            rows = rows_of[run_catalog.digest]
+            body, inertial, sigma = _directions(
+                batch, mission, run_catalog, stars.get(row.id, {}), rows
+            )
+            found.append((row.time_ns, body, inertial, sigma))
+    if not found:
+        return no_directions()
+    return DirectionMeasurements(
+        np.repeat([each[0] for each in found], [len(each[3]) for each in found]).astype(np.int64),
+        np.concatenate([each[1] for each in found]),
+        np.concatenate([each[2] for each in found]),
+        np.concatenate([each[3] for each in found]),
+    )
+
+
+def _inputs(connection: Connection, batch_ids: list[str]) -> dict[str, str]:
+    query = select(batches.c.id, batches.c.input).where(batches.c.id.in_(batch_ids))
+    return dict(map(tuple, connection.execute(query)))
+
+
+def _unique_stars(connection: Connection, ids: list[str]) -> dict[str, dict[tuple[str, int], str]]:
+    c = star_results.c
+    query = select(c.result_id, c.tracker, c.position, c.star_id).where(
+        c.result_id.in_(ids), c.outcome == Outcome.UNIQUE.word
+    )
+    found: dict[str, dict[tuple[str, int], str]] = {}
+    for id, tracker, position, star in connection.execute(query):
+        found.setdefault(id, {})[tracker, position] = star
+    return found
+
+
+def _directions(
+    batch: ObservationBatch,
+    mission: Mission,
+    run_catalog: RunCatalog,
+    stars: Stars,
+    rows: Mapping[str, int],
+) -> tuple[Vector, Vector, Vector]:
+    """Body and apparent inertial directions (n, 3) of the unique stars, and their sigmas (n,)."""
+    try:
+        corrected = correct(batch, mission)
+    except BadInput:
+        corrected = ()
+    names = list(stars.values())
+    star = [
+        # Two stars with one identity: at least one of them is wrong.
+        rows.get(name, -1) if name is not None and names.count(name) == 1 else -1
+        for each in corrected
+        for name in _of_tracker(each, stars)
+    ]
+    if not any(row >= 0 for row in star):
+        return np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
+    body, inertial, sigma = matched_vectors(
+        np.concatenate([each.direction_body for each in corrected]),
+        np.concatenate([each.sigma_rad for each in corrected]),
+        np.array(star, np.int64),
+        run_catalog.direction_at(batch.time),
+        aberration_velocity(batch),
+        sun_distance_au(batch.time),
+    )
+    return unit(body), unit(inertial), sigma
+
+
+def _of_tracker(corrected: CorrectedObservations, stars: Stars) -> list[str | None]:
+    name = corrected.tracker.name
+    return [stars.get((name, k)) for k in range(len(corrected.sigma_rad))]

@@ -1,6 +1,7 @@
-"""The grades of a period for its charts: a bounded number of samples and innovations."""
+"""The grades of a period: samples and innovations for charts, in pages, and the alarm quantity."""
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -8,18 +9,30 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
+from service.alarms.quantities import REJECTED
+from service.alarms.window import Point, Sample, preview_of
+from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers
-from service.filtering.state import Status
-from service.grades.day import GRADES, Grade, GradedSamples
+from service.filtering.state import Outcome, Status
+from service.grades.day import (
+    GRADES,
+    Grade,
+    GradedSamples,
+    day_bounds,
+    unpacked,
+    unpacked_innovations,
+)
 from service.grades.innovations import MeasuredInnovations
-from service.grades.packing import unpacked, unpacked_innovations
-from service.storage.grades.days import shown
-from service.storage.grades.innovations import inside
-from service.storage.grades.models import GradedDayRow
-from service.storage.grades.rows import block_conditions
+from service.gyro import texts_of
+from service.missions.mission import Mission
+from service.storage.grades.days import DayKey, GradedDayRow, Innovation, shown
+from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
+from service.storage.models.base import Page
+from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
+from service.storage.queries.limits import limits_of
 from service.storage.queries.pages import ResultFilter
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
-from service.times import DAY_S, Utc
+from service.times import DAY_S, Utc, shifted
 
 PARTS = 600
 """Of a period, of each of which one sample is kept: as many as a chart shows."""
@@ -198,3 +211,121 @@ def _innovations(
         kept = _of_each_part(whole.tai_ns[chosen], rank[chosen], start, end)
         places.append(chosen[kept])
     return whole.taken(np.sort(np.concatenate(places)))
+
+
+def list_innovations(
+    connection: Connection, selected: ResultFilter, *, limit: int, cursor: str | None
+) -> Page[Innovation]:
+    """How the measured attitudes of a period met the filter, the earliest first."""
+    query = BLOCKS.where(*block_conditions(selected, INNOVATIONS)).order_by(*PLACE).limit(1)
+    day, position, row = (-1, -1, 0) if cursor is None else _read_cursor(cursor)
+    beyond = query if cursor is None else query.where(tuple_(*PLACE) >= tuple_(day, position))
+    items: list[Innovation] = []
+    while (block := connection.execute(beyond).mappings().first()) is not None:
+        found = unpacked_innovations(block["packed"], block["samples"])
+        places = inside(found, selected)
+        if (block["day"], block["position"]) == (day, position):
+            places = places[places >= row]
+        for place, item in zip(places.tolist(), _shown(block, found, places), strict=False):
+            if len(items) == limit:
+                return Page(items, f"{block['day']}.{block['position']}.{place}")
+            items.append(item)
+        beyond = query.where(tuple_(*PLACE) > tuple_(block["day"], block["position"]))
+    return Page(items, None)
+
+
+def inside(found: MeasuredInnovations, selected: ResultFilter) -> Any:
+    """The places of the measurements in the period."""
+    chosen = np.ones(len(found), dtype=bool)
+    if selected.start is not None:
+        chosen &= found.tai_ns >= selected.start.tai_ns
+    if selected.end is not None:
+        chosen &= found.tai_ns < selected.end.tai_ns
+    return np.flatnonzero(chosen)
+
+
+def _shown(block: Any, found: MeasuredInnovations, places: Any) -> Iterator[Innovation]:
+    start, _ = day_bounds(block["day"])
+    chosen = found.taken(places)
+    times = texts_of(start, np.asarray((chosen.tai_ns - start.tai_ns) * 1e-9))
+    met = np.isfinite(chosen.nis)
+    sigma = chosen.innovation_sigma_arcsec
+    for k, time in enumerate(times):
+        yield Innovation(
+            time=time,
+            outcome=Outcome(int(chosen.outcome[k])).name.lower(),
+            innovation_arcsec=chosen.innovation_arcsec[k].tolist() if met[k] else None,
+            innovation_sigma_arcsec=sigma[k].tolist() if met[k] else None,
+            chi_square=float(chosen.nis[k]) if met[k] else None,
+            difference_arcsec=chosen.difference_arcsec[k].tolist(),
+            difference_sigma_arcsec=chosen.difference_sigma_arcsec[k].tolist(),
+            model=block["model"],
+            revision=block["revision"],
+        )
+
+
+def _read_cursor(cursor: str) -> tuple[int, int, int]:
+    if not re.fullmatch(r"-?\d{1,8}\.\d{1,4}\.\d{1,5}", cursor, re.ASCII):
+        raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
+    day, position, row = cursor.split(".")
+    return int(day), int(position), int(row)
+
+
+_COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
+
+
+def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
+    """What each measured attitude of a period adds to the share, in order of time."""
+    found: list[Sample] = []
+    for part in latest_innovations(connection, selected):
+        counted = np.isin(part.outcome, _COUNTED)
+        rejected = part.outcome[counted] == Outcome.REJECTED
+        times = part.tai_ns[counted].tolist()
+        found += [(at, float(is_one), 1.0) for at, is_one in zip(times, rejected, strict=True)]
+    return sorted(found)
+
+
+def evaluate_day(connection: Connection, mission: Mission, key: DayKey, row: GradedDayRow) -> None:
+    """Evaluate the limits of the share for a day that was recorded now.
+
+    Its measurements are evaluated in the order of their time, as batches that arrive are: what
+    was out of limits within the day raises an alarm, and returns.  Of a later revision of the
+    day the state at its end counts alone.  Days before the latest one raise nothing, and neither
+    do runs without alarms.
+    """
+    if key.run not in runs_with_alarms(connection, {key.run}) or not _is_latest(connection, key):
+        return
+    start, end = day_bounds(key.day)
+    samples = rejected_samples(connection, ResultFilter(key.run, key.spacecraft, start, end))
+    limits = limits_of(connection, mission)[REJECTED]
+    if len(samples) < limits.minimum_count:
+        return
+    active = ActiveAlarms(connection, key.spacecraft, key.run)
+    excursions = preview_of(samples, limits).excursions
+    last_ns = samples[-1][0]
+
+    def at(time_ns: int, value: float | None = None) -> Point:
+        """The value at a time; by default the share over the latest until then."""
+        if value is None:
+            parts = [part for at_ns, part, _ in samples if at_ns <= time_ns]
+            value = sum(parts[-limits.minimum_count :]) / limits.minimum_count
+        return Point(value, shifted(start, (time_ns - start.tai_ns) * 1e-9).text, None)
+
+    for each in excursions:
+        if row.revision > 1 and each.end_ns is not None:
+            continue
+        worst = at(each.start_ns, each.worst)
+        active.observe(REJECTED, each.severity, limits, worst, row.created, worst)
+        if each.end_ns is not None:
+            active.observe(REJECTED, None, limits, at(each.end_ns), row.created)
+    if not excursions or excursions[-1].end_ns is not None:
+        active.observe(REJECTED, None, limits, at(last_ns), row.created)
+    active.save()
+
+
+def _is_latest(connection: Connection, key: DayKey) -> bool:
+    c = graded_days.c
+    later = select(c.id).where(
+        c.spacecraft == key.spacecraft, c.run == key.run, c.current, c.day > key.day
+    )
+    return connection.execute(later.limit(1)).first() is None

@@ -1,27 +1,39 @@
-"""Filtered and smoothed attitudes of a period in order of time, page by page."""
+"""Filtered and smoothed attitudes of a period page by page, and the filtered one of live data."""
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
 
 from service.filtering.state import Status
-from service.grades.day import Grade, day_bounds
-from service.grades.packing import unpacked
-from service.gyro.block import texts_of
+from service.grades.carried import Carried
+from service.grades.day import Grade, day_bounds, unpacked
+from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
+from service.storage.models.base import (
+    Components,
+    Covariance,
+    DescribedAs,
+    Moment,
+    Quaternion,
+    Record,
+    doc,
+)
+from service.storage.models.base import (
+    Status as StatusWord,
+)
 from service.storage.queries.pages import ResultFilter
 from service.storage.sql.grade_tables import graded_blocks, graded_days
-from service.times import DAY_S
+from service.times import DAY_S, Utc
 
 METHODS: dict[Grade, str] = {"filtered": "ekf", "smoothed": "filter_smoother"}
 """The words of CCSDS ACM's AD_METHOD."""
 STATUS = {Status.GOOD: "good", Status.STARTING: "suspect", Status.DOUBTFUL: "suspect"}
-_PLACE = (graded_days.c.day, graded_blocks.c.position)
-_BLOCKS = select(
-    *_PLACE,
+PLACE = (graded_days.c.day, graded_blocks.c.position)
+BLOCKS = select(
+    *PLACE,
     graded_days.c.id,
     graded_days.c.revision,
     graded_blocks.c.model,
@@ -42,8 +54,8 @@ def graded_pages(
 
     Of each block no more than the first `page`.  Between two blocks no connection is held.
     """
-    order = [column.desc() if newest_first else column for column in _PLACE]
-    query = _BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
+    order = [column.desc() if newest_first else column for column in PLACE]
+    query = BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
     beyond: Select[Any] = query
     while True:
         with reading() as connection:
@@ -55,7 +67,7 @@ def graded_pages(
             rows = rows.taken(slice(None, None, -1))
         if len(rows):
             yield rows.taken(slice(0, page))
-        place, last = tuple_(*_PLACE), tuple_(row["day"], row["position"])
+        place, last = tuple_(*PLACE), tuple_(row["day"], row["position"])
         beyond = query.where(place < last if newest_first else place > last)
 
 
@@ -126,3 +138,45 @@ def _repeated(value: str | None, n: int) -> Any:
     column = np.empty(n, dtype=object)
     column[:] = value
     return column
+
+
+class LiveAttitude(Record, frozen=True, kw_only=True):
+    """The filtered attitude of a spacecraft at the last epoch of its live data."""
+
+    component: ClassVar[str] = "LiveAttitude"
+    spacecraft: str
+    time: Annotated[Moment, doc("Of the last gyro sample or, without a gyro, measurement.")]
+    quaternion: Quaternion
+    covariance_arcsec2: Covariance
+    rate_deg_per_s: Annotated[Components, doc("Of the body relative to inertial, in body axes.")]
+    bias_deg_per_h: Annotated[
+        Components | None, doc("Bias of the gyro, in body axes; null at a constant rate.")
+    ]
+    bias_sigma_deg_per_h: Annotated[
+        Components, doc("One sigma of the bias or, at a constant rate, of the rate.")
+    ]
+    status: Annotated[
+        StatusWord, doc("`suspect`: measurements contradict it, or have not confirmed it yet.")
+    ]
+    model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
+
+
+def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:
+    """What is answered of the last epoch; None where there is no attitude, or it is lost."""
+    if carried is None or (word := STATUS.get(Status(int(carried.sample.status[0])))) is None:
+        return None
+    sample = carried.sample
+    (time,) = texts_of(day_start, np.asarray((sample.tai_ns - day_start.tai_ns) * 1e-9))
+    p11, p12, p13, p22, p23, p33 = sample.covariance_arcsec2[0].tolist()
+    is_gyro = carried.model == "gyro"
+    return LiveAttitude(
+        spacecraft=name,
+        time=time,
+        quaternion=sample.quaternion[0].tolist(),
+        covariance_arcsec2=[[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]],
+        rate_deg_per_s=sample.rate_deg_per_s[0].tolist(),
+        bias_deg_per_h=sample.bias_deg_per_h[0].tolist() if is_gyro else None,
+        bias_sigma_deg_per_h=sample.bias_sigma_deg_per_h[0].tolist(),
+        status=word,
+        model=carried.model,
+    )

@@ -1,4 +1,4 @@
-"""Limits and alarms."""
+"""Limits and alarms, and annotations: notes that people write on times and periods."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -190,3 +190,31 @@ class AlarmSummary(Record, frozen=True, kw_only=True):
     acknowledged: int
     shelved: int
     worst: Annotated[SeverityName | None, doc("Worst severity of the alarms that are not shelved.")]
+
+
+class Annotation(Record, frozen=True, kw_only=True):
+    """A note on a time or a period, signed by its author."""
+
+    component: ClassVar[str] = "Annotation"
+    id: Id
+    spacecraft: Annotated[str | None, doc("null: it is about every spacecraft.")]
+    start: Annotated[Moment, doc("Telemetry time.")]
+    end: Annotated[Moment | None, doc("null: the note is about a moment.")]
+    text: str
+    who: str
+    created: Stamp
+
+
+class AnnotationPage(Record, frozen=True, kw_only=True):
+    """A page of annotations."""
+
+    component: ClassVar[str] = "AnnotationPage"
+    items: list[Annotation]
+    next_cursor: str | None
+
+
+class AnnotationChange(Annotation, frozen=True, kw_only=True):
+    """The data of an event: an annotation that was written or deleted."""
+
+    component: ClassVar[str] = "AnnotationEvent"
+    deleted: bool

@@ -1,17 +1,16 @@
-"""The answer to a batch, and answers in lists."""
+"""The answer to a batch, the stars of its frame, and answers in lists."""
 
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
 
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Raw, Struct, UnsetType
 from pydantic import BaseModel, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
 from service.acquire.result import TrackingState
 from service.alarms.quantities import QUANTITIES, value_names
 from service.missions.mission import Identifier
-from service.observations.prediction import NoPrediction, RateSource
-from service.observations.schema import BatchIn
+from service.observations.schema import BatchIn, NoPrediction, RateSource
 from service.storage.models.base import (
     Count,
     Covariance,
@@ -21,6 +20,7 @@ from service.storage.models.base import (
     MissionSettings,
     Moment,
     Outcome,
+    Problem,
     Quaternion,
     Reason,
     Record,
@@ -29,7 +29,85 @@ from service.storage.models.base import (
     Status,
     doc,
 )
-from service.storage.models.frames import FrameSummary, FrameWithStars
+
+
+class FrameTimings(Record, frozen=True, kw_only=True):
+    """Microseconds per step from file to stars."""
+
+    component: ClassVar[str] = "FrameTimingsOut"
+    read: Count
+    detect: Count
+    centroid: Count
+
+
+class FrameSummary(Record, frozen=True, kw_only=True):
+    """The frame of a batch, and the numbers of detected stars."""
+
+    component: ClassVar[str] = "FrameOut"
+    digest: Digest
+    format: Annotated[str, DescribedAs(Literal["FITS", "TIFF", "PNG", "NPY", "JPEG", "BMP"])]
+    tracker: str
+    width_px: Count
+    height_px: Count
+    exposure_s: float
+    centroid: Annotated[str, DescribedAs(Literal["window", "scan", "matched", "recursive"])]
+    background_counts: Annotated[float, doc("Median background above the bias.")]
+    noise_counts: Annotated[float, doc("Standard deviation of a background pixel.")]
+    candidates: Annotated[Count, doc("Detections above the threshold, without hot pixels.")]
+    measured: Annotated[Count, doc("The brightest of these, whose positions were measured.")]
+    used: Annotated[Count, doc("Of these, the stars in the batch.")]
+    hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
+    timings_us: FrameTimings
+    remarks: (
+        Annotated[list[str], doc("What was fitted, chosen of the file, or turned, in words.")]
+        | UnsetType
+    ) = UNSET
+
+
+class Detection(Record, frozen=True, kw_only=True):
+    """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
+
+    component: ClassVar[str] = "DetectionOut"
+    u_px: Annotated[
+        float | None,
+        doc("null if the position could not be measured; `left_out` states the reason."),
+    ]
+    v_px: float | None
+    sigma_u_px: Annotated[float | None, doc("Predicted, one standard deviation.")]
+    sigma_v_px: float | None
+    flux_counts: float | None
+    magnitude: float | None
+    signal_ratio: Annotated[float | None, doc("Signal divided by its noise.")]
+    flags: list[
+        Annotated[
+            str,
+            DescribedAs(
+                Literal[
+                    "saturated",
+                    "edge",
+                    "blended",
+                    "too_faint",
+                    "outside_hump",
+                    "masked_pixels",
+                    "truncated",
+                    "not_converged",
+                ]
+            ),
+        ]
+    ]
+    used: Annotated[bool, doc("Whether it is in the batch. The batch has the same order.")]
+    left_out: Annotated[str | None, doc("Why it is not in the batch.")]
+
+
+class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
+    """A frame with every candidate."""
+
+    component: ClassVar[str] = "FrameRecordOut"
+    stars: Annotated[list[Detection], doc("The stars in the batch come first.")]
+    hot_or_cosmic_px: Annotated[
+        list[Annotated[list[float], Field(min_length=2, max_length=2)]],
+        doc("Positions (u, v) of rejected hot pixels and cosmic rays; the first 500."),
+    ]
 
 
 class StarRef(Record, frozen=True, kw_only=True):
@@ -379,3 +457,25 @@ class Neighbours(Struct, frozen=True):
     current: str | None
     earlier: Summary | None
     later: Summary | None
+
+
+class BatchOutcome(Record, frozen=True, kw_only=True):
+    """The outcome of one batch of an array: its answer or its problem, the other is null."""
+
+    component: ClassVar[str] = "BatchOutcome"
+    status: Annotated[
+        int,
+        doc(
+            "The status that the batch alone would have had: 201 if it is now recorded, 200 if it "
+            "was recorded before, or the status of the problem."
+        ),
+    ]
+    answer: Annotated[Raw | None, DescribedAs(Answer | None), doc("As it is recorded.")]
+    problem: Problem | None
+
+
+class BatchOutcomes(Record, frozen=True, kw_only=True):
+    """One outcome for each batch of an array, in the order in which they were sent."""
+
+    component: ClassVar[str] = "BatchOutcomes"
+    items: list[BatchOutcome]

@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
 from service.acquire.result import TrackingState
-from service.storage.models.alarms import Alarm, Limit
-from service.storage.models.annotations import AnnotationChange
+from service.storage.models.alarms import Alarm, AnnotationChange, Limit
 from service.storage.models.answers import StarCounts
 from service.storage.models.base import (
     Count,

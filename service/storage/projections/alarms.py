@@ -1,4 +1,4 @@
-"""Evaluating limits against batches in the order of the record, each batch exactly once.
+"""Alarms: limits evaluated against batches in the order of the record, and by the clock.
 
 The evaluation is part of the transaction that moves the projector on: after a crash either
 both are stored or neither.  The row in `watches` is locked, so that several
@@ -6,27 +6,28 @@ processes evaluate one after the other.
 """
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from typing import Any
 
 import msgspec
 from msgspec import Struct
-from sqlalchemy import Connection, bindparam, select, update
+from sqlalchemy import Connection, bindparam, insert, select, update
 
-from service.alarms.limits import LimitSettings
+from service.alarms import state_machine
+from service.alarms.limits import LimitSettings, Severity
 from service.alarms.quantities import SILENCE
-from service.alarms.subjects import Subject, sampler
+from service.alarms.subjects import Subject, quantity_and_tracker, sampler, subject_of
 from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
-from service.storage.projections.active_alarms import ActiveAlarms
 from service.storage.projections.recorded import RecordedResult
-from service.storage.projections.silence import silence_severity
+from service.storage.queries.alarms import change, record_action
 from service.storage.queries.limits import limits_of
+from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.alarm_tables import watches
+from service.storage.sql.alarm_tables import alarms, watches
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import prepared
-from service.storage.sql.statements import insert_missing
+from service.storage.sql.statements import insert_missing, prepared
 from service.storage.sql.tables import batches, missions, results, runs
-from service.times import recorded_utc
+from service.times import Utc, recorded_utc
 
 # Run with every batch of a live spacecraft, or with a few of them.
 _PLACE = (
@@ -269,3 +270,167 @@ def _columns_of(batch: Row) -> Row:
 
 def _reference(batch: Row) -> BatchRef:
     return batch["time"], batch["id"]
+
+
+def silence_severity(limits: Mapping[Subject, LimitSettings], gap_s: float) -> Severity | None:
+    """The worst severity whose limit a gap between batches exceeds; None within limits."""
+    exceeded = limits[SILENCE].severities_out(gap_s)
+    return exceeded[-1] if exceeded else None
+
+
+def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
+    """Raise the alarms of live spacecraft that are silent, and end shelving that has expired."""
+    for spacecraft in sorted(_silent(connection, missions, now)):
+        row = _locked_watch(connection, spacecraft)
+        if row is None:
+            continue
+        active = ActiveAlarms(connection, spacecraft, LIVE)
+        gap_s = _seconds(row["received"], now)
+        limits = limits_of(connection, missions[spacecraft])
+        severity = silence_severity(limits, gap_s)
+        if severity is not None:
+            point = Point(gap_s, row["time"], row["batch_id"])
+            active.observe(SILENCE, severity, limits[SILENCE], point, now.text)
+            active.save()
+    expired = connection.execute(_expired(now).with_for_update()).mappings().all()
+    for alarm in map(dict, expired):
+        changes, actions = state_machine.expired(alarm, now.text)
+        change(connection, alarm, changes, actions, now.text)
+
+
+def is_due_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> bool:
+    """Whether `evaluate_by_clock` would change anything; it only reads."""
+    if connection.execute(_expired(now).limit(1)).first() is not None:
+        return True
+    return bool(_silent(connection, missions, now))
+
+
+def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> set[str]:
+    """The live spacecraft whose silence is worse than their alarm says so far."""
+    found = set()
+    query = select(watches.c.spacecraft, watches.c.received).where(watches.c.run == LIVE)
+    for spacecraft, received in connection.execute(query):
+        mission = missions.get(spacecraft)
+        if mission is None:
+            continue
+        severity = silence_severity(limits_of(connection, mission), _seconds(received, now))
+        if severity is None:
+            continue
+        noted = select(alarms.c.current_severity).where(
+            alarms.c.run == LIVE,
+            alarms.c.spacecraft == spacecraft,
+            alarms.c.quantity == SILENCE,
+            alarms.c.cleared_at.is_(None),
+        )
+        if connection.execute(noted).scalar() != severity.word:
+            found.add(spacecraft)
+    return found
+
+
+def _locked_watch(connection: Connection, spacecraft: str) -> Any:
+    query = select(watches).where(watches.c.spacecraft == spacecraft, watches.c.run == LIVE)
+    return connection.execute(query.with_for_update()).mappings().first()
+
+
+def _expired(now: Utc) -> Any:
+    return (
+        select(alarms)
+        .where(alarms.c.cleared_at.is_(None), alarms.c.shelved_until <= now.text)
+        .order_by(alarms.c.id)
+    )
+
+
+def _seconds(received: str, now: Utc) -> float:
+    return (now.tai_ns - recorded_utc(received).tai_ns) * 1e-9
+
+
+_IDS = Ulids()
+
+# Run with every batch of a live spacecraft.
+_ACTIVE = prepared(
+    select(alarms)
+    .where(
+        alarms.c.run == bindparam("of_run"),
+        alarms.c.spacecraft == bindparam("of_spacecraft"),
+        alarms.c.cleared_at.is_(None),
+    )
+    .order_by(alarms.c.id)
+    .with_for_update()
+)
+_VALUES = (
+    *(f"{which}_{part}" for which in ("latest", "worst") for part in ("value", "time", "batch_id")),
+    "current_severity",
+    "returned_at",
+)
+"""The columns that a new value can change without an action to note."""
+_UPDATE_VALUES = prepared(
+    update(alarms)
+    .where(alarms.c.id == bindparam("of_id"))
+    .values({name: bindparam(name) for name in _VALUES})
+)
+
+
+class ActiveAlarms:
+    """The alarms that are not cleared, by subject; their rows stay locked until the commit."""
+
+    def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
+        self._connection = connection
+        self._place = {"spacecraft": spacecraft, "run": run}
+        rows = _ACTIVE.read(connection, {"of_spacecraft": spacecraft, "of_run": run})
+        self._alarms: dict[Subject, Row] = {
+            subject_of(row["quantity"], row["tracker"]): row for row in rows
+        }
+        self._unsaved: set[Subject] = set()
+
+    def has(self, subject: Subject) -> bool:
+        """Whether a subject has an active alarm."""
+        return subject in self._alarms
+
+    def is_out(self, subject: Subject) -> bool:
+        """Whether a subject has an active alarm and is out of limits."""
+        return self.has(subject) and self._alarms[subject]["current_severity"] is not None
+
+    def observe(
+        self,
+        subject: Subject,
+        severity: Severity | None,
+        limits: LimitSettings,
+        point: Point,
+        now: str,
+        worst: Point | None = None,
+    ) -> None:
+        """Apply a new value to the subject's alarm, or raise an alarm if it has none."""
+        alarm = self._alarms.get(subject)
+        if alarm is None:
+            if severity is not None:
+                columns, actions = state_machine.raised(severity, limits, point, now, worst)
+                quantity, tracker = quantity_and_tracker(subject)
+                what = {"quantity": quantity, "tracker": tracker}
+                alarm = {"id": _IDS.new(), **what, **self._place, **columns}
+                self._connection.execute(insert(alarms), alarm)
+                record_action(self._connection, alarm, actions, now)
+                self._alarms[subject] = alarm
+            return
+        changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)
+        if actions:
+            # The changes that were not written yet go with it.
+            values = {name: alarm[name] for name in _VALUES}
+            alarm = change(self._connection, alarm, values | changes, actions, now)
+            self._unsaved.discard(subject)
+        else:
+            # Values alone are written once, by `save`.
+            alarm = alarm | changes
+            self._unsaved.add(subject)
+        self._alarms[subject] = alarm
+        if alarm["cleared_at"] is not None:
+            del self._alarms[subject]
+
+    def save(self) -> None:
+        """Write the latest values of the alarms that did not change otherwise."""
+        if self._unsaved:
+            found = [self._alarms[subject] for subject in sorted(self._unsaved)]
+            rows = [
+                {name: alarm[name] for name in _VALUES} | {"of_id": alarm["id"]} for alarm in found
+            ]
+            _UPDATE_VALUES.run(self._connection, rows)
+            self._unsaved.clear()

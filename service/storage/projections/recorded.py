@@ -8,7 +8,7 @@ from sqlalchemy import Connection, bindparam, literal_column, select
 
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import prepared
+from service.storage.sql.statements import prepared
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
 from service.times import HOUR_S, recorded_utc
 

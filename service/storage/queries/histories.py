@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from pydantic import ValidationError
 from sqlalchemy import Connection, Select, exists, func, select
 
-from service.acquire.measured import METHOD
+from service.acquire.result import METHOD
 from service.missions.mission import Mission
 from service.storage.archive.reading import Archive
 from service.storage.models.base import Page
@@ -18,11 +18,18 @@ from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries.pages import PLACE, ResultFilter, newest
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
+from service.storage.queries.with_archive import MOST_OPENED, ArchiveUse, page_of
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import batches, mission_uses, missions, results, runs, solutions
+from service.storage.sql.tables import (
+    batches,
+    mission_uses,
+    missions,
+    results,
+    rollups_daily,
+    runs,
+    solutions,
+)
 from service.times import DAY_S, Utc, bucket_start
 
 log = logging.getLogger(__name__)

@@ -29,7 +29,7 @@ from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording import events
 from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import prepared
+from service.storage.sql.statements import prepared
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
 from service.times import Utc, recorded_utc
 

@@ -15,7 +15,7 @@ from service.storage.archive.reading import Archive, PlacedPart
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result
-from service.storage.queries.with_archive.rows import ArchiveUse, bounds_of, count_of_part, parts_of
+from service.storage.queries.with_archive import ArchiveUse, bounds_of, count_of_part, parts_of
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 

@@ -18,8 +18,7 @@ from service.storage.models.runs import (
     ReplayStateName,
 )
 from service.storage.recording import events
-from service.storage.sql.rollup_tables import rollups_daily
-from service.storage.sql.tables import replays
+from service.storage.sql.tables import replays, rollups_daily
 
 MAX_LISTED = 100
 CANCELLED: ReplayStateName = "cancelled"

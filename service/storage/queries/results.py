@@ -1,6 +1,7 @@
 """Reading results: lists of them, and one with all that belongs to it."""
 
 import json
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import msgspec
@@ -8,17 +9,37 @@ from msgspec import UNSET
 from sqlalchemy import ColumnElement, Connection, Select, or_, select
 
 from service.alarms.quantities import QUANTITIES, value_names
-from service.errors import NotFound, WrongState, shown_value
+from service.errors import Busy, NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
-from service.storage.models.answers import Answer, Result, StarCounts, Summary
+from service.storage.models.answers import (
+    Answer,
+    FrameWithStars,
+    Neighbours,
+    Result,
+    StarCounts,
+    Summary,
+)
 from service.storage.models.base import Page
-from service.storage.models.frames import FrameWithStars
 from service.storage.queries.pages import ResultFilter, newest
-from service.storage.queries.with_archive.rows import MOST_OPENED, ArchiveUse, page_of
+from service.storage.queries.with_archive import (
+    FIRST_ID,
+    LAST_ID,
+    MOST_OPENED,
+    ArchiveUse,
+    first_rows,
+    page_of,
+)
 from service.storage.recording.unsaved_result import STARS
-from service.storage.sql.archive_tables import archived_batches, archived_what_ifs
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import batches, frames, missions, results, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_what_ifs,
+    batches,
+    frames,
+    missions,
+    results,
+    runs,
+)
 from service.times import Utc
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
@@ -227,3 +248,48 @@ def summary_fields(row: Any) -> Row:
 def measured(row: Any) -> dict[str, float | None]:
     """The values of a result's measured quantities and their ratios, by name."""
     return {name: QUANTITIES[name].value_of(row) for name in value_names()}
+
+
+@dataclass(frozen=True)
+class Here:
+    """A result: its spacecraft, run and time, and the id of the current one of its batch."""
+
+    spacecraft: str
+    run: str
+    time_ns: int
+    current: str | None
+
+
+def here_of(connection: Connection, id: str) -> Here:
+    """Where a result is."""
+    row = connection.execute(select(results).where(results.c.id == id)).one()
+    standing = select(results.c.id).where(results.c.batch_id == row.batch_id, results.c.current)
+    return Here(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
+
+
+def neighbours(connection: Connection, archive: Archive, here: Here) -> Neighbours:
+    """The results before and after one in time, of its spacecraft and run."""
+    sides = (_next(connection, archive, here, newest_first=side) for side in (True, False))
+    return Neighbours(here.current, *sides)
+
+
+def _next(
+    connection: Connection, archive: Archive, here: Here, *, newest_first: bool
+) -> Summary | None:
+    selected = ResultFilter(here.run, here.spacecraft)
+    beyond = here.time_ns, FIRST_ID if newest_first else LAST_ID
+    query = summary_query().where(*selected.conditions())
+    try:
+        found = first_rows(
+            connection,
+            ArchiveUse(archive),
+            query,
+            selected,
+            1,
+            newest_first=newest_first,
+            beyond=beyond,
+        )
+    except Busy:
+        # Without the archive the page of a recorded batch is shown all the same.
+        return None
+    return next((summary_of(each.shown) for each in found.rows), None)

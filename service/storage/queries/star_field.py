@@ -1,4 +1,4 @@
-"""The stars of a batch in each tracker's field of view: the data of its chart.
+"""The stars of a batch in each tracker's field of view, and its trackers side by side.
 
 Nothing is identified here: the outcomes are those of the answer that is shown, so
 that the chart of an old result shows that result.
@@ -19,13 +19,14 @@ from service.sky.ephemeris import observer_velocity, sun_distance_au
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.models.star_field import (
+from service.storage.models.charts import (
     Boresight,
     CatalogStarPlace,
     ObservedStarPlace,
     StarField,
     TrackerField,
 )
+from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
@@ -200,3 +201,23 @@ def _angles(direction: Vector) -> dict[str, float]:
 
 def _number(value: float | Vector) -> float | None:
     return None if np.isnan(value) else float(value)
+
+
+def tracker_comparison(
+    batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
+) -> list[Row]:
+    """A row of `tracker_values` for each tracker, with its sigma as the mission has it.
+
+    Offsets from the catalog are not known where the answer's run catalog is no longer there.
+    """
+    run_catalog = sky.run_catalog(mission, batch.time)
+    place: dict[str, int] = {}
+    if run_catalog.digest == answer.provenance.run_catalog:
+        place = {id: row for row, id in enumerate(run_catalog.star_id)}
+    corrected = correct(batch, mission)
+    star = catalog_rows(answer, place)
+    rows = tracker_rows(answer.id or "", answer, batch, corrected, run_catalog, star)
+    return [
+        row | {"sigma_arcsec": each.tracker.sigma_arcsec}
+        for row, each in zip(rows, corrected, strict=True)
+    ]

@@ -13,18 +13,19 @@ from typing import Any, Literal
 import numpy as np
 from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
 
-from service.storage.recording.rollup_sql import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
-from service.storage.sql.archive_tables import archived_parts
+from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.tables import (
     COUNTS,
     ROLLED_UP,
+    archived_parts,
+    results,
     rollups_daily,
     rollups_hourly,
     tracker_rollups_daily,
     tracker_rollups_hourly,
+    tracker_values,
 )
-from service.storage.sql.tables import results, tracker_values
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
 from service.vectors import Matrix, Vector
 

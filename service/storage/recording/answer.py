@@ -17,6 +17,7 @@ from service.sky.zones import SearchRegion
 from service.storage.models.answers import (
     Answer,
     Attitude,
+    FrameSummary,
     Prediction,
     Provenance,
     Rival,
@@ -29,7 +30,6 @@ from service.storage.models.answers import (
     TrackerStars,
     Tracking,
 )
-from service.storage.models.frames import FrameSummary
 from service.vectors import ra_dec_of
 
 FRAME = "EME2000"

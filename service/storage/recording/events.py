@@ -1,24 +1,33 @@
-"""Recent events in order of commit, for clients that reconnect.
+"""Annotations, and recent events in order of commit, for clients that reconnect.
 
 An event is noted in the transaction of the change that it reports.  Its number
 comes from one row whose lock is held until the commit: in no process does an
 event become visible after one with a higher number, and no number is left out.
 """
 
-from collections.abc import Collection, Iterator, Sequence
+import logging
+import threading
+from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
 import msgspec
-from sqlalchemy import Connection, delete, func, select
+from sqlalchemy import URL, Connection, create_engine, delete, func, insert, or_, select
+from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.pool import NullPool
 
+from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.storage.models.alarms import Annotation, AnnotationChange
+from service.storage.models.base import Page
+from service.storage.recording.ids import is_ulid
+from service.storage.sql.alarm_tables import annotations
 from service.storage.sql.columns import Row
-from service.storage.sql.heard_events import CHANNEL
-from service.storage.sql.prepared import execute
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import execute, insert_all
 from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
+
+log = logging.getLogger(__name__)
 
 EventKind = Literal[
     "batches",
@@ -150,3 +159,118 @@ def events_between(connection: Connection, since: Utc, until: Utc) -> Sequence[E
 
 def _event(row: Any) -> Event:
     return Event(**row)
+
+
+_SHOWN = ("id", "spacecraft", "start", "end", "text", "who", "created")
+
+
+def add_annotation(connection: Connection, row: Row) -> Annotation:
+    """Store an annotation, and add an event."""
+    connection.execute(insert(annotations), row)
+    shown = _shown_annotation(row)
+    _add_annotation_event(connection, shown, deleted=False)
+    return shown
+
+
+def list_annotations(
+    connection: Connection,
+    *,
+    spacecraft: str | None,
+    start: Utc | None,
+    end: Utc | None,
+    limit: int,
+    cursor: str | None,
+) -> Page[Annotation]:
+    """Annotations that touch the period from `start` to before `end`, the latest written first.
+
+    Those of a spacecraft include those about every spacecraft.
+    """
+    chosen = []
+    if spacecraft is not None:
+        of_all = annotations.c.spacecraft.is_(None)
+        chosen.append(or_(annotations.c.spacecraft == spacecraft, of_all))
+    if start is not None:
+        chosen.append(annotations.c.end_ns >= start.tai_ns)
+    if end is not None:
+        chosen.append(annotations.c.start_ns < end.tai_ns)
+    if cursor is not None:
+        if not is_ulid(cursor):
+            raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
+        chosen.append(annotations.c.id < cursor)
+    query = select(annotations).where(*chosen).order_by(annotations.c.id.desc()).limit(limit + 1)
+    rows = [_shown_annotation(row) for row in connection.execute(query).mappings()]
+    return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+
+
+def read_annotation(connection: Connection, id: str) -> Annotation:
+    """One annotation; raises `NotFound`."""
+    query = select(annotations).where(annotations.c.id == id)
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        raise NotFound(f"there is no annotation with the id {shown_value(id)}")
+    return _shown_annotation(row)
+
+
+def delete_annotation(connection: Connection, id: str) -> Annotation:
+    """Delete an annotation, and add an event; raises `NotFound`."""
+    found = read_annotation(connection, id)
+    connection.execute(delete(annotations).where(annotations.c.id == id))
+    _add_annotation_event(connection, found, deleted=True)
+    return found
+
+
+def _shown_annotation(row: Any) -> Annotation:
+    return Annotation(**{name: row[name] for name in _SHOWN})
+
+
+def _add_annotation_event(connection: Connection, shown: Annotation, *, deleted: bool) -> None:
+    data = AnnotationChange(**msgspec.structs.asdict(shown), deleted=deleted)
+    add_event(connection, "annotation", data, spacecraft=shown.spacecraft)
+
+
+CHANNEL = "acquire_events"
+WAIT_S = 0.5
+"""Between two looks whether the thread is to end."""
+RECONNECT_S = 1.0
+
+
+class HeardEvents:
+    """A thread that wakes a service when another one has recorded events on PostgreSQL.
+
+    It listens with a connection of its own until it is closed.  The table of events is the truth;
+    a notification says only that it is worth reading.  A service whose connection is cut meanwhile
+    reads the table each second all the same.
+    """
+
+    def __init__(self, url: URL, heard: Callable[[], object]) -> None:
+        """`heard` is called from the thread after commits with events, also those of this one."""
+        self._url, self._heard = url, heard
+        self._closed = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="heard-events", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End the thread."""
+        self._closed.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        import psycopg
+
+        engine = create_engine(self._url, poolclass=NullPool, isolation_level="AUTOCOMMIT")
+        while not self._closed.is_set():
+            try:
+                with engine.connect() as connection:
+                    driver = connection.connection.driver_connection
+                    assert isinstance(driver, psycopg.Connection)
+                    driver.execute(f"LISTEN {CHANNEL}")
+                    while not self._closed.is_set():
+                        if list(driver.notifies(timeout=WAIT_S, stop_after=1)):
+                            self._heard()
+            except (SQLAlchemyError, psycopg.Error) as error:
+                log.info("events of other services are read each second: %s", error)
+                self._closed.wait(RECONNECT_S)
+            except Exception:
+                # An error of a listener must not end the thread that wakes all event streams.
+                log.exception("a listener of events failed")
+                self._closed.wait(RECONNECT_S)

@@ -10,8 +10,8 @@ from sqlalchemy import Connection, insert
 
 from service.errors import Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
-from service.storage.sql.packed_text import unpack
-from service.storage.sql.prepared import execute
+from service.storage.sql.columns import unpack
+from service.storage.sql.statements import execute
 from service.storage.sql.tables import idempotency_keys
 
 Identity = tuple[str, str, str]

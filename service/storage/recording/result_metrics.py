@@ -1,12 +1,16 @@
-"""The metrics of results: quantities measured from an acquisition, and rollups of them."""
+"""The metrics of results: measured from an acquisition, and rolled up in memory or by SQL."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
+from typing import Any
+
+from sqlalchemy import BigInteger, ColumnElement, Double, Table, case, func
 
 from service.acquire import Acquisition
-from service.alarms.quantities import QUANTITIES, Measured
+from service.alarms.quantities import QUANTITIES, Measured, Quantity, Ratio, StarShare
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import (
+from service.storage.sql.tables import (
+    COUNTED,
     COUNTS,
     MAXIMA,
     MINIMA,
@@ -14,6 +18,8 @@ from service.storage.sql.rollup_tables import (
     SHARES,
     SUMS,
     VALUES,
+    results,
+    tracker_values,
 )
 
 
@@ -63,3 +69,61 @@ def merge(into: Row, row: Row) -> None:
     for name in MAXIMA:
         if into[name] is None or (row[name] is not None and row[name] > into[name]):
             into[name] = row[name]
+
+
+# The columns of a rollup as SQL over current results, for sums that the database computes.
+#
+# `result_metrics.rolled_up` makes the same of results in memory.  The index of
+# current results has every column that is read here.
+
+
+def _counts(of: Table) -> Mapping[str, ColumnElement[Any]]:
+    stars = {name: of.c[name] for name in COUNTED if name != "observed"}
+    # The sum of the others, which the index has.
+    return {"observed": stars["unique"] + stars["ambiguous"] + stars["unmatched"], **stars}
+
+
+def value_sql(quantity: Quantity, of: Table = results) -> ColumnElement[Any]:
+    """The value of one result, or of one tracker in it; null where it has none."""
+    match quantity.source:
+        case StarShare(part):
+            counts = _counts(of)
+            return _over(part(counts), counts["observed"])
+        case Ratio(numerator, denominator):
+            return _over(of.c[numerator], of.c[denominator])
+        case _:
+            return of.c[quantity.name]
+
+
+def _sum(of: ColumnElement[Any]) -> ColumnElement[Any]:
+    # PostgreSQL's sum over integers is a decimal number.
+    return func.coalesce(func.sum(of), 0).cast(BigInteger)
+
+
+def _over(part: ColumnElement[Any], whole: ColumnElement[Any]) -> ColumnElement[Any]:
+    return part.cast(Double) / func.nullif(whole, 0).cast(Double)
+
+
+def _summed(of: Table) -> Mapping[str, ColumnElement[Any]]:
+    columns: dict[str, ColumnElement[Any]] = {
+        "batches": func.count(),
+        **{name: _sum(count) for name, count in _counts(of).items()},
+        "solved": func.count(of.c.status),
+        "suspect": _sum(case((of.c.status == "suspect", 1), else_=0)),
+    }
+    for name in VALUES:
+        value = value_sql(QUANTITIES[name], of)
+        columns[f"{name}_n"] = func.count(value)
+        columns[f"{name}_sum"] = func.coalesce(func.sum(value), 0.0)
+    for name in (*SHARES, *VALUES):
+        value = value_sql(QUANTITIES[name], of)
+        columns[f"{name}_min"], columns[f"{name}_max"] = func.min(value), func.max(value)
+    return {name: column.label(name) for name, column in columns.items()}
+
+
+SUMMED = _summed(results)
+"""Each column as SQL over `results`, for a query that groups them or sums up all."""
+SUMMED_OF_TRACKERS = _summed(tracker_values)
+"""The same over `tracker_values`."""
+OF_TRACKERS = results.join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
+"""What a query over `tracker_values` reads, so that it can choose current results."""

@@ -17,12 +17,11 @@ from service.storage.recording.identity import (
     require_not_archived,
     stored_answers,
 )
-from service.storage.recording.tracker_splits import split_anew
+from service.storage.recording.tracker_values import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
-from service.storage.sql.prepared import execute
-from service.storage.sql.statements import insert_all, insert_missing, insert_runs
+from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
 from service.storage.sql.tables import (
     batches,
     catalogs,

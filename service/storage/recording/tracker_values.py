@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from sqlalchemy import Connection, delete, insert, select
 
 from service.acquire import Acquisition
 from service.alarms.drift import alignment_offsets_arcsec, mean_stars, scale_offset_ppm
@@ -18,7 +19,13 @@ from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.models.answers import Answer, Star
 from service.storage.recording.digests import digest_of_row
-from service.storage.sql.tables import MEASURED, tracker_values
+from service.storage.sql.tables import (
+    MEASURED,
+    results,
+    rollups_daily,
+    tracker_splits,
+    tracker_values,
+)
 from service.vectors import Vector
 
 Row = dict[str, Any]
@@ -141,3 +148,23 @@ def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
 def _rms(squares: float, count: int) -> float | None:
     """The rms of so many squares; None where it is not known."""
     return math.sqrt(squares / count) if count and squares > 0.0 else None
+
+
+def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
+    """Whether batches of a spacecraft's run are still to be split."""
+    query = select(tracker_splits.c.run).where(
+        tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
+    )
+    return connection.execute(query).first() is not None
+
+
+def split_anew(connection: Connection, spacecraft: str) -> None:
+    """Have all batches of a spacecraft looked at: from now on it has several trackers."""
+    connection.execute(delete(tracker_splits).where(tracker_splits.c.spacecraft == spacecraft))
+    recorded, trends = (
+        select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
+        for table in (results, rollups_daily)
+    )
+    # Archived batches are in the trends alone, and the latest ones in the record alone.
+    runs = recorded.union(trends)
+    connection.execute(insert(tracker_splits).from_select(["spacecraft", "run"], runs))

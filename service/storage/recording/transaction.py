@@ -21,7 +21,7 @@ from service.storage.recording import events
 from service.storage.recording.identity import ArchivedMeanwhile
 from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
-from service.storage.sql.prepared import execute
+from service.storage.sql.statements import execute
 
 WriteOutcome = RecordOutcome | Exception
 WriteOutcomes = list[WriteOutcome]

@@ -17,8 +17,7 @@ from sqlalchemy import Connection
 from service.acquire import Acquisition
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
-from service.storage.models.answers import Answer
-from service.storage.models.frames import FrameSummary, FrameTimings
+from service.storage.models.answers import Answer, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.digests import digest_of
 from service.storage.recording.result_metrics import metrics_of

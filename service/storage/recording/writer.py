@@ -29,9 +29,8 @@ from service.storage.recording.transaction import (
 )
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.connections import PersistentConnection, RolledBack
-from service.storage.sql.database_file import DatabaseFile
+from service.storage.sql.database_file import DatabaseFile, FileLock
 from service.storage.sql.engines import TO_WRITE, patience
-from service.storage.sql.file_lock import FileLock
 from service.storage.sql.projector_lock import Attempt, NotProjecting, ProjectorLock
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
 

@@ -18,7 +18,8 @@ from sqlalchemy.exc import SQLAlchemyError
 from service import __version__
 from service.errors import BadConfiguration
 from service.resources import shipped
-from service.storage.sql.columns import metadata
+from service.storage.sql.columns import metadata, unpack
+from service.storage.sql.database_file import writing_alone
 from service.storage.sql.engines import (
     database_file,
     database_url,
@@ -26,8 +27,6 @@ from service.storage.sql.engines import (
     shown_url,
     writing_engine,
 )
-from service.storage.sql.file_lock import writing_alone
-from service.storage.sql.packed_text import unpack
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -111,12 +110,9 @@ def all_tables() -> list[Table]:
     from service.storage.sql import (  # noqa: F401
         access_tables,
         alarm_tables,
-        archive_tables,
         calibration_tables,
         grade_tables,
-        gyro_tables,
         tables,
-        webhook_tables,
     )
 
     return metadata.sorted_tables

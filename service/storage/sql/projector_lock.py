@@ -17,7 +17,7 @@ from typing import Literal
 from sqlalchemy import Connection
 
 from service.errors import Busy
-from service.storage.sql.prepared import execute
+from service.storage.sql.statements import execute
 
 # Two numbers, the second of which is that of a table: each schema of a database has its own lock.
 _TAKE = "SELECT pg_try_advisory_lock(1633906037, 'event_counter'::regclass::oid::int)"

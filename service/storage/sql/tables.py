@@ -7,11 +7,11 @@
     idempotency_keys ── results
     mission_uses ── missions                       from when each settings were in use
     tracker_values ── batches                      its current result, tracker by tracker
-    rollups_hourly, rollups_daily                  of current results (rollup_tables.py)
+    rollups_hourly, rollups_daily                  of current results
     projector                                      how far projections have come
     limits, watches, alarms ── alarm_actions       limits and alarms (alarm_tables.py)
     annotations                                    notes of people (alarm_tables.py)
-    archived_parts, archived_batches, ...          batches that left it (archive/tables.py)
+    archived_parts, archived_batches, ...          batches that left it (see their figure below)
     events, event_counter                          recent events in order of commit
     replays
     access_tokens ── access_sessions, audit        who may ask, who changed what (access_tables.py)
@@ -50,14 +50,67 @@ from sqlalchemy import (
 
 from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
-from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
-from service.storage.sql.packed_text import PackedText
-from service.storage.sql.rollup_tables import (
-    rollups_daily,
-    rollups_hourly,
-    tracker_rollups_daily,
-    tracker_rollups_hourly,
+from service.storage.sql.columns import Digest, Id, Moment, Name, PackedText, RunName, metadata
+
+# The rollups: sums and extremes of current results by hour and day, for trends.
+#
+# Of spacecraft, and of the trackers of spacecraft that have several.
+
+COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
+_ROLLED_UP = [each for each in QUANTITIES.values() if each.rolled_up]
+SHARES = tuple(each.name for each in _ROLLED_UP if each.is_share)
+"""Shares of a batch's stars; their means follow from the counts."""
+VALUES = tuple(each.name for each in _ROLLED_UP if not each.is_share)
+SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
+MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
+MAXIMA = tuple(f"{name}_max" for name in (*SHARES, *VALUES))
+ROLLED_UP = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
+"""The columns of a rollup without its key."""
+
+
+def _rollup(name: str, *trackers: Column[str]) -> Table:
+    """Sums and extremes over the current results of each spacecraft, run, tracker and bucket.
+
+    A bucket is a UTC hour or day (see `Utc.bucket`).  `_n` batches have the
+    value whose `_sum` stands beside it; an extreme of none is null.
+    """
+    return Table(
+        name,
+        metadata,
+        Column("spacecraft", Name, primary_key=True),
+        Column("run", RunName, primary_key=True),
+        *trackers,
+        Column("bucket", Integer, primary_key=True, autoincrement=False),
+        *(Column(count, BigInteger, nullable=False) for count in COUNTS),
+        *(Column(each, _type_of(each), nullable=False, server_default=text("0")) for each in SUMS),
+        *(Column(each, Double) for each in (*MINIMA, *MAXIMA)),
+        sqlite_with_rowid=False,
+    )
+
+
+def _type_of(sum_name: str) -> type[BigInteger] | type[Double[float]]:
+    return BigInteger if sum_name.endswith("_n") else Double
+
+
+rollups_hourly = _rollup("rollups_hourly")
+rollups_daily = _rollup("rollups_daily")
+tracker_rollups_hourly = _rollup(
+    "tracker_rollups_hourly", Column("tracker", Name, primary_key=True)
 )
+tracker_rollups_daily = _rollup("tracker_rollups_daily", Column("tracker", Name, primary_key=True))
+
+tracker_splits = Table(
+    "tracker_splits",
+    metadata,
+    # A run of a spacecraft whose older batches are not split by tracker yet; no row: all are.
+    Column("spacecraft", Name, primary_key=True),
+    Column("run", RunName, primary_key=True),
+    # Batches before this one, in order of time, are still to be split; null: none was.
+    Column("time_ns", BigInteger),
+    Column("batch_id", Id),
+    sqlite_with_rowid=False,
+)
+
 
 runs = Table(
     "runs",
@@ -357,3 +410,73 @@ WRITTEN_BY_POSTS = (
     event_counter,
 )
 """The tables that a batch is written to, by its post and by the projector."""
+
+
+# The tables of the archive: which batches left the database, and where they are.
+#
+# archived_parts ── archived_batches ── archived_what_ifs
+#          └── archived_hours
+#
+# A batch has a row in `batches` or in `archived_batches`, never in both: one transaction takes it
+# from one to the other, and so (spacecraft, run, batch) stays unique after archiving.
+
+archived_parts = Table(
+    "archived_parts",
+    metadata,
+    Column("id", Integer, primary_key=True),
+    # Below the folder of the archive.
+    Column("path", Text, nullable=False, unique=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, nullable=False),
+    # Of the first batch and of the last.
+    Column("first_ns", BigInteger, nullable=False),
+    Column("last_ns", BigInteger, nullable=False),
+    Column("batches", Integer, nullable=False),
+    Column("sha256", String(64), nullable=False),
+)
+# A part spans no more than a day: those of a period are found by their end.
+Index(
+    "ix_archived_parts_by_spacecraft",
+    archived_parts.c.spacecraft,
+    archived_parts.c.run,
+    archived_parts.c.last_ns,
+)
+Index("ix_archived_parts_by_time", archived_parts.c.last_ns)
+
+# No foreign key names the part: to delete a part, each would be looked for without an index.
+archived_batches = Table(
+    "archived_batches",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("spacecraft", Name, nullable=False),
+    Column("run", RunName, nullable=False),
+    Column("batch", Name, nullable=False),
+    Column("fingerprint", String(64), nullable=False),
+    Column("part_id", Integer, nullable=False),
+    UniqueConstraint("spacecraft", "run", "batch"),
+    sqlite_with_rowid=False,
+)
+
+# The results of archived batches that do not have the id of their batch.
+archived_what_ifs = Table(
+    "archived_what_ifs",
+    metadata,
+    Column("id", Id, primary_key=True),
+    Column("batch_id", Id, nullable=False),
+    sqlite_with_rowid=False,
+)
+
+# The share of a part in the trends of an hour: extremes cannot be subtracted from those of others.
+archived_hours = Table(
+    "archived_hours",
+    metadata,
+    Column("spacecraft", Name, primary_key=True),
+    Column("run", RunName, primary_key=True),
+    Column("bucket", Integer, primary_key=True, autoincrement=False),
+    # Empty: of the spacecraft as a whole.
+    Column("tracker", Name, primary_key=True),
+    Column("part_id", Integer, primary_key=True, autoincrement=False),
+    # JSON: the columns of a rollup.
+    Column("sums", Text, nullable=False),
+    sqlite_with_rowid=False,
+)

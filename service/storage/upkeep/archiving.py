@@ -24,6 +24,7 @@ from service.storage.archive.folder import (
     Manifest,
     Part,
     Settings,
+    claim,
     day_folder,
     locked,
     manifest_of,
@@ -34,7 +35,6 @@ from service.storage.archive.folder import (
     write_partition,
     write_settings,
 )
-from service.storage.archive.owner import claim
 from service.storage.archive.rows import (
     Rows,
     differing,
@@ -44,12 +44,20 @@ from service.storage.archive.rows import (
     to_partition,
 )
 from service.storage.projections import rollups
-from service.storage.recording.archived_hours import keep_share
-from service.storage.recording.tracker_splits import is_waiting
-from service.storage.sql.archive_tables import archived_batches, archived_parts, archived_what_ifs
-from service.storage.sql.rollup_tables import rollups_daily, rollups_hourly
+from service.storage.projections.rollups import keep_share
+from service.storage.recording.tracker_values import is_waiting
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import catalogs, missions, results, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    archived_what_ifs,
+    catalogs,
+    missions,
+    results,
+    rollups_daily,
+    rollups_hourly,
+    runs,
+)
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now

@@ -1,4 +1,4 @@
-"""Copies the whole database as it is at one moment, while it is being served.
+"""Backups: the whole database copied at one moment while it is served, and restored from a copy.
 
 SQLite is copied page by page from one read transaction: writers go on beside
 it, and what they write meanwhile is not in the copy.  PostgreSQL's own tool
@@ -8,11 +8,12 @@ does the same with a snapshot.
 import os
 import sqlite3
 import subprocess
+import tempfile
 from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
 
-from sqlalchemy import URL
+from sqlalchemy import URL, inspect
 
 from service.errors import BadConfiguration
 from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile, sync_folder
@@ -22,7 +23,7 @@ from service.storage.sql.engines import (
     reading_engine,
     shown_url,
 )
-from service.storage.sql.migrations import reported
+from service.storage.sql.migrations import reported, revision_of
 
 PAGES_AT_ONCE = 2_000
 """About eight megabytes: often enough to show how far it is."""
@@ -149,3 +150,132 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
         raise BadConfiguration(f"ACQUIRE_DATABASE: {about}: {said}")
     return done.stdout
+
+
+# Makes a database from a backup: whole, or not at all, and never over records that are there.
+#
+# A backup keeps the schema of the version that wrote it.  This module does not migrate it:
+# the version that wrote a backup can be installed again and serve the database restored from it.
+
+SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
+"""How the files begin."""
+BESIDE = ("-wal", "-shm", "-journal")
+"""What SQLite keeps beside a file: of another database it would be taken for this one's."""
+
+
+def restore(database: str, source: Path, step: Step = lambda left, total: None) -> str:
+    """Make a database from a file of `back_up`, and return the schema revision that it has.
+
+    A SQLite file must not exist yet; a PostgreSQL database must exist, without the service's
+    tables.  Raises `BadConfiguration` for a backup that is missing, damaged or of the other
+    kind, and for a database that holds records already or that a service is using.
+    """
+    url = database_url(database)
+    _check_kind(source, url)
+    if url.drivername == "sqlite":
+        return _restore_sqlite(source, Path(url.database or ""), step)
+    return _restore_postgresql(source, url)
+
+
+def _check_kind(source: Path, url: URL) -> None:
+    try:
+        with source.open("rb") as file:
+            begins = file.read(len(SQLITE))
+    except OSError as error:
+        raise BadConfiguration(f"{source}: cannot be read: {error.strerror}") from None
+    is_sqlite = begins == SQLITE
+    if not is_sqlite and not begins.startswith(POSTGRESQL):
+        raise BadConfiguration(f"{source}: is no file of `acquire database backup`")
+    if is_sqlite != (url.drivername == "sqlite"):
+        kind, other = ("SQLite", "PostgreSQL") if is_sqlite else ("PostgreSQL", "SQLite")
+        raise BadConfiguration(
+            f"{source}: is a backup of {kind}; ACQUIRE_DATABASE names a database of {other}"
+        )
+
+
+def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
+    for there in (target, *(target.with_name(target.name + part) for part in BESIDE)):
+        if there.exists():
+            raise BadConfiguration(
+                f"ACQUIRE_DATABASE: {there}: exists already; move it away, or name another file"
+            )
+    part = target.with_name(target.name + ".part")
+    part.unlink(missing_ok=True)
+    try:
+        part.touch(mode=PRIVATE_FILE, exist_ok=False)
+        with (
+            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reading,
+            closing(sqlite3.connect(part)) as writing,
+        ):
+            reading.backup(
+                writing,
+                pages=PAGES_AT_ONCE,
+                progress=lambda _, left, total: step(left, total),
+                sleep=0.0,
+            )
+            found = [row[0] for row in writing.execute("PRAGMA integrity_check(1)")]
+        if found != ["ok"]:
+            raise BadConfiguration(f"{source}: is damaged: {found[0]}")
+        revision = _revision(f"sqlite:///{part}", source)
+        with part.open("rb") as file:
+            os.fsync(file.fileno())
+        # Unlike `replace` this refuses a file that a service has made in the meantime.
+        os.link(part, target)
+        sync_folder(target.absolute().parent)
+    except FileExistsError:
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {target}: exists already") from None
+    except sqlite3.Error as error:
+        raise BadConfiguration(f"{source}: cannot be restored: {error}") from None
+    finally:
+        for left in (part, *(part.with_name(part.name + end) for end in BESIDE)):
+            left.unlink(missing_ok=True)
+    return revision
+
+
+def _restore_postgresql(source: Path, url: URL) -> str:
+    to_server, secret = client_options(url)
+    engine = reading_engine(url)
+    try:
+        with reported(url), engine.begin() as connection:
+            schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one_or_none()
+            tables = inspect(connection).get_table_names() if schema is not None else []
+    finally:
+        engine.dispose()
+    if tables:
+        raise BadConfiguration(
+            f"ACQUIRE_DATABASE: {shown_url(url)}: holds tables already ({tables[0]}, ...); "
+            "name an empty database"
+        )
+    contents = run_client(["pg_restore", "--list", str(source)], str(source)).splitlines()
+    held = [entry for line in contents if (entry := _entry(line)).startswith("TABLE ")]
+    held = [entry for entry in held if not entry.startswith("TABLE DATA ")]
+    if schema is not None and held and not held[0].startswith(f"TABLE {schema} "):
+        raise BadConfiguration(
+            f"{source}: holds the tables of schema {held[0].split()[1]}; those of "
+            f"{shown_url(url)} belong in schema {schema}"
+        )
+    wanted = [line for line in contents if schema is None or not _makes_schema(line, schema)]
+    with tempfile.NamedTemporaryFile("w", encoding="utf-8") as listed:
+        listed.write("\n".join(wanted))
+        listed.flush()
+        command = ["pg_restore", "--single-transaction", "--exit-on-error", "--no-owner"]
+        command += ["--no-privileges", f"--use-list={listed.name}", *to_server, str(source)]
+        run_client(command, f"{source} into {shown_url(url)}", secret)
+    return _revision(url.render_as_string(hide_password=False), source)
+
+
+def _entry(line: str) -> str:
+    """What a line of a backup's contents is about: of `5; 2615 2200 SCHEMA - public me` the end."""
+    return " ".join(line.partition(";")[2].split(" ")[3:])
+
+
+def _makes_schema(line: str, schema: str) -> bool:
+    """Whether a line of a backup's contents makes a schema that the database has already."""
+    return _entry(line).startswith((f"SCHEMA - {schema} ", f"COMMENT - SCHEMA {schema} "))
+
+
+def _revision(database: str, source: Path) -> str:
+    revision = revision_of(database)
+    if revision is None:
+        raise BadConfiguration(f"{source}: holds no records of this service")
+    return revision

@@ -33,6 +33,8 @@ from sqlalchemy import (
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
+from service.storage.sql.access_tables import webhook_sender
+from service.storage.sql.database_file import writing_alone
 from service.storage.sql.engines import (
     database_file,
     database_url,
@@ -40,7 +42,6 @@ from service.storage.sql.engines import (
     shown_url,
     writing_engine,
 )
-from service.storage.sql.file_lock import writing_alone
 from service.storage.sql.migrations import (
     HEAD,
     UNFINISHED,
@@ -55,7 +56,6 @@ from service.storage.sql.migrations import (
 from service.storage.sql.projector_lock import ProjectorLock
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import event_counter, projector
-from service.storage.sql.webhook_tables import webhook_sender
 from service.storage.upkeep.verify import verify
 
 FIRST_ROWS = (event_counter, projector, webhook_sender)

@@ -18,17 +18,17 @@ from sqlalchemy.exc import IntegrityError
 from service.errors import BadConfiguration, NotFound, shown_value
 from service.storage.models.runs import Forgotten
 from service.storage.projections import rollups
-from service.storage.recording.archived_hours import forget_share
+from service.storage.projections.rollups import forget_share
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.archive_tables import (
+from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.tables import (
     archived_batches,
     archived_hours,
     archived_parts,
     archived_what_ifs,
+    batches,
+    runs,
 )
-from service.storage.sql.grade_tables import graded_days
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.tables import batches, runs
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches, delete_blocks, delete_days
 from service.times import DAY_S, HOUR_S, recorded_utc
@@ -219,6 +219,7 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
     """
     # Archives need pyarrow, which is an extra.
     from service.storage.archive.folder import (
+        claim,
         locked,
         manifest_of,
         manifests,
@@ -226,7 +227,6 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
         read_partition,
         whole_content,
     )
-    from service.storage.archive.owner import claim
     from service.storage.archive.rows import from_partition
     from service.storage.upkeep.archiving import remove_part
     from service.storage.upkeep.restoring import put_back

@@ -11,14 +11,13 @@ from functools import partial
 from sqlalchemy import ColumnElement, Connection, delete, func, select
 
 from service.storage.projections import rollups, seals
-from service.storage.sql.grade_tables import graded_blocks, graded_days
-from service.storage.sql.gyro_tables import gyro_blocks
-from service.storage.sql.rollup_tables import rollups_hourly
+from service.storage.sql.grade_tables import graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.tables import (
     batches,
     frames,
     idempotency_keys,
     results,
+    rollups_hourly,
     solutions,
     star_results,
     tracker_values,

@@ -29,15 +29,19 @@ from service.storage.archive.folder import (
 from service.storage.archive.rows import Rows, from_partition
 from service.storage.projections import alarms, rollups
 from service.storage.projections.recorded import RecordedResult
+from service.storage.projections.rollups import WHOLE, insert_share
 from service.storage.recording import events
-from service.storage.recording.archived_hours import WHOLE, insert_share
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS
-from service.storage.sql.archive_tables import archived_batches, archived_parts
 from service.storage.sql.columns import Row
-from service.storage.sql.rollup_tables import rollups_hourly
-from service.storage.sql.tables import batches, runs
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    batches,
+    rollups_hourly,
+    runs,
+)
 from service.storage.store import Store
 from service.storage.upkeep.archiving import described, hours_of, note_part
 from service.storage.upkeep.restoring import put_back
@@ -81,7 +85,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """As `projections.states` has it."""
+    """As `projections.projector` has it."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()

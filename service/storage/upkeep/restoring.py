@@ -29,10 +29,17 @@ from service.storage.archive.folder import (
 )
 from service.storage.archive.rows import Rows, from_partition, insert_rows
 from service.storage.projections import rollups, seals
-from service.storage.recording.archived_hours import forget_share
-from service.storage.sql.archive_tables import archived_batches, archived_parts, archived_what_ifs
+from service.storage.projections.rollups import forget_share
 from service.storage.sql.statements import insert_missing, insert_runs
-from service.storage.sql.tables import batches, catalogs, missions, results
+from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
+    archived_what_ifs,
+    batches,
+    catalogs,
+    missions,
+    results,
+)
 from service.storage.store import Store
 from service.times import HOUR_S, Utc, parse_utc
 

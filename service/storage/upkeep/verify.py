@@ -15,24 +15,37 @@ from typing import Any, get_args
 
 import msgspec
 import numpy as np
-from sqlalchemy import ColumnElement, Connection, Engine, Table, and_, event, func, select, text
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    Engine,
+    Table,
+    and_,
+    event,
+    func,
+    select,
+    text,
+    tuple_,
+)
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
-from service.grades.day import GRADES, GradedSamples
+from service.grades.day import GRADES, GradedSamples, unpacked, unpacked_innovations
 from service.grades.innovations import MeasuredInnovations
-from service.grades.packing import unpacked, unpacked_innovations
+from service.gyro import SAME_TIME_NS, Nanoseconds, first_shared_ns
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
+from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
 from service.storage.recording.digests import SETTINGS, agrees, digest_of, digest_of_row
-from service.storage.recording.tracker_splits import is_waiting
-from service.storage.sql.archive_tables import archived_batches, archived_parts
+from service.storage.recording.tracker_values import is_waiting
 from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine
-from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
+from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.migrations import check, reported
 from service.storage.sql.tables import (
+    archived_batches,
+    archived_parts,
     batches,
     frames,
     missions,
@@ -41,7 +54,6 @@ from service.storage.sql.tables import (
     star_results,
     tracker_values,
 )
-from service.storage.upkeep.verify_gyro import of_the_gyro_blocks
 from service.times import unix_seconds, utc_of_unix
 
 AT_ONCE = 500
@@ -448,3 +460,53 @@ def _of_a_day(connection: Connection, id: str) -> Iterator[str]:
         yield f"{name}: it has not as many samples as it says"
     elif f"sha256:{digest.hexdigest()}" != row["digest"]:
         yield f"{name}: its samples are not those that were digested"
+
+
+BLOCKS_AT_ONCE = 50
+ORDER = (gyro_blocks.c.spacecraft, gyro_blocks.c.run, gyro_blocks.c.start_ns, gyro_blocks.c.id)
+
+
+def of_the_gyro_blocks(engine: Engine) -> Iterator[str]:
+    """The faults of the gyro blocks, a sentence each.
+
+    A block must be the one that was sent, and no two of a spacecraft and a run may share a time.
+    """
+    before: list[tuple[Any, Nanoseconds]] = []
+    for row in _block_rows(engine):
+        name = f"gyro block {row['id']}"
+        try:
+            block = block_of(row)
+            times_ns = block.tai_ns
+            rising = bool(np.all(np.diff(times_ns) >= SAME_TIME_NS))
+        except ValueError as error:
+            yield f"{name}: its samples cannot be read: {error}"
+            continue
+        if block.fingerprint != row["fingerprint"]:
+            yield f"{name}: its samples are not those that were fingerprinted"
+        told = row["start_ns"], row["end_ns"], row["end"]
+        if not rising or told != (int(times_ns[0]), int(times_ns[-1]), block.end.text):
+            yield f"{name}: its times are not those of its samples"
+        near = row["start_ns"] - SAME_TIME_NS
+        place = row["spacecraft"], row["run"]
+        before = [
+            (other, others_ns)
+            for other, others_ns in before
+            if other["end_ns"] > near and (other["spacecraft"], other["run"]) == place
+        ]
+        for other, others_ns in before:
+            if first_shared_ns(times_ns, others_ns) is not None:
+                yield f"{name}: it shares a time with gyro block {other['id']}"
+        before.append((row, times_ns))
+
+
+def _block_rows(engine: Engine) -> Iterator[Any]:
+    query = select(gyro_blocks).order_by(*ORDER).limit(BLOCKS_AT_ONCE)
+    beyond = query
+    while True:
+        with engine.begin() as connection:
+            rows = connection.execute(beyond).mappings().all()
+        yield from rows
+        if len(rows) < BLOCKS_AT_ONCE:
+            return
+        last = [rows[-1][column.name] for column in ORDER]
+        beyond = query.where(tuple_(*ORDER) > tuple_(*last))

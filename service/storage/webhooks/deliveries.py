@@ -1,4 +1,4 @@
-"""What waits to be delivered to webhooks: queued, settled, dead-lettered, queued again.
+"""Deliveries to webhooks: queued, settled, dead-lettered, queued again, and by which process.
 
 A row is one event for one webhook.  It is deleted when it is delivered; a dead
 letter stays until it is sent again, or until there are too many after it.
@@ -12,10 +12,10 @@ from sqlalchemy import Connection, case, delete, func, select, tuple_, update
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
 from service.storage.models.base import Page
+from service.storage.sql.access_tables import webhook_deliveries, webhook_sender, webhooks
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
-from service.storage.sql.webhook_tables import webhook_deliveries, webhooks
-from service.storage.webhooks.models import WebhookDelivery
+from service.storage.webhooks.registered import WebhookDelivery
 
 DEAD_KEPT = 10_000
 """Dead letters of one webhook; of more the oldest are deleted."""
@@ -263,3 +263,29 @@ def _shown(row: Any) -> WebhookDelivery:
         spacecraft=row["spacecraft"] or None,
         state="dead" if row["dead"] else "waiting",
     )
+
+
+# Which process delivers: one of those that share a database.
+#
+# The process that delivers raises a number every few seconds.  Another takes over where
+# the number has stood still for a while by its own clock, so the clocks of two machines
+# are never compared.
+
+
+def read_sender(connection: Connection) -> tuple[str | None, int]:
+    """The process that delivers, None for none, and its number."""
+    found = connection.execute(select(webhook_sender.c.holder, webhook_sender.c.beat)).one()
+    return found.holder, found.beat
+
+
+def hold_sender(connection: Connection, holder: str | None, beat: int) -> bool:
+    """Deliver from now on, or go on to; False where the number is no longer `beat`.
+
+    With None as holder no process delivers any more.
+    """
+    taken = connection.execute(
+        update(webhook_sender)
+        .where(webhook_sender.c.beat == beat)
+        .values(holder=holder, beat=beat + 1)
+    )
+    return bool(taken.rowcount)

@@ -1,4 +1,4 @@
-"""Batches: submit, list, look at one, try it with other options."""
+"""Batches: submit, list, look at one, try it with other options, compare sets of options."""
 
 from typing import Annotated
 
@@ -10,10 +10,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.submissions import MAX_ARRAY, Outcome
-from service.errors import BadInput
-from service.observations.schema import BatchIn, OptionsIn, Wire
-from service.storage.models.answers import Answer, BatchPage, Result
-from service.storage.models.outcomes import BatchOutcome, BatchOutcomes
+from service.errors import BadBatch, BadInput, Fault
+from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
+from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
+from service.storage.models.compare import Comparison
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi.route import (
     IDEMPOTENCY_KEY,
@@ -31,11 +31,25 @@ from service.web.requests.dependencies import (
     json_response,
     page_response,
 )
-from service.web.requests.headers import NO_IDEMPOTENCY_KEY, NO_KEY_OF_MANY, idempotency_key
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import NO_QUERY, BatchQuery, require_no_query
-from service.web.requests.request_body import BINARY, JsonBody, json_body, read_model, refused
-from service.web.requests.statements import Comment, Who
+from service.web.requests.query_parameters import (
+    NO_QUERY,
+    BatchQuery,
+    Comment,
+    Time,
+    Who,
+    require_no_query,
+)
+from service.web.requests.request_body import (
+    BINARY,
+    NO_IDEMPOTENCY_KEY,
+    NO_KEY_OF_MANY,
+    JsonBody,
+    idempotency_key,
+    json_body,
+    read_model,
+    refused,
+)
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
 
@@ -192,3 +206,54 @@ def what_if(
         entry = audited.entry(201)
     answered = app.results.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
     return answer_response(answered, recorded=record)
+
+
+compare_router = APIRouter(prefix="/api/v1", tags=["batches"])
+
+COMPARISON_S = 10.0
+"""Of one comparison; the rest is left out, and the answer says so."""
+
+SideOptions = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
+
+
+class CompareIn(Wire):
+    """A choice of batches, and two sets of options; an omitted option stays as recorded."""
+
+    spacecraft: Key
+    run: RunName = "live"
+    start: Annotated[Time | None, Field(description="Start of the period, included.")] = None
+    end: Annotated[Time | None, Field(description="End of the period, excluded.")] = None
+    sample: Annotated[
+        int,
+        Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
+    ] = 100
+    a: SideOptions = OptionsIn()
+    b: SideOptions = OptionsIn()
+
+
+@compare_router.post(
+    "/compare",
+    dependencies=[NO_QUERY],
+    **route_docs(
+        {200: ResponseDoc("The results of both sides.", Comparison)},
+        body=CompareIn,
+        problems=(404, 503),
+    ),
+)
+def compare(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
+    """Process recorded batches again with two sets of options; nothing is recorded."""
+    asked = read_model(CompareIn, body)
+    caller.require(asked.spacecraft)
+    if asked.start and asked.end and asked.start.tai_ns > asked.end.tai_ns:
+        raise BadBatch(Fault("start", f"must not be after end {asked.end}", repr(str(asked.start))))
+    found = app.comparisons.of_options(
+        asked.spacecraft,
+        asked.a,
+        asked.b,
+        run=asked.run,
+        start=asked.start,
+        end=asked.end,
+        sample=asked.sample,
+        limit_s=COMPARISON_S,
+    )
+    return json_response(found)

@@ -9,33 +9,34 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access.tokens import Caller
-from service.app.calibrations.estimates import CALIBRATION_SAMPLE, CalibrationRequest
-from service.app.comparisons import COMPARE_SAMPLE
+from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
+from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
-from service.storage.calibrations.models import (
+from service.storage.calibrations import (
     Calibration,
     CalibrationAdoption,
     CalibrationInForce,
     CalibrationPage,
 )
 from service.storage.models.compare import Comparison
-from service.web.api.compare import WORK_S
+from service.web.api.batches import COMPARISON_S
 from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
 from service.web.requests.access import AuditDep, CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
     NO_QUERY,
     Cursor,
     PageLimit,
     Query,
     SpacecraftFilter,
+    SpacecraftPath,
     Time,
+    Who,
+    without_nul,
 )
 from service.web.requests.request_body import JsonBody, read_model
-from service.web.requests.statements import Who, without_nul
 
 router = APIRouter(prefix="/api/v1", tags=["calibrations"])
 
@@ -204,7 +205,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     """Process recorded batches again with and without a calibration; nothing is recorded."""
     asked = read_model(CalibrationTrialIn, body)
     _visible(app, id, caller)
-    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=WORK_S))
+    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=COMPARISON_S))
 
 
 @router.post(

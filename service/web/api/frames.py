@@ -25,10 +25,8 @@ from service.web.requests.dependencies import (
     answer_response,
     json_response,
 )
-from service.web.requests.headers import IdempotencyKey
-from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.query_parameters import TIME_SCHEMA, Query
-from service.web.requests.request_body import frame_body
+from service.web.requests.query_parameters import TIME_SCHEMA, Query, SpacecraftPath
+from service.web.requests.request_body import IdempotencyKey, frame_body
 
 router = APIRouter(prefix="/api/v1", tags=["frames"])
 

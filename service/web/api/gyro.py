@@ -8,14 +8,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.errors import BadInput
-from service.gyro.schema import GyroBlockIn
+from service.gyro import GyroBlockIn
 from service.storage.models.gyro import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.web.openapi.route import LINK, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response, page_response
-from service.web.requests.headers import NO_KEY_OF_A_BLOCK
-from service.web.requests.path_parameters import SpacecraftPath
-from service.web.requests.query_parameters import NO_QUERY, PeriodPageQuery
-from service.web.requests.request_body import JsonBody, refused
+from service.web.requests.query_parameters import NO_QUERY, PeriodPageQuery, SpacecraftPath
+from service.web.requests.request_body import NO_KEY_OF_A_BLOCK, JsonBody, refused
 
 router = APIRouter(prefix="/api/v1/spacecraft", tags=["gyro"])
 

@@ -1,38 +1,46 @@
-"""Spacecraft: their settings and state, attitude history, and star rates."""
+"""Spacecraft: settings, state, attitude history, star rates, advice, and all at a glance."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from fastapi import APIRouter
 from fastapi import Query as InQuery
+from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.history_table import batch_table, history_table
+from service.app.advice import ADVICE_SAMPLE
+from service.app.spacecraft import batch_table, history_table
+from service.observations.schema import tolerances_from_text
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
+from service.storage.models.advice import Advice
 from service.storage.models.answers import Result
+from service.storage.models.overview import About, Overview
 from service.storage.models.spacecraft import (
     AttitudePage,
+    History,
+    Ranking,
     RateList,
     SpacecraftList,
     SpacecraftState,
 )
-from service.storage.models.trends import History, Ranking
 from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.exports import ExportsDep
-from service.web.requests.history_files import (
+from service.web.requests.exports import (
     THINNED,
+    ExportsDep,
     history_file,
     history_headers,
     thinned_header,
 )
-from service.web.requests.path_parameters import SpacecraftPath
 from service.web.requests.query_parameters import (
+    NO_QUERY,
     HistoryQuery,
     PeriodPageQuery,
+    PeriodQuery,
     RatesQuery,
     RunQuery,
+    SpacecraftPath,
     WorstQuery,
 )
 
@@ -157,3 +165,63 @@ def list_worst(
 ) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
     return json_response(app.spacecraft.ranking(name, **query.asked()))
+
+
+overview_router = APIRouter(prefix="/api/v1", tags=["spacecraft"])
+
+
+@overview_router.get(
+    "/overview", **route_docs({200: ResponseDoc("Every spacecraft in the run.", Overview)})
+)
+def get_overview(query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep) -> Response:
+    """Every spacecraft in a run: state, last attitude, the last hour and day, active alarms."""
+    return json_response(app.spacecraft.overview(query.run, caller.spacecraft))
+
+
+@overview_router.get(
+    "/about",
+    dependencies=[NO_QUERY],
+    **route_docs({200: ResponseDoc("The version of the service and its data.", About)}),
+)
+def get_about(app: AppDep, caller: CallerDep) -> Response:
+    """Version, catalog, missions, database and credits."""
+    return json_response(app.service.about(caller.spacecraft))
+
+
+advice_router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
+
+MAX_SAMPLE = 2_000
+ADVICE_LIMIT_S = 20.0
+"""The longest wait for an answer; a sample that takes longer is cut short, and says so."""
+
+
+class AdviceQuery(PeriodQuery):
+    """Which batches to advise from, and how much work to spend on them."""
+
+    sample: Annotated[
+        int, Field(ge=1, le=MAX_SAMPLE, description="Maximum number of batches to process again.")
+    ] = ADVICE_SAMPLE
+    tolerance: Annotated[
+        list[Annotated[str, Field(max_length=80)]],
+        Field(
+            default_factory=list,
+            max_length=8,
+            description="Further tolerances to try, all together: `separation_deg=0.01`.",
+        ),
+    ]
+
+    def asked(self) -> dict[str, Any]:
+        """Every parameter as the app's functions take them."""
+        asked = super().asked()
+        return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
+
+
+@advice_router.get(
+    "/{name}/advice",
+    **route_docs({200: ResponseDoc("The advice.", Advice)}, problems=(404, 503)),
+)
+def get_advice(
+    name: SpacecraftPath, query: Annotated[AdviceQuery, InQuery()], app: AppDep
+) -> Response:
+    """Recommended mission settings from recorded batches: tolerances, noise, alignment."""
+    return json_response(app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S))

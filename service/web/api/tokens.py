@@ -8,8 +8,7 @@ from pydantic import ConfigDict, Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.administration import DEFAULT_DAYS, MAX_DAYS
-from service.access.tokens import SESSION_H
+from service.access.tokens import DEFAULT_DAYS, MAX_DAYS, SESSION_H
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList

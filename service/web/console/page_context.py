@@ -23,16 +23,6 @@ from service.web.requests.dependencies import AppDep
 from service.web.requests.problems import root_path
 from service.web.requests.query_parameters import Query
 
-__all__ = [
-    "EMPTY_LAYOUT",
-    "LIVE",
-    "ContextDep",
-    "Layout",
-    "PageContext",
-    "PageQuery",
-    "SortedQuery",
-]
-
 
 class PageQuery(Query):
     """The run that a page shows; every page takes it."""

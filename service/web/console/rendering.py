@@ -18,8 +18,9 @@ from starlette.responses import HTMLResponse, Response
 
 from service import __version__
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
+from service.storage.recording.unsaved_result import LIVE
 from service.web.console.formatting import FILTERS, present
-from service.web.console.page_context import EMPTY_LAYOUT, LIVE, Layout
+from service.web.console.page_context import EMPTY_LAYOUT, Layout
 from service.web.requests.problem_types import (
     INTERNAL_ERROR,
     PROBLEM_TYPES,

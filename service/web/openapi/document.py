@@ -12,27 +12,32 @@ from pydantic import BaseModel
 from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 
 from service import __version__
-from service.gyro.schema import GyroBlockIn
+from service.gyro import GyroBlockIn
 from service.observations.schema import BatchIn
 from service.storage.models.base import Record, component_name, described
 from service.storage.models.events import EVENT_DATA
-from service.web.api.alarms import CommentIn, LimitIn, LimitTrialIn, ShelveIn, StatementIn
-from service.web.api.annotations import AnnotationIn
-from service.web.api.batches import WhatIfIn
+from service.web.api.alarms import (
+    AnnotationIn,
+    CommentIn,
+    LimitIn,
+    LimitTrialIn,
+    ShelveIn,
+    StatementIn,
+)
+from service.web.api.batches import CompareIn, WhatIfIn
 from service.web.api.calibrations import (
     CalibrationAdoptIn,
     CalibrationIn,
     CalibrationRevertIn,
     CalibrationTrialIn,
 )
-from service.web.api.compare import CompareIn
 from service.web.api.events import EVENT_STREAM
-from service.web.api.grades import DefinitiveIn
+from service.web.api.products import DefinitiveIn
 from service.web.api.runs import ForgetIn, RunIn
 from service.web.api.tokens import SignIn, TokenIn
 from service.web.api.webhooks import ReplayEventsIn, RetryIn, SecretIn, WebhookIn
 from service.web.api.zones import WarmIn
-from service.web.conditional import API
+from service.web.middleware import API
 from service.web.openapi.route import (
     ATTITUDES,
     ETAG,

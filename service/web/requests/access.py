@@ -59,7 +59,7 @@ class Policy:
         return (self.scope,) if self.or_scope is None else (self.scope, self.or_scope)
 
 
-READ, SUBMIT, OPERATE = Policy("read"), Policy("submit"), Policy("operate")
+READ, OPERATE = Policy("read"), Policy("operate")
 OPEN = Policy("read", "nothing", open=True)
 
 POLICIES: dict[str, Policy] = {

@@ -28,13 +28,13 @@ from service.app.factory import App
 from service.ingest.outcomes import Recorded
 from service.ingest.queue import Backlog
 from service.storage.models.alarms import Alarm
-from service.storage.models.zones import ZoneCache
+from service.storage.models.overview import ZoneCache
 from service.storage.projections.projector import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
-from service.storage.webhooks.models import Webhook
+from service.storage.webhooks.registered import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now
-from service.webhooks.delivery_log import Result
+from service.webhooks.messages import Result
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,7 @@ from service.errors import (
     Unauthenticated,
     WrongState,
 )
-from service.gyro.overlap import SampleTaken
+from service.gyro import SampleTaken
 
 
 @dataclass(frozen=True)

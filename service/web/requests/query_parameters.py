@@ -1,10 +1,11 @@
-"""Query parameters: each is checked, unknown ones are refused."""
+"""Parameters of requests: each is checked, unknown ones are refused."""
 
 from collections.abc import Callable
 from typing import Annotated, Any, Literal, Self, TypedDict
 
-from fastapi import Depends
+from fastapi import Depends, Path
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
@@ -19,15 +20,18 @@ from pydantic_core import CoreSchema, core_schema
 from starlette.requests import Request
 
 from service.alarms.quantities import QuantityName, RankedName, trend_names
+from service.app.products import TableKind
 from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
-from service.products.formats import JSON_FORMAT, table_formats
+from service.products.attitudes import ProductGrade, StatusWanted
+from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
+from service.products.moment import AtMethod
 from service.storage.projections.rollups import Bucket
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
-from service.web.requests.statements import Comment, Who
 
 MAX_LIMIT = 500
 
@@ -292,6 +296,30 @@ class AnnotationQuery(Query):
         return self
 
 
+def without_nul(text: str | None) -> str | None:
+    """The text; raises `ValueError` for a NUL character, which PostgreSQL does not store."""
+    if text is not None and "\x00" in text:
+        raise ValueError("must have no NUL character")
+    return text
+
+
+Who = Annotated[
+    str | None,
+    Field(
+        min_length=1,
+        max_length=64,
+        description="Your name. Required while access is open; with a token, the service uses "
+        "the token's name.",
+    ),
+    AfterValidator(without_nul),
+]
+Comment = Annotated[
+    str | None,
+    Field(max_length=2_000, description="A comment."),
+    AfterValidator(without_nul),
+]
+
+
 class AuthorQuery(Query):
     """Who makes a change."""
 
@@ -332,3 +360,106 @@ async def require_no_query(request: Request) -> None:
 
 NO_QUERY = Depends(require_no_query)
 """For a route that takes no parameter."""
+
+
+SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
+
+
+TDM_MEDIA_TYPE = "text/plain"
+LargestGap = Annotated[
+    float | None,
+    Field(
+        gt=0,
+        le=MAX_LARGEST_GAP_S,
+        allow_inf_nan=False,
+        description="Attitudes farther apart than this, in seconds, belong to two stretches. "
+        "Default: the mission's; of raw attitudes of a mission without the key, at least 60 and "
+        "two and a half times the usual time between batches of the period.",
+    ),
+]
+Statuses = Annotated[
+    StatusWanted,
+    Field(description="Only good attitudes, only suspect ones, or `all`."),
+]
+Grades = Annotated[
+    ProductGrade,
+    Field(
+        description="`raw`: the attitudes of batches. `filtered`, `smoothed`: those that "
+        "`acquire smooth` recorded, the latest revision of each day."
+    ),
+]
+TableKindPath = Annotated[
+    TableKind,
+    Path(
+        description="`batches`: one row per batch; `stars`: one row per star; "
+        "`gyro`: one row per gyro sample."
+    ),
+]
+
+
+class AttitudeQuery(PeriodQuery):
+    """Attitudes of a period, in a format."""
+
+    format: Annotated[
+        str,
+        FormatNames(lambda: [*attitude_formats()]),
+        Field(description="`json`: objects; any other: a file."),
+    ] = JSON_FORMAT
+    grade: Grades = "raw"
+    status: Statuses = "good"
+    order: Annotated[
+        Literal["oldest", "newest"],
+        Field(description="Which come first. `newest` is for JSON and tables alone."),
+    ] = "oldest"
+    largest_gap_s: LargestGap = None
+    object_id: Annotated[
+        str | None,
+        Field(
+            pattern=f"^{OBJECT_ID}$",
+            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the mission's, "
+            "or else the name.",
+        ),
+    ] = None
+    naif_id: Annotated[
+        int | None,
+        Field(
+            ge=MIN_NAIF_ID,
+            le=-1,
+            description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
+        ),
+    ] = None
+
+
+class TracksQuery(PeriodQuery):
+    """Tracks of a period, in a format."""
+
+    format: Annotated[
+        Literal["json", "tdm"],
+        Field(description="`json`: every track; `tdm`: the moving ones as a file, a CCSDS TDM."),
+    ] = "json"
+
+
+class AttitudeAtQuery(RunQuery):
+    """A moment, and how its attitude is found."""
+
+    time: Annotated[Time, Field(description="The moment.")]
+    method: Annotated[
+        AtMethod,
+        Field(
+            description="`interpolated`: between the attitudes before and after the moment, within "
+            "a stretch. `nearest`: the nearest one within the largest gap."
+        ),
+    ] = "interpolated"
+    grade: Grades = "raw"
+    status: Statuses = "good"
+    largest_gap_s: LargestGap = None
+
+
+class TableQuery(PeriodQuery):
+    """A table of a period, in a format."""
+
+    format: Annotated[
+        str,
+        FormatNames(lambda: [*table_formats()]),
+        Field(description="The format of the file."),
+    ] = "csv"

@@ -1,4 +1,4 @@
-"""Request bodies: type checked, size and time bounded while they stream.
+"""Request bodies: type checked, size and time bounded while they stream; and Idempotency-Key.
 
 The server has no deadline for a body, and the framework would buffer a body
 of any size.  A body that is too large is refused as soon as
@@ -11,7 +11,7 @@ import ctypes
 import tempfile
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
-from typing import IO, Annotated, TypeVar
+from typing import IO, Annotated, Any, TypeVar
 
 from fastapi import Depends
 from pydantic import BaseModel, ValidationError
@@ -20,7 +20,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
 from starlette.types import Scope
 
-from service.errors import BadBatch, BadInput, Busy, Fault
+from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.faults import faults_of
 from service.observations.readers.decompress import Coding
 from service.web.requests.problem_types import NotJson
@@ -298,3 +298,41 @@ async def optional_json_body(request: Request) -> bytes:
 JsonBody = Annotated[bytes, Depends(json_body)]
 OptionalJsonBody = Annotated[bytes, Depends(optional_json_body)]
 SessionBody = Annotated[bytes, Depends(session_body)]
+
+
+async def idempotency_key(request: Request) -> str | None:
+    """The request's key, None without one; raises `BadBatch` where there are several."""
+    keys = request.headers.getlist("Idempotency-Key")
+    if not keys:
+        return None
+    key = keys[0]
+    if len(set(keys)) > 1:
+        raise BadBatch(Fault("Idempotency-Key", "must be sent only once", shown_value(keys)))
+    return key
+
+
+IdempotencyKey = Annotated[str | None, Depends(idempotency_key)]
+
+
+def _no_idempotency_key(message: str) -> Any:
+    async def require_none(request: Request) -> None:
+        key = request.headers.get("Idempotency-Key")
+        if key is not None:
+            # Ignored, it would let a client believe something of it.
+            raise BadBatch(Fault("Idempotency-Key", message, shown_value(key)))
+
+    return Depends(require_none)
+
+
+NO_IDEMPOTENCY_KEY = _no_idempotency_key(
+    "belongs to new batches: a what-if that is recorded twice is there twice"
+)
+"""For a route where a repeat makes another result."""
+NO_KEY_OF_MANY = _no_idempotency_key(
+    "belongs to one batch: of an array, each batch is recognised by its own batch id"
+)
+"""For a route that takes several batches."""
+NO_KEY_OF_A_BLOCK = _no_idempotency_key(
+    "belongs to batches: a gyro block is recognised by its own name"
+)
+"""For a route that takes gyro blocks."""

@@ -5,8 +5,7 @@ import hashlib
 from sqlalchemy import select
 
 from service.storage.archive import folder
-from service.storage.sql.archive_tables import archived_batches
-from service.storage.sql.tables import batches
+from service.storage.sql.tables import archived_batches, batches
 from service.storage.upkeep.restoring import verify_archive
 from tests.storage.recount import assert_equal_to_a_recount
 

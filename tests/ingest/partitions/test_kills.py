@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from service.errors import BadConfiguration
-from service.ingest.partitions import plan
+from service.ingest.partitions import coordinator
 from service.storage.archive.folder import manifests
 from tests.fresh_databases import sqlite_at
 from tests.ingest.partitions.checks import assert_whole, files_of
@@ -29,7 +29,7 @@ from tests.waiting import wait_until
 __all__ = ["faulty_disk"]
 
 WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
-MOST_BATCHES = plan.MOST_BATCHES
+MOST_BATCHES = coordinator.MOST_BATCHES
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def folders(archived, place, tmp_path, database):
 def undisturbed(folders, opened, monkeypatch):
     """The parts that a single process makes of all, as large as the commands make them."""
     database, place = folders()
-    monkeypatch.setattr(plan, "MOST_BATCHES", MOST_BATCHES)
+    monkeypatch.setattr(coordinator, "MOST_BATCHES", MOST_BATCHES)
     app = opened(database=database, archive_folder=place)
     app.runs.reprocess_into_archive("again", place, processes=1)
     app.close()

@@ -79,7 +79,7 @@ def test_with_the_same_settings_every_star_comes_out_alike_and_with_others_not(
 
 def test_trends_pages_and_lists_of_the_run_are_those_of_a_recorded_one(archived, place):
     """Held against the same batches run again into the database."""
-    recorded, _ = archived.runs.reprocess("recorded", processes=1)
+    recorded = archived.runs.reprocess("recorded", processes=1)
     again(archived, place)
     source = archived.runs.compare("live", "again", "XTE", NOON)
     assert source.batches > recorded.recorded - 12
@@ -244,11 +244,11 @@ def test_what_is_pruned_of_the_newest_part_is_run_again(archived, place):
 
 def test_a_run_that_has_recorded_batches_gets_no_second_ones(archived, place):
     """They are left out, wherever they are."""
-    recorded, _ = archived.runs.reprocess("again", processes=1)
+    recorded = archived.runs.reprocess("again", processes=1)
     progress = again(archived, place)
     assert (progress.before, progress.recorded) == (recorded.recorded, ALL - recorded.recorded)
     assert names_of(archived, "again") == names_of(archived, "live")
-    more, _ = archived.runs.reprocess("again", processes=1)
+    more = archived.runs.reprocess("again", processes=1)
     assert (more.before, more.recorded) == (recorded.recorded, 0)
 
 

@@ -24,8 +24,7 @@ from studies.paper_1994.region import (
     spread,
 )
 from studies.paper_1994.tally import Tally
-from studies.paper_1994.time_tables import geometric_share
-from studies.paper_1994.timings import measure, proportion
+from studies.paper_1994.time_tables import geometric_share, measure, proportion
 from studies.paper_1994.views import (
     EPOCH,
     View,

@@ -11,8 +11,7 @@ from scipy.stats import binomtest, poisson
 from service.errors import BadInput
 from service.simulate.scenes import Conditions, SceneSky, draw_scenes
 from service.vectors import angle_between_deg, unit
-from studies.ptp_2015 import claims, tables
-from studies.ptp_2015.case import Case
+from studies.ptp_2015 import tables
 from studies.ptp_2015.command import CASES, run_ptp
 from studies.ptp_2015.comparison import (
     ALGORITHMS,
@@ -27,7 +26,7 @@ from studies.ptp_2015.projections import printed_slope
 from studies.ptp_2015.rivals.liebe import features
 from studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
 from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
-from studies.ptp_2015.tally import COLUMNS, FieldShare, Tally
+from studies.ptp_2015.tally import COLUMNS, Case, FieldShare, Tally
 
 PIXEL_RAD = Conditions().camera.pixel_rad
 SCENES = 60
@@ -270,7 +269,7 @@ class TestCommand:
         text = page.read_text()
         for title in TITLES.values():
             assert f"### {title}" in text
-        for note in claims.NOT_REPRODUCED.values():
+        for note in tables.NOT_REPRODUCED.values():
             assert note in text
         for name in (name for name in TITLES if name.startswith("figure")):
             assert f"plots/ptp-{name}.svg" in text

@@ -7,7 +7,7 @@ import pytest
 
 from service.errors import BadInput
 from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.optics.transfer import PointImage, image_by_fft
+from service.imaging.optics import PointImage, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report.correlate import (
     displacement_by_derivative,

@@ -5,12 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.app.calibrations.geometry import geometry_of
+from service.app.calibration_estimates import geometry_of
 from service.calibration.magnitudes import COLOR, SCALE
 from service.missions.corrections import AS_MEASURED
 from service.missions.mission import Mission
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
-from service.storage.calibrations.models import CalibrationSummary, TrackerGeometry
+from service.storage.calibrations import CalibrationSummary, TrackerGeometry
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 

@@ -1,11 +1,12 @@
-"""The geometry of a sparkline: shares over a stretch of time; a gap where nothing was."""
+"""Shares over time: the geometry of a sparkline, and a heat map that the browser draws."""
 
+import base64
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from service.vectors import Vector
+from service.vectors import Matrix, Vector
 
 WIDTH, HEIGHT = 128, 22
 PAD = 2
@@ -61,3 +62,14 @@ def _level(length: int, is_end: bool, text: list[str]) -> list[str]:
     """A level line of that length; none of no length, but a dot where a part has one point."""
     is_lone = is_end and bool(text) and text[-1].startswith("M")
     return [f"h{length}"] if length or is_lone else []
+
+
+LEVELS = 254
+"""Steps of a share; a cell of 0 had no batch, one of 1 has the share 0."""
+
+
+def packed(shares: Matrix) -> str:
+    """A byte for each cell, row by row, as base64; NaN where there was no batch."""
+    known = np.isfinite(shares)
+    levels = 1 + np.rint(np.clip(np.where(known, shares, 0.0), 0.0, 1.0) * LEVELS)
+    return base64.b64encode(np.where(known, levels, 0).astype(np.uint8).tobytes()).decode()

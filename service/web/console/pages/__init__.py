@@ -1,4 +1,4 @@
-"""The pages of the console, a module each; importing one registers its pages."""
+"""The pages of the console; importing a module registers its pages."""
 
 import pkgutil
 from importlib import import_module

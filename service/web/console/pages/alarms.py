@@ -1,4 +1,4 @@
-"""The pages of alarms: the list of a run by state, and one with its cause and its history."""
+"""The pages of alarms: lists, one with its history, a spacecraft's limits, and annotations."""
 
 import math
 from collections.abc import Callable
@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal
 
 from fastapi import Path
 from fastapi import Query as InQuery
+from pydantic import Field
 from starlette.responses import Response
 
 from service.alarms.limits import Severity
@@ -14,12 +15,12 @@ from service.alarms.quantities import quantity_named, trend_names
 from service.alarms.subjects import limited_trackers
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
-from service.storage.models.alarms import Alarm, AlarmWithActions, Limit, SeverityName
-from service.storage.queries.period.alarms import TimeOut
-from service.times import Utc, recorded_utc, shifted
+from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName
+from service.storage.queries.alarms import TimeOut
+from service.times import Utc, parse_utc, recorded_utc, shifted
 from service.web.console.formatting import with_day_of_year
-from service.web.console.page_context import ContextDep, PageContext, SortedQuery
-from service.web.console.pages.one_spacecraft.trend_charts import (
+from service.web.console.page_context import ContextDep, PageContext, PageQuery, SortedQuery
+from service.web.console.pages.spacecraft import (
     charts_by_quantity,
     history_address,
 )
@@ -298,3 +299,88 @@ def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
         charts_by_quantity()[alarm.quantity],
         [each for each in limits if each.quantity == alarm.quantity],
     )
+
+
+SEVERITIES = ("watch", "warning", "critical")
+PREVIEW_DAYS = (1, 7, 30)
+
+
+class LimitsQuery(PageQuery):
+    """Whose limits: those of the spacecraft as a whole, or of one of its trackers."""
+
+    tracker: Key | None = None
+
+
+@console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
+def limits_page(
+    name: Annotated[str, Path()], query: Annotated[LimitsQuery, InQuery()], context: ContextDep
+) -> Response:
+    """The bounds of every quantity, which can be previewed and changed, with their history."""
+    app, tracker = context.app, query.tracker
+    limits = app.limits.all(name, tracker)
+    return rendered(
+        "limits.html.jinja",
+        context.layout(query.run),
+        name=name,
+        tracker=tracker,
+        trackers=limited_trackers(app.context.known[name]),
+        limits=[app.limits.get(name, each.quantity, tracker) for each in limits],
+        severities=SEVERITIES,
+        days=PREVIEW_DAYS,
+        charts=charts_by_quantity(),
+        may_write="operate" in context.caller.scopes,
+    )
+
+
+ANNOTATION_ROWS = 50
+AROUND_S = 1800.0
+"""Before and after an annotation: what the link to the trends shows."""
+
+
+class AnnotationsQuery(PageQuery):
+    """Which annotations; an empty field of the form stands for any value."""
+
+    spacecraft: Key | Literal[""] = ""
+    start: Annotated[str, Field(max_length=40)] = ""
+    end: Annotated[str, Field(max_length=40)] = ""
+    cursor: Cursor = None
+
+    @property
+    def filters(self) -> dict[str, str | None]:
+        """The filters, without the run and the cursor."""
+        return {name: getattr(self, name) or None for name in ("spacecraft", "start", "end")}
+
+
+@console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
+def annotations_page(
+    query: Annotated[AnnotationsQuery, InQuery()], context: ContextDep
+) -> Response:
+    """The annotations of a period, the latest written first."""
+    if query.spacecraft:
+        context.caller.require(query.spacecraft)
+    elif context.caller.spacecraft is not None:
+        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
+    page = context.app.annotations.page(
+        spacecraft=query.spacecraft or None,
+        start=parse_utc(query.start, "start") if query.start else None,
+        end=parse_utc(query.end, "end") if query.end else None,
+        limit=ANNOTATION_ROWS,
+        cursor=query.cursor,
+    )
+    return rendered(
+        "annotations.html.jinja",
+        context.layout(query.run),
+        query=query,
+        page=page,
+        around=_around,
+        spacecraft=context.spacecraft,
+    )
+
+
+def _around(annotation: Annotation) -> dict[str, str]:
+    """The period of the trends about an annotation."""
+    end = annotation.end or annotation.start
+    return {
+        "start": shifted(recorded_utc(annotation.start), -AROUND_S).text,
+        "end": shifted(recorded_utc(end), AROUND_S).text,
+    }

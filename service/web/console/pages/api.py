@@ -1,19 +1,26 @@
-"""The API's description for people, from the document that programs get."""
+"""The API's description for people, and what the `type` of each problem means."""
 
+import html
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated
+from typing import Annotated, Any
 
-from fastapi import FastAPI
+from fastapi import FastAPI, Path
 from fastapi import Query as InQuery
-from markupsafe import Markup
+from markupsafe import Markup, escape
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.web.console.api_reference import reference_for_people
+from service.errors import NotFound
 from service.web.console.page_context import PageQuery, open_layout
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered, rendered_part
+from service.web.openapi.route import SCHEMAS
 from service.web.requests.access import OPEN
+from service.web.requests.problem_types import types_with_pages
 
 
 @console_page("/docs", "API", OPEN)
@@ -42,3 +49,236 @@ def _operations(app: FastAPI) -> Markup:
 @lru_cache(maxsize=1)
 def _shapes(app: FastAPI) -> Markup:
     return rendered_part("_api_shapes.html.jinja", reference=reference_for_people(app))
+
+
+@console_page("/problems", "Problems", OPEN, section="/docs")
+def problems_page(query: Annotated[PageQuery, InQuery()]) -> Response:
+    """Every type of problem."""
+    kinds = list(types_with_pages().values())
+    return rendered(
+        "problems.html.jinja",
+        open_layout(query.run, "Problems", "/docs"),
+        kinds=kinds,
+        heading="Problems",
+    )
+
+
+@console_page("/problems/{slug}", "Problem", OPEN, section="/docs")
+def problem_page(slug: Annotated[str, Path()], query: Annotated[PageQuery, InQuery()]) -> Response:
+    """One type of problem."""
+    kind = types_with_pages().get(slug)
+    if kind is None:
+        known = ", ".join(types_with_pages())
+        raise NotFound(f"there is no problem {slug[:80]!r}; there are {known}")
+    return rendered(
+        "problems.html.jinja",
+        open_layout(query.run, kind.title, "/docs"),
+        kinds=[kind],
+        heading="Problem",
+    )
+
+
+Json = Mapping[str, Any]
+
+EXAMPLE_LINES = 40
+_SHORT_ARRAY = re.compile(r"\[[^][{}\"]*\]")
+_CODE = re.compile(r"`([^`]+)`")
+_IN_A_PATH = {"{name}": "XTE", "{quantity}": "residual_ratio", "{run}": "pass-7", "{id}": "ID"}
+_LOW = {"minimum": "from ", "exclusiveMinimum": "above ", "minLength": "length from "}
+_HIGH = {"maximum": "to ", "exclusiveMaximum": "below ", "maxLength": "length to "}
+
+
+@dataclass(frozen=True)
+class Field:
+    """A parameter, or a field of a shape."""
+
+    name: str
+    kind: Markup
+    text: Markup
+    is_required: bool
+    place: str = ""
+    """Of a parameter: `path`, `query` or `header`."""
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An answer of an operation by its status."""
+
+    status: str
+    kind: Markup
+    text: Markup
+
+
+@dataclass(frozen=True)
+class Operation:
+    """A route with one of its methods."""
+
+    id: str
+    method: str
+    path: str
+    title: str
+    text: Markup
+    scopes: tuple[str, ...]
+    parameters: list[Field]
+    request: Markup | None
+    answers: list[Answer]
+    problems: tuple[str, ...]
+    """The statuses of its problems."""
+    command: str
+    request_example: Markup | None
+    answer_example: Markup | None
+
+
+@dataclass(frozen=True)
+class Subject:
+    """The operations of one subject."""
+
+    name: str
+    text: str
+    operations: list[Operation]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A component: what a request or an answer is made of."""
+
+    name: str
+    text: Markup
+    fields: list[Field]
+    kind: Markup
+
+
+@dataclass(frozen=True)
+class Reference:
+    """All of the page."""
+
+    paragraphs: list[Markup]
+    subjects: list[Subject]
+    shapes: list[Shape]
+
+
+def reference_for_people(app: FastAPI) -> Reference:
+    """The page of an app, from its description."""
+    document = app.openapi()
+    operations = list(_operations_by_subject(document))
+    subjects = [
+        Subject(
+            tag["name"],
+            tag["description"],
+            [each for name, each in operations if name == tag["name"]],
+        )
+        for tag in document["tags"]
+    ]
+    shapes = [_shape(name, each) for name, each in document["components"]["schemas"].items()]
+    paragraphs = document["info"]["description"].split("\n\n")
+    return Reference([prose(each) for each in paragraphs], subjects, shapes)
+
+
+def prose(text: str) -> Markup:
+    """A description, with what stands between backticks as code."""
+    return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
+
+
+def kind_of(schema: Json) -> Markup:
+    """A schema in words, with links to the shapes that it names."""
+    if "$ref" in schema:
+        name = schema["$ref"].removeprefix(SCHEMAS)
+        return Markup('<a href="/docs/shapes#{0}">{0}</a>').format(name)
+    for either in ("anyOf", "oneOf"):
+        if either in schema:
+            return Markup(" or ").join(map(kind_of, schema[either]))
+    if "enum" in schema or "const" in schema:
+        values = schema.get("enum", [schema.get("const")])
+        return Markup(", ").join(Markup("<code>{}</code>").format(each) for each in values)
+    if schema.get("type") == "array":
+        return _array(schema)
+    words = [str(schema.get("type", "any value")), str(schema.get("format", ""))]
+    words += [f"{word}{schema[key]}" for key, word in (_LOW | _HIGH).items() if key in schema]
+    return escape(", ".join(filter(None, words)))
+
+
+def _array(schema: Json) -> Markup:
+    inner: Json = schema.get("items") or next(iter(schema.get("prefixItems", ())), {})
+    low, high = schema.get("minItems", 0), schema.get("maxItems")
+    count = f"{low} " if low == high else f"{low} to {high} " if high is not None else ""
+    return Markup("array of {}{}").format(count, kind_of(inner))
+
+
+def _operations_by_subject(document: Json) -> Iterator[tuple[str, Operation]]:
+    for path, methods in document["paths"].items():
+        for method, described in methods.items():
+            title, _, text = described["summary"].partition("\n\n")
+            request = described.get("requestBody", {}).get("content", {})
+            good = next(each for status, each in described["responses"].items() if status < "300")
+            operation = Operation(
+                described["operationId"],
+                method.upper(),
+                path,
+                title.replace("\n", " "),
+                prose(text),
+                tuple(described[key] for key in ("x-scope", "x-scope-or") if key in described),
+                [_parameter(each) for each in described.get("parameters", ())],
+                _content(request) if request else None,
+                [
+                    Answer(status, _content(each["content"]), prose(each["description"]))
+                    for status, each in described["responses"].items()
+                    if status < "400"
+                ],
+                tuple(each for each in described["responses"] if "400" <= each < "600"),
+                _command(method.upper(), path, request),
+                _example(request),
+                _example(good["content"]),
+            )
+            yield described["tags"][0], operation
+
+
+def _parameter(described: Json) -> Field:
+    kind = kind_of(described["schema"])
+    if described["schema"].get("default") is not None:
+        kind += Markup(", default <code>{}</code>").format(described["schema"]["default"])
+    text = prose(described["description"])
+    return Field(described["name"], kind, text, described.get("required", False), described["in"])
+
+
+def _content(content: Json) -> Markup:
+    kinds = (
+        Markup("{} <code>{}</code>").format(kind_of(each["schema"]) if "json" in kind else "", kind)
+        for kind, each in content.items()
+    )
+    return Markup(", ").join(kinds)
+
+
+def _example(content: Json) -> Markup | None:
+    for each in content.values():
+        for example in each.get("examples", {}).values():
+            text = json.dumps(example["value"], indent=1, ensure_ascii=False)
+            # Vectors in one line, and of a long answer its beginning.
+            lines = _SHORT_ARRAY.sub(lambda found: " ".join(found[0].split()), text).split("\n")
+            cut = [*lines[:EXAMPLE_LINES], "..."] if len(lines) > EXAMPLE_LINES else lines
+            return Markup(html.escape("\n".join(cut), quote=False))
+    return None
+
+
+def _command(method: str, path: str, request: Json) -> str:
+    for name, value in _IN_A_PATH.items():
+        path = path.replace(name, value)
+    words = [
+        "curl -s",
+        *([] if method == "GET" else [f"-X {method}"]),
+        f"http://127.0.0.1:8000{path}",
+    ]
+    if request:
+        kind = next(iter(request))
+        file = "request.json" if "json" in kind and "nd" not in kind else "FILE"
+        words += [f"-H 'content-type: {kind}'", f"--data-binary @{file}"]
+    return " ".join(words)
+
+
+def _shape(name: str, schema: Json) -> Shape:
+    required = schema.get("required", ())
+    fields = [
+        Field(field, kind_of(each), prose(each.get("description", "")), field in required)
+        for field, each in schema.get("properties", {}).items()
+    ]
+    kind = Markup("") if fields else kind_of(schema)
+    return Shape(name, prose(schema.get("description", "")), fields, kind)

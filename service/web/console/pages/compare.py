@@ -1,10 +1,11 @@
-"""The page that compares two runs, or two sets of options over the same recorded batches."""
+"""The pages of runs and replays, and the one that compares runs or sets of options."""
 
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from fastapi import Depends
+from fastapi import Query as InQuery
 from pydantic import Field, ValidationError
 from starlette.requests import Request
 from starlette.responses import Response
@@ -13,14 +14,14 @@ from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison, RatesOfRuns
-from service.times import DAY_S, parse_utc
-from service.web.api.compare import WORK_S
+from service.times import DAY_S, parse_utc, utc_now
+from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import asked_options, fields_of, settings_of_mission
 from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
-from service.web.requests.access import Policy
+from service.web.requests.access import READ, Policy
 
 SAMPLE = 100
 SIDES = ("a", "b")
@@ -95,7 +96,7 @@ def compare_page(
             sample=query.sample,
             a=a,
             b=b,
-            limit_s=WORK_S,
+            limit_s=COMPARISON_S,
         )
     run = pair[0] if pair and runs else query.run
     name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
@@ -145,3 +146,31 @@ def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
     if result is None:
         return {}
     return {(each.from_, each.to): each.stars for each in result.transitions}
+
+
+@console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
+def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Every run, and the replays and reprocessings with their progress.
+
+    A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
+    """
+    bound = context.caller.spacecraft is not None
+    return rendered(
+        "runs.html.jinja",
+        context.layout(query.run),
+        runs=context.app.runs.all(context.caller.spacecraft),
+        reprocessings=[] if bound else context.app.runs.reprocessings(),
+        replays=context.app.replays.all(context.caller.spacecraft),
+        bound=bound,
+        now=utc_now(),
+    )
+
+
+@console_page("/replays/{id}", "Replay", READ, section="/runs")
+def replay_page(id: str, query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """One replay: how far it is, and every line that was refused."""
+    return rendered(
+        "replay.html.jinja",
+        context.layout(query.run),
+        replay=context.app.replays.get(id),
+    )

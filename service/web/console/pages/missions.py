@@ -1,20 +1,26 @@
-"""The page of missions: their settings and the history of these."""
+"""The pages of missions: their settings with history, advice on these, and zones."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
+from urllib.parse import urlencode
 
 from fastapi import Query as InQuery
+from pydantic import model_validator
 from starlette.responses import Response
 
+from service.advice.zone_size import LEAST_BATCHES, Verdict
+from service.app.advice import no_changes_text
 from service.errors import BadConfiguration
+from service.missions.mission import Tolerances
 from service.observations.schema import Key
 from service.storage.models.spacecraft import MissionThen
+from service.web.api.spacecraft import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.options import SYMBOLS
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
-from service.web.requests.access import Policy
+from service.web.requests.access import READ, Policy
 
 MOST_SHOWN = 8
 """Missions whose settings are shown whole without being asked for."""
@@ -134,3 +140,72 @@ def _entries(history: Sequence[MissionThen]) -> list[SettingsEntry]:
         entries.append(SettingsEntry(each.digest, each.since, changes, is_first=not entries))
         before = after
     return entries
+
+
+MOST_ZONES_SHOWN = 60
+VERDICTS: dict[Verdict, str] = {
+    "too_few": f"No advice on its size: that needs {LEAST_BATCHES} batches.",
+    "fits": "The size fits.",
+    "too_small": "The zone is too small.",
+    "larger_than_needed": "The zone is larger than needed.",
+}
+
+
+class ZonesQuery(PageQuery):
+    """Whose zone is weighed: by default the first spacecraft with batches in the run."""
+
+    spacecraft: Key | None = None
+
+
+@console_page("/zones", "Zones", READ, position=75)
+def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> Response:
+    """The size of a zone, and cached zones and run catalogs, the most recently used first."""
+    name = query.spacecraft or context.filled_spacecraft(query.run)
+    size, costs = context.app.zones.size(name, query.run)
+    cache = context.app.zones.state()
+    epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
+    return rendered(
+        "zones.html.jinja",
+        context.layout(query.run),
+        cache=cache,
+        zones=cache.items[::-1][:MOST_ZONES_SHOWN],
+        epochs=epochs,
+        spacecraft=context.spacecraft,
+        name=name,
+        size=size,
+        costs=costs,
+        verdicts=VERDICTS,
+        may_write="operate" in context.caller.scopes,
+    )
+
+
+class AdviceForm(AdviceQuery):
+    """The same from a form, whose empty fields are left out."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_empty(cls, asked: Mapping[str, Any]) -> dict[str, Any]:
+        filled = {name: value for name, value in asked.items() if value != ""}
+        if isinstance(filled.get("tolerance"), list):
+            filled["tolerance"] = [each for each in filled["tolerance"] if each != ""]
+        return filled
+
+
+@console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
+def advice_page(
+    name: str, query: Annotated[AdviceForm, InQuery()], context: ContextDep
+) -> Response:
+    """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
+    advice = context.app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S)
+    return rendered(
+        "advice.html.jinja",
+        context.layout(query.run),
+        advice=advice,
+        query=query,
+        asked=urlencode(
+            {name: getattr(query, name) for name in sorted(query.model_fields_set)}, doseq=True
+        ),
+        max_sample=MAX_SAMPLE,
+        tolerances=list(Tolerances.model_fields),
+        no_changes=no_changes_text(advice),
+    )

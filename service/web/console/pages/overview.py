@@ -10,14 +10,13 @@ from starlette.responses import Response
 
 from service.alarms.limits import Severity
 from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
-from service.storage.models.fleet import Fleet, FleetCells, FleetRow
+from service.storage.models.overview import Fleet, FleetCells, FleetRow
 from service.storage.queries.fleet import PERIODS_S, Period
+from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
-from service.web.console.charts.heat_map import packed
-from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
+from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
 from service.web.console.page_context import (
-    LIVE,
     ContextDep,
     PageContext,
     SortedQuery,

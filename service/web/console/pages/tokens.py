@@ -1,17 +1,18 @@
-"""The pages of access: tokens with the form for a new one, and the audit list of changes."""
+"""The pages of operators: tokens, the audit list of changes, signing in, and webhooks."""
 
 from typing import Annotated
 
 from fastapi import Query as InQuery
+from pydantic import Field
 from starlette.responses import Response
 
-from service.access.administration import MAX_DAYS
-from service.access.tokens import SCOPES
-from service.web.console.page_context import ContextDep, PageQuery
+from service.access.tokens import MAX_DAYS, SCOPES
+from service.storage.recording.events import EVENT_KINDS
+from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
-from service.web.requests.access import OPERATE
-from service.web.requests.query_parameters import Cursor
+from service.web.requests.access import OPEN, OPERATE
+from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 100
 
@@ -40,4 +41,47 @@ def tokens_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> 
         max_days=MAX_DAYS,
         spacecraft=context.spacecraft,
         is_open=context.caller.token_id is None,
+    )
+
+
+OWN_PATH = r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$"
+"""A second slash, or a backslash that browsers take for one, would name another host."""
+
+
+class SignInQuery(Query):
+    """The page to open after sign-in: a path of this service, never another host's address."""
+
+    next: Annotated[str, Field(max_length=2000, pattern=OWN_PATH)] = "/"
+
+
+@console_page("/sign-in", "Sign in", OPEN)
+def sign_in_page(query: Annotated[SignInQuery, InQuery()]) -> Response:
+    """Ask for a token."""
+    return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
+
+
+SHOWN_DELIVERIES = 20
+SEVERITIES = ("watch", "warning", "critical")
+
+
+@console_page("/webhooks", "Webhooks", OPERATE, section="/about")
+def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+    """Every webhook with what waits for it."""
+    webhooks = context.app.webhooks.all()
+    waiting = {
+        each.id: context.app.webhooks.deliveries(
+            each.id, limit=SHOWN_DELIVERIES, oldest_first=True
+        ).items
+        for each in webhooks
+    }
+    return rendered(
+        "webhooks.html.jinja",
+        context.layout(query.run),
+        webhooks=webhooks,
+        deliveries=waiting,
+        most=SHOWN_DELIVERIES,
+        kinds=EVENT_KINDS,
+        severities=SEVERITIES,
+        spacecraft=context.spacecraft,
+        may_add="read" in context.caller.scopes,
     )

@@ -1,0 +1,471 @@
+"""Trackers calibrated from recorded batches, and what is recorded and shown of it."""
+
+import hashlib
+import math
+import time
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import chain
+from typing import Any
+
+import msgspec
+import numpy as np
+from msgspec import structs
+
+from service.acquire import Acquisition
+from service.app.context import Context
+from service.app.submissions import Submissions
+from service.calibration.elimination import NotObservable
+from service.calibration.estimate import (
+    Calibration,
+    HeldOut,
+    calibrate,
+    calibrate_with_chosen_degree,
+)
+from service.calibration.evidence import identified_magnitudes, identified_stars
+from service.calibration.magnitudes import (
+    UNITS,
+    MagnitudeCalibration,
+    MagnitudeStars,
+    calibrate_magnitudes,
+    calibrated_settings,
+)
+from service.calibration.magnitudes import joined as joined_magnitudes
+from service.calibration.mission_file import Lines, magnitude_lines, tracker_lines
+from service.calibration.stars import IdentifiedStars, joined
+from service.calibration.unknowns import LARGEST_DEGREE, Model
+from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.missions.corrections import AS_MEASURED, Magnitudes
+from service.missions.corrections import Calibration as FocalPlaneSettings
+from service.missions.mission import Mission, Tracker
+from service.observations.batch import ObservationBatch
+from service.storage.calibrations import (
+    CalibrationBatches,
+    CalibrationHeldOut,
+    CalibrationNotObservable,
+    CalibrationResiduals,
+    CalibrationResult,
+    CalibrationUnknown,
+    FocalPlane,
+    ResidualCell,
+    ResidualMap,
+    TrackerGeometry,
+    TrackerMagnitudes,
+)
+from service.storage.queries.pages import ResultFilter
+from service.storage.queries.recorded_batch import sample_batches
+from service.storage.recording.unsaved_result import LIVE
+from service.times import Utc
+from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
+
+CALIBRATION_SAMPLE = 2_000
+LARGEST_CHOSEN_DEGREE = 5
+LONGEST_WAIT_S = 120.0
+"""For a thread of the solver, while others keep them all at work."""
+
+Step = Callable[[int, int], object]
+"""Told after each batch: how many are done, and of how many."""
+
+
+@dataclass(frozen=True)
+class CalibrationRequest:
+    """The unknowns of a calibration, and the batches that it is estimated from.
+
+    Without `trackers` all of the mission's; the first of them is the reference.  Without
+    a `degree` the distortion's is chosen, up to `LARGEST_CHOSEN_DEGREE`.
+    """
+
+    spacecraft: str
+    run: str | None = None
+    start: Utc | None = None
+    end: Utc | None = None
+    trackers: Sequence[str] = ()
+    degree: int | None = None
+    alignment: bool = True
+    scale: bool = True
+    time_tag: bool = False
+    magnitudes: bool = True
+    sample: int = CALIBRATION_SAMPLE
+
+    def require(self, mission: Mission, trackers_field: str = "trackers") -> None:
+        """Raise `BadInput` for trackers that the mission has not, and for a useless model."""
+        for name in self.trackers:
+            mission.tracker(name, trackers_field)
+        if self.degree is not None and not 0 <= self.degree <= LARGEST_DEGREE:
+            message = f"must be from 0 to {LARGEST_DEGREE}"
+            raise BadInput(Fault("degree", message, shown_value(self.degree)))
+        if self.degree == 0 and not (self.alignment or self.scale or self.time_tag):
+            raise BadInput(Fault("degree", "leaves nothing to estimate", "0"))
+
+    def model(self, degree: int) -> Model:
+        """The unknowns, with a distortion of this degree."""
+        return Model(self.alignment, self.scale, degree, time_tag=self.time_tag)
+
+
+@dataclass(frozen=True)
+class CalibrationRun:
+    """A calibration with the batches it came from.
+
+    `total` batches are in the period, `sampled` were run again and `used` had identified
+    stars; `refused` no longer fit the mission.  `tried` is empty where the degree was given.
+    """
+
+    mission: Mission
+    found: Calibration
+    tried: tuple[HeldOut, ...]
+    total: int
+    sampled: int
+    used: int
+    refused: int
+    first: str | None
+    last: str | None
+    magnitudes: tuple[MagnitudeCalibration, ...] = ()
+    """Of each tracker that was calibrated; empty where they were not asked for."""
+
+    @property
+    def calibrated_magnitudes(self) -> dict[str, Magnitudes]:
+        """The settings of every tracker's magnitudes, with what was found, by its name."""
+        names = [each.name for each in self.found.stars.trackers]
+        return calibrated_settings(self.mission.trackers, self.magnitudes, names)
+
+    @property
+    def covariance(self) -> Matrix:
+        """Of all unknowns, those of magnitudes last: these share nothing with the others."""
+        blocks = [self.found.covariance, *(each.covariance for each in self.magnitudes)]
+        size = sum(len(each) for each in blocks)
+        whole, first = np.zeros((size, size)), 0
+        for each in blocks:
+            end = first + len(each)
+            whole[first:end, first:end] = each
+            first = end
+        return whole
+
+
+class Estimator:
+    """Estimates calibrations; nothing is recorded and no setting is changed."""
+
+    def __init__(self, context: Context, submissions: Submissions) -> None:
+        self._context = context
+        self._submissions = submissions
+
+    def estimate(
+        self,
+        wanted: CalibrationRequest,
+        mission: Mission,
+        step: Step = lambda done, total: None,
+    ) -> CalibrationRun:
+        """The calibration that the batches of a run give.
+
+        Batches are identified anew by verified identification, which does not look at the
+        tolerances.  Raises `BadInput` where there are too few identified stars.
+        """
+        names = set(wanted.trackers or (each.name for each in mission.trackers))
+        selected = ResultFilter(wanted.run or LIVE, wanted.spacecraft, wanted.start, wanted.end)
+        with self._context.reading() as connection:
+            drawn = sample_batches(connection, self._context.store.archive, selected, wanted.sample)
+        parts: list[IdentifiedStars] = []
+        seen: list[MagnitudeStars] = []
+        color_bv_mag = self._context.sky.catalog.color_bv_mag
+        refused = 0
+        for number, batch in enumerate(drawn.batches, 1):
+            options = structs.replace(batch.options, identifier="verified", solver="quest")
+            try:
+                again = self._run_again(structs.replace(batch, options=options), mission)
+                stars = identified_stars(again, names)
+            except BadInput:
+                refused += 1
+            else:
+                parts += [] if stars is None else [stars]
+                magnitudes = identified_magnitudes(again, names, color_bv_mag)
+                seen += [] if magnitudes is None else [magnitudes]
+            step(number, len(drawn.batches))
+        if not parts:
+            message = "have no identified stars: there is nothing to calibrate with"
+            raise BadInput(Fault("batches", message, f"{len(drawn.batches)} batches"))
+        found, tried = _calibrated(joined(parts), wanted)
+        counts = drawn.total, len(drawn.batches), len(parts), refused
+        used = [each.name for each in found.stars.trackers]
+        of_magnitudes: tuple[MagnitudeCalibration, ...] = ()
+        if wanted.magnitudes:
+            settings = {each.name: each.magnitudes for each in mission.trackers}
+            of_magnitudes = calibrate_magnitudes(joined_magnitudes(seen), used, settings)
+        ends = drawn.first, drawn.last
+        return CalibrationRun(mission, found, tried, *counts, *ends, of_magnitudes)
+
+    def _run_again(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
+        """The acquisition of a batch; while the threads are at work on others it waits."""
+        until_s = time.monotonic() + LONGEST_WAIT_S
+        while True:
+            try:
+                return self._submissions.ingest.run_again(batch, mission.within_zones)
+            except Stopping:
+                raise
+            except Busy:
+                if time.monotonic() > until_s:
+                    raise
+
+
+def _calibrated(
+    stars: IdentifiedStars, wanted: CalibrationRequest
+) -> tuple[Calibration, tuple[HeldOut, ...]]:
+    """With the degree that is wanted, or the best of those that so many stars allow."""
+    if wanted.degree is not None:
+        return calibrate(stars, wanted.model(wanted.degree)), ()
+    for degree in range(LARGEST_CHOSEN_DEGREE, 0, -1):
+        try:
+            return calibrate_with_chosen_degree(stars, wanted.model(degree))
+        except BadInput:
+            continue
+    return calibrate_with_chosen_degree(stars, wanted.model(0))
+
+
+VECTORS = (
+    "scale and distortion in a mission file correct stars sent as angles (h_deg, v_deg) only, "
+    "not those sent as vectors"
+)
+TIME_TAGS = "mission files hold no time tag: add it to time_offset_s where telemetry is made"
+COLORS = (
+    "the colour terms of the trackers differ: the run catalog is one for all and has their mean, "
+    "so that magnitudes of very blue and very red stars stay off"
+)
+MAP_CELLS = 12
+"""Cells of a residual map across the field of view."""
+
+
+def result_of(run: CalibrationRun) -> CalibrationResult:
+    """A calibration as a record, without its covariance."""
+    found = run.found
+    return CalibrationResult(
+        batches=CalibrationBatches(
+            total=run.total,
+            sampled=run.sampled,
+            used=run.used,
+            refused=run.refused,
+            first=run.first,
+            last=run.last,
+        ),
+        stars=len(found.stars),
+        stars_left_out=int(np.sum(~found.used)),
+        degree=found.model.degree,
+        held_out=[
+            CalibrationHeldOut(
+                degree=each.degree,
+                residual_over_sigma=each.residual_over_sigma,
+                chosen=each.chosen,
+            )
+            for each in run.tried
+        ],
+        residual_over_sigma=found.residual_over_sigma,
+        residuals=residuals_by_tracker(found),
+        unknowns=unknowns_of(run),
+        not_observable=[
+            CalibrationNotObservable(name=each.name, reason=each.reason)
+            for each in not_observable_of(run)
+        ],
+        notes=notes(run),
+        maps=list(_maps(found)),
+        trackers=calibrated_geometry(run.mission, found, run.calibrated_magnitudes),
+        mission_file=mission_file_lines(run.mission, found, run.calibrated_magnitudes),
+    )
+
+
+def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
+    """The names of the estimated parameters, in the order of the covariance."""
+    found = run.found
+    names = [each.name for each in found.stars.trackers]
+    of_positions = [
+        CalibrationUnknown(
+            name=unknown.name,
+            tracker=names[unknown.tracker],
+            kind=unknown.kind,
+            value=float(value),
+            sigma=float(sigma),
+            unit=unknown.unit,
+        )
+        for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
+    ]
+    return of_positions + [
+        CalibrationUnknown(
+            name=f"{names[each.tracker]} {name}",
+            tracker=names[each.tracker],
+            kind="magnitude",
+            value=float(value),
+            sigma=float(sigma),
+            unit=UNITS[name],
+        )
+        for each in run.magnitudes
+        for name, value, sigma in zip(each.names, each.value, each.sigma, strict=True)
+    ]
+
+
+def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
+    """What the stars do not show."""
+    of_magnitudes = (each.not_observable for each in run.magnitudes)
+    return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
+
+
+def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
+    """Of each tracker the rms of the residuals of used stars, before and after."""
+    sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
+    rows = []
+    for index, tracker in enumerate(found.stars.trackers):
+        own = found.used & (found.stars.tracker == index)
+        if own.any():
+            rows.append(
+                CalibrationResiduals(
+                    tracker=tracker.name,
+                    stars=int(own.sum()),
+                    before_arcsec=_rms((found.before * sigma_arcsec)[own]),
+                    after_arcsec=_rms((found.residual * sigma_arcsec)[own]),
+                    before_over_sigma=_rms(found.before[own]),
+                    after_over_sigma=_rms(found.residual[own]),
+                )
+            )
+    return rows
+
+
+def _rms(values: Vector) -> float:
+    return math.sqrt(float(np.mean(values**2)))
+
+
+def notes(run: CalibrationRun) -> list[str]:
+    """What a mission file cannot hold of this calibration."""
+    kinds = {each.kind for each in run.found.unknowns}
+    told = [VECTORS] if kinds & {"scale", "distortion"} else []
+    told += [TIME_TAGS] if "time_tag" in kinds else []
+    return told + ([COLORS] if _colors_differ(run) else [])
+
+
+def _colors_differ(run: CalibrationRun) -> bool:
+    """Whether the calibrated trackers do not have one colour term within the noise of a star."""
+    settings = run.calibrated_magnitudes
+    colors = [settings[each.name].color_mag for each in run.mission.trackers]
+    least = min(each.magnitude_sigma_mag for each in run.mission.trackers)
+    return max(colors) - min(colors) > least
+
+
+def _maps(found: Calibration) -> Iterator[ResidualMap]:
+    """The mean residuals of used stars in the cells of each tracker's focal plane."""
+    sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
+    both = np.hstack([found.before * sigma_arcsec, found.residual * sigma_arcsec])
+    measured_deg = np.degrees(found.stars.measured_rad)
+    for index, tracker in enumerate(found.stars.trackers):
+        own = found.used & (found.stars.tracker == index)
+        radius = tracker.field_of_view_radius_deg
+        step = 2.0 * radius / MAP_CELLS
+        cells = np.clip(np.floor((measured_deg[own] + radius) / step), 0, MAP_CELLS - 1)
+        places, inverse, counts = np.unique(
+            cells.astype(int), axis=0, return_inverse=True, return_counts=True
+        )
+        sums = np.zeros((len(places), 4))
+        np.add.at(sums, inverse.reshape(-1), both[own])
+        means = np.round(sums / counts[:, None], 4)
+        yield ResidualMap(
+            tracker=tracker.name,
+            radius_deg=radius,
+            step_deg=step,
+            cells=[
+                ResidualCell(
+                    h_deg=round((place[0] + 0.5) * step - radius, 6),
+                    v_deg=round((place[1] + 0.5) * step - radius, 6),
+                    stars=int(count),
+                    before_arcsec=mean[:2].tolist(),
+                    after_arcsec=mean[2:].tolist(),
+                )
+                for place, count, mean in zip(places.tolist(), counts, means, strict=True)
+            ],
+        )
+
+
+def geometry_of(tracker: Tracker) -> TrackerGeometry:
+    """Alignment, focal plane and magnitudes of a tracker."""
+    plane = tracker.calibration
+    return TrackerGeometry(
+        name=tracker.name,
+        x_axis_body=list(tracker.x_axis_body),
+        y_axis_body=list(tracker.y_axis_body),
+        z_axis_body=list(tracker.z_axis_body),
+        calibration=FocalPlane(
+            scale=plane.scale,
+            h_terms=[list(each) for each in plane.h_terms],
+            v_terms=[list(each) for each in plane.v_terms],
+        ),
+        magnitudes=TrackerMagnitudes(**tracker.magnitudes.model_dump()),
+    )
+
+
+def geometry_digest(mission: Mission) -> str:
+    """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
+    told = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
+    for each, tracker in zip(told, mission.trackers, strict=True):
+        # Adoptions of versions without magnitudes hold the digest of the rest.
+        if tracker.magnitudes == AS_MEASURED:
+            del each["magnitudes"]
+    return "sha256:" + hashlib.sha256(msgspec.json.encode(told)).hexdigest()
+
+
+def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
+    """The mission with the calibrations of these trackers; those not named stay as they are."""
+    named = {each.name: each for each in trackers}
+    changed = tuple(
+        _with(each, named[each.name]) if each.name in named else each for each in mission.trackers
+    )
+    return mission.model_copy(update={"trackers": changed})
+
+
+def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
+    told = msgspec.to_builtins(geometry)
+    if geometry.magnitudes is None:
+        del told["magnitudes"]
+    settings = {
+        **tracker.model_dump(exclude={"camera"}),
+        **told,
+        "camera": tracker.camera,
+    }
+    return Tracker.model_validate(settings)
+
+
+def calibrated_geometry(
+    mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
+) -> list[TrackerGeometry]:
+    """Every tracker of a mission with what a calibration changes of it."""
+    return [
+        _calibrated_tracker(
+            each.model_copy(update={"magnitudes": magnitudes[each.name]}),
+            tracker_lines(each, found),
+        )
+        for each in mission.trackers
+    ]
+
+
+def _calibrated_tracker(tracker: Tracker, changes: dict[str, Lines]) -> TrackerGeometry:
+    own: dict[str, Any] = {
+        name: tuple(value) for name, value in _values(changes["tracker"]).items()
+    }
+    if changes["calibration"]:
+        told = _values(changes["calibration"])
+        own["calibration"] = FocalPlaneSettings.model_validate(told)
+    return geometry_of(tracker.model_copy(update=own))
+
+
+def _values(lines: Lines) -> dict[str, Any]:
+    return tomllib.loads("\n".join(f"{key} = {value}" for key, value in lines.items()))
+
+
+def mission_file_lines(
+    mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
+) -> str:
+    """What a calibration changes of a mission file, as TOML."""
+    parts = []
+    for each in mission.trackers:
+        changes = tracker_lines(each, found)
+        changes["magnitudes"] = magnitude_lines(magnitudes[each.name], each)
+        lines = [f"{key} = {value}" for key, value in changes["tracker"].items()]
+        for table in ("calibration", "magnitudes"):
+            if changes[table]:
+                lines += ["", f"[trackers.{table}]"]
+                lines += [f"{key} = {value}" for key, value in changes[table].items()]
+        if lines:
+            parts.append("\n".join(["[[trackers]]", f'name = "{each.name}"', *lines]))
+    return "\n\n".join(parts)

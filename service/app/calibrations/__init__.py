@@ -1,1 +1,0 @@
-"""Calibrations of a spacecraft's trackers from recorded batches."""

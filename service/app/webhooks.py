@@ -1,0 +1,227 @@
+"""Webhooks: registered, changed, tried out, and sent to again."""
+
+from collections.abc import Sequence
+
+from sqlalchemy import Connection
+
+from service.access.audit import Entry
+from service.access.sessions import Access
+from service.access.tokens import Caller
+from service.app.context import Context, known_id
+from service.errors import WrongState
+from service.ingest.solver_pool import mission_in_input
+from service.settings import networks
+from service.storage.models.base import Page
+from service.storage.recording.events import events_between, last_event
+from service.storage.recording.ids import Ulids
+from service.storage.sql.columns import Row
+from service.storage.webhooks import deliveries, registered
+from service.storage.webhooks.registered import (
+    Webhook,
+    WebhookDelivery,
+    WebhookQueued,
+    WebhookTest,
+    WebhookWithSecret,
+)
+from service.times import HOUR_S, Utc, shifted, utc_now
+from service.webhooks.addresses import require_http_allowed, require_url
+from service.webhooks.messages import delivery_row, new_webhook_secret, wants
+from service.webhooks.sender import WebhookSender
+
+MAX_WEBHOOKS = 50
+
+
+class Webhooks:
+    """Reads and changes webhooks.  `entry` goes to the audit list with a change."""
+
+    def __init__(self, context: Context, access: Access) -> None:
+        self._context = context
+        self._access = access
+        self._ids = Ulids()
+        self._allowed = networks(context.settings.webhook_networks)
+        self.sender = WebhookSender(context.store, self._allowed, lambda: access.is_open)
+
+    def all(self) -> list[Webhook]:
+        """Every webhook, the oldest first."""
+        is_open = self._access.is_open
+        with self._context.reading() as connection:
+            return registered.list_webhooks(connection, utc_now().text, is_open)
+
+    def get(self, id: str) -> Webhook:
+        """One webhook."""
+        is_open = self._access.is_open
+        with self._context.reading() as connection:
+            return registered.read_webhook(connection, _known(id), utc_now().text, is_open)
+
+    def add(self, settings: Row, caller: Caller, entry: Entry | None = None) -> WebhookWithSecret:
+        """Register a webhook, which is sent the events from now on.
+
+        `settings` are name, url, kinds, spacecraft, severity, run and enabled.
+        Raises `BadInput` for a URL that must not be reached and for a spacecraft without a
+        mission file, `WrongState` where there are too many webhooks.
+        """
+        self._require(settings)
+        id, now, secret = self._ids.new(), utc_now().text, new_webhook_secret()
+        is_open = self._access.is_open
+        row = settings | _of(caller) | {"id": id, "created": now, "secret": secret}
+
+        def change(connection: Connection) -> Webhook:
+            if registered.count_webhooks(connection) >= MAX_WEBHOOKS:
+                raise WrongState(f"there are {MAX_WEBHOOKS} webhooks already; delete one first")
+            position = last_event(connection)
+            registered.add_webhook(connection, row | {"position": position})
+            return registered.read_webhook(connection, id, now, is_open)
+
+        added = self._context.change_audited(change, entry)
+        self.sender.changed()
+        return _with_secret(added, secret)
+
+    def change(self, id: str, settings: Row, caller: Caller, entry: Entry | None = None) -> Webhook:
+        """Replace the settings of a webhook; from now on it is sent what the caller may read.
+
+        One that was paused or disabled goes on where it stopped.
+        """
+        known, now, is_open = _known(id), utc_now().text, self._access.is_open
+        self._require(settings)
+        changes = settings | _of(caller) | {"gone_at": None, "held_until": None}
+
+        def change(connection: Connection) -> Webhook:
+            registered.change_webhook(connection, known, changes)
+            deliveries.resume(connection, known, now)
+            return registered.read_webhook(connection, known, now, is_open)
+
+        changed = self._context.change_audited(change, entry)
+        self.sender.changed()
+        return changed
+
+    def delete(self, id: str, entry: Entry | None = None) -> Webhook:
+        """Delete a webhook, with what waits for it."""
+        known, now, is_open = _known(id), utc_now().text, self._access.is_open
+
+        def change(connection: Connection) -> Webhook:
+            found = registered.read_webhook(connection, known, now, is_open)
+            registered.delete_webhook(connection, known)
+            return found
+
+        deleted = self._context.change_audited(change, entry)
+        self.sender.changed()
+        return deleted
+
+    def rotate(self, id: str, hours: int, entry: Entry | None = None) -> WebhookWithSecret:
+        """Give a webhook a new secret; the one before signs too for so many hours.
+
+        Raises `WrongState` where an earlier secret was promised to sign still, except with 0 hours.
+        """
+        known, now, is_open = _known(id), utc_now(), self._access.is_open
+        secret, until = new_webhook_secret(), shifted(now, hours * HOUR_S).text
+
+        def change(connection: Connection) -> Webhook:
+            before = registered.registered_webhook(connection, known, now.text, is_open)
+            if hours and len(before.secrets(now.text)) > 1:
+                raise WrongState(
+                    f"the secret before the present one signs until {before.previous_until}: make "
+                    "a new one after that, or with `previous_hours` 0, which ends both at once"
+                )
+            changes = {"secret": secret, "previous_secret": before.secret, "previous_until": until}
+            registered.change_webhook(connection, known, changes)
+            return registered.read_webhook(connection, known, now.text, is_open)
+
+        rotated = self._context.change_audited(change, entry)
+        self.sender.changed()
+        return _with_secret(rotated, secret)
+
+    def try_out(self, id: str) -> WebhookTest:
+        """Send a test event at once, whatever waits, and say what came of it.
+
+        Raises `WrongState` for a webhook that is not active.
+        """
+        is_open = self._access.is_open
+        with self._context.reading() as connection:
+            webhook = registered.registered_webhook(connection, _known(id), utc_now().text, is_open)
+        if webhook.state != "active":
+            raise WrongState(f"the webhook is {webhook.state}: {webhook.reason}")
+        message_id, outcome = self.sender.try_out(webhook)
+        return WebhookTest(
+            delivered=outcome.delivered,
+            message_id=message_id,
+            status=outcome.status,
+            fault=outcome.fault,
+            duration_ms=round(1e3 * outcome.duration_s, 1),
+        )
+
+    def deliveries(
+        self,
+        id: str,
+        dead: bool | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+        *,
+        oldest_first: bool = False,
+    ) -> Page[WebhookDelivery]:
+        """What waits for a webhook and its dead letters, or one of these; the latest first."""
+        known, is_open = _known(id), self._access.is_open
+        with self._context.reading() as connection:
+            registered.read_webhook(connection, known, utc_now().text, is_open)
+            return deliveries.list_deliveries(
+                connection,
+                known,
+                dead=dead,
+                limit=limit,
+                cursor=cursor,
+                oldest_first=oldest_first,
+            )
+
+    def retry(
+        self, id: str, numbers: Sequence[int] | None, entry: Entry | None = None
+    ) -> WebhookQueued:
+        """Send dead letters again, those of some events or all.
+
+        Raises `BadInput` for an event that is no dead letter.
+        """
+        known, now, is_open = _known(id), utc_now().text, self._access.is_open
+
+        def change(connection: Connection) -> int:
+            registered.registered_webhook(connection, known, now, is_open)
+            return deliveries.retry_dead(connection, known, numbers, now)
+
+        return WebhookQueued(queued=self._context.change_audited(change, entry))
+
+    def replay(
+        self, id: str, since: Utc, until: Utc | None, entry: Entry | None = None
+    ) -> WebhookQueued:
+        """Send the kept events of a period again, if the webhook wants them."""
+        known, now, is_open = _known(id), utc_now().text, self._access.is_open
+        end = utc_now() if until is None else until
+        # Not in the writer, which others would wait for.
+        with self._context.reading() as connection:
+            webhook = registered.registered_webhook(connection, known, now, is_open)
+            kept = events_between(connection, since, end)
+        # What was not queued yet comes by itself.
+        found = [each for each in kept if each.id <= webhook.position]
+        wanted = [each for each in found if wants(webhook, each)]
+        rows = [delivery_row(known, each, now, again=True) for each in wanted]
+
+        def change(connection: Connection) -> int:
+            registered.registered_webhook(connection, known, now, is_open)
+            return deliveries.queue_again(connection, known, rows)
+
+        return WebhookQueued(queued=self._context.change_audited(change, entry))
+
+    def _require(self, settings: Row) -> None:
+        require_url(settings["url"], self._allowed)
+        require_http_allowed(settings["url"], self._allowed)
+        for name in settings["spacecraft"] or ():
+            mission_in_input(self._context.missions, name)
+
+
+def _known(id: str) -> str:
+    return known_id(id, "webhook")
+
+
+def _of(caller: Caller) -> Row:
+    return {"token_id": caller.token_id, "who": caller.name}
+
+
+def _with_secret(webhook: Webhook, secret: str) -> WebhookWithSecret:
+    fields = {name: getattr(webhook, name) for name in Webhook.__struct_fields__}
+    return WebhookWithSecret(**fields, secret=secret)

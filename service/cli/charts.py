@@ -1,0 +1,224 @@
+"""Pictures as SVG: errors of attitudes over time, and the zones of a mission file."""
+
+from typing import TYPE_CHECKING
+from xml.sax.saxutils import escape
+
+import numpy as np
+
+from service.advice.zone_census import ZoneCensus, axes_deg
+from service.vectors import Vector, from_ra_dec, to_ra_dec, unit
+
+if TYPE_CHECKING:
+    from service.cli.mission_report import MissionReport
+    from service.products.scoring import Errors
+
+
+WIDTH, ROW, HEAD, FOOT = 960, 190, 44, 30
+TIME_LEFT, TIME_RIGHT, BARS_LEFT, BARS_RIGHT = 76, 640, 690, 940
+TOP, BOTTOM = 26, 166
+"""Within a row."""
+MOST_POINTS = 3_000
+"""Of an axis: the picture of a longer series shows a part of the attitudes, evenly spread."""
+POINT, SIGMA, BAR = "#1f5f99", "#b3541e", "#7ba7cf"
+
+
+def errors_picture(errors: "Errors", title: str) -> str:
+    """The errors as SVG; needs one attitude at least."""
+    from service.products.scoring import AXES, histogram
+
+    counts = histogram(errors)
+    limit = counts["edges_arcsec"][-1]
+    height = HEAD + ROW * len(AXES) + FOOT
+    parts = [
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+            'font-family="sans-serif" font-size="13" fill="#222" role="img">'
+        ),
+        f"<title>Errors of {escape(title)}</title>",
+        f'<rect width="{WIDTH}" height="{height}" fill="#fff"/>',
+        (
+            f'<text x="12" y="26" font-size="15">Errors of {len(errors.time_ns):,} attitudes: '
+            f"{escape(title)}</text>"
+        ),
+    ]
+    for number, axis in enumerate(AXES):
+        parts.append(f'<g transform="translate(0 {HEAD + number * ROW})">')
+        parts += _over_time(errors, number, axis, limit)
+        parts += _bars(counts[axis], limit)
+        parts.append("</g>")
+    y = HEAD + ROW * len(AXES) + 16
+    parts.append(
+        f'<text x="{TIME_LEFT}" y="{y}">time: {_hours(errors):.3g} h; '
+        f'<tspan fill="{SIGMA}">lines: three predicted standard deviations</tspan>; errors '
+        "beyond the scale stand at its ends</text>"
+    )
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _hours(errors: "Errors") -> float:
+    return float(errors.time_ns.max() - errors.time_ns.min()) / 3.6e12
+
+
+def _over_time(errors: "Errors", number: int, axis: str, limit: float) -> list[str]:
+    step = -(-len(errors.time_ns) // MOST_POINTS)
+    time_ns = errors.time_ns[::step]
+    span = max(1, int(time_ns.max() - time_ns.min()))
+    x = TIME_LEFT + (TIME_RIGHT - TIME_LEFT) * (time_ns - time_ns.min()) / span
+    y = _height(errors.error_arcsec[::step, number], limit)
+    three = 3.0 * np.sqrt(errors.variance_arcsec2[::step, number])
+    parts = [
+        f'<text x="{TIME_LEFT}" y="16">about {axis}, arcsec</text>',
+        *_scale(limit, TIME_LEFT, TIME_RIGHT),
+    ]
+    for sign in (-1.0, 1.0):
+        points = _points(x, _height(sign * three, limit))
+        parts.append(f'<polyline points="{points}" fill="none" stroke="{SIGMA}" opacity=".6"/>')
+    parts += [
+        f'<circle cx="{px:.1f}" cy="{py:.1f}" r="1.3" fill="{POINT}"/>'
+        for px, py in zip(x.tolist(), y.tolist(), strict=True)
+    ]
+    return parts
+
+
+def _scale(limit: float, left: int, right: int) -> list[str]:
+    parts = []
+    for share in (-1.0, 0.0, 1.0):
+        y = float(_height(np.array([share * limit]), limit)[0])
+        parts.append(f'<line x1="{left}" x2="{right}" y1="{y}" y2="{y}" stroke="#ccc"/>')
+        parts.append(
+            f'<text x="{left - 6}" y="{y + 4}" text-anchor="end">{share * limit:.3g}</text>'
+        )
+    return parts
+
+
+def _bars(counts: list[int], limit: float) -> list[str]:
+    most = max(1, *counts)
+    width = (BARS_RIGHT - BARS_LEFT) / len(counts)
+    parts = [
+        f'<rect x="{BARS_LEFT + k * width:.2f}" width="{width - 0.6:.2f}" fill="{BAR}" '
+        f'y="{BOTTOM - (BOTTOM - TOP) * count / most:.1f}" '
+        f'height="{(BOTTOM - TOP) * count / most:.1f}"/>'
+        for k, count in enumerate(counts)
+    ]
+    for share, anchor in ((-1.0, "start"), (0.0, "middle"), (1.0, "end")):
+        x = BARS_LEFT + (BARS_RIGHT - BARS_LEFT) * (share + 1.0) / 2.0
+        parts.append(
+            f'<text x="{x}" y="{BOTTOM + 16}" text-anchor="{anchor}">{share * limit:.3g}</text>'
+        )
+    return parts
+
+
+def _height(values: Vector, limit: float) -> Vector:
+    middle, half = (TOP + BOTTOM) / 2.0, (BOTTOM - TOP) / 2.0
+    return np.asarray(middle - half * np.clip(values / limit, -1.0, 1.0))
+
+
+def _points(x: Vector, y: Vector) -> str:
+    return " ".join(f"{px:.1f},{py:.1f}" for px, py in zip(x.tolist(), y.tolist(), strict=True))
+
+
+PICTURE_WIDTH, MAP_HEIGHT, MAP_HEAD, MAP_FOOT = 960, 480, 34, 46
+COLORS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
+"""Viridis: darker is less, also for eyes that do not tell red from green."""
+
+
+def zones_picture(report: "MissionReport") -> str:
+    """The zones as SVG: pairs by axis over the whole sky, the richest zone with its stars."""
+    height = len(report.zones) * (MAP_HEAD + MAP_HEIGHT + MAP_FOOT)
+    parts = [
+        (
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {PICTURE_WIDTH} {height}" '
+            'font-family="sans-serif" font-size="14" fill="#222">'
+        ),
+        f'<rect width="{PICTURE_WIDTH}" height="{height}" fill="#fff"/>',
+    ]
+    for k, zone in enumerate(report.zones):
+        parts.append(f'<g transform="translate(0 {k * (MAP_HEAD + MAP_HEIGHT + MAP_FOOT)})">')
+        parts += _panel(report, zone)
+        parts.append("</g>")
+    return "\n".join([*parts, "</svg>", ""])
+
+
+def _panel(report: "MissionReport", zone: ZoneCensus) -> list[str]:
+    ra_deg, dec_deg = axes_deg()
+    least, most = zone.spread["pairs"].least, zone.spread["pairs"].most
+    half_ra, half_dec = 180.0 / len(ra_deg), 90.0 / len(dec_deg)
+    parts = [f'<text x="12" y="22">{report.mission.name}: pairs in a {zone.of} by its axis</text>']
+    for row, dec in enumerate(dec_deg):
+        for column, ra in enumerate(ra_deg):
+            level = (int(zone.pairs[row, column]) - least) / max(1, most - least)
+            corners = _projected(
+                np.array([ra - half_ra, ra + half_ra, ra + half_ra, ra - half_ra]),
+                np.array([dec - half_dec, dec - half_dec, dec + half_dec, dec + half_dec]),
+            )
+            color = _color(level)
+            # The stroke of the same colour closes the seam between neighbours.
+            parts.append(
+                f'<polygon points="{_star_points(corners)}" fill="{color}" stroke="{color}"/>'
+            )
+    parts += _richest(report, zone)
+    y = MAP_HEAD + MAP_HEIGHT + 14
+    for x, text in ((12, "RA 360"), (PICTURE_WIDTH - 52, "RA 0")):
+        parts.append(f'<text x="{x}" y="{MAP_HEAD + 14}">{text}</text>')
+    for k in range(60):
+        parts.append(
+            f'<rect x="{12 + 4 * k}" y="{y}" width="4" height="14" fill="{_color(k / 59)}"/>'
+        )
+    ra, dec = zone.richest_deg()
+    note = (
+        f"{least:,} to {most:,} pairs; the outline is the zone about RA {ra:.1f}, "
+        f"Dec {dec:+.0f} deg, the richest, with its stars"
+    )
+    return [*parts, f'<text x="264" y="{y + 12}">{note}</text>']
+
+
+def _richest(report: "MissionReport", zone: ZoneCensus) -> list[str]:
+    """The outline of the zone with the most pairs, and its stars."""
+    axis = from_ra_dec(*zone.richest_deg())
+    parts = []
+    turn = np.radians(np.linspace(0.0, 360.0, 721))
+    first = unit(np.cross(axis, (0.0, 0.0, 1.0)))
+    second = np.cross(axis, first)
+    for edge_deg in (zone.least_deg, zone.most_deg):
+        if not 0.0 < edge_deg < 180.0:
+            continue
+        angle = np.radians(edge_deg)
+        ring = np.cos(angle) * axis + np.sin(angle) * (
+            np.outer(np.cos(turn), first) + np.outer(np.sin(turn), second)
+        )
+        places = _projected(*to_ra_dec(ring))
+        # The outline is cut where it leaves the map on one side and comes in on the other.
+        breaks = np.flatnonzero(np.abs(np.diff(places[:, 0])) > PICTURE_WIDTH / 4) + 1
+        parts += [
+            f'<polyline points="{_star_points(piece)}" fill="none" stroke="#fff" stroke-width="2"/>'
+            for piece in np.split(places, breaks)
+        ]
+    angle_deg = np.degrees(np.arccos(np.clip(report.run_catalog.direction @ axis, -1.0, 1.0)))
+    inside = (zone.least_deg <= angle_deg) & (angle_deg <= zone.most_deg)
+    places = _projected(report.run_catalog.ra_deg[inside], report.run_catalog.dec_deg[inside])
+    parts += [f'<circle cx="{x:.1f}" cy="{y:.1f}" r="1" fill="#fff"/>' for x, y in places]
+    return parts
+
+
+def _projected(ra_deg: Vector, dec_deg: Vector) -> Vector:
+    """Places (n, 2) on the equal-area map of Hammer, right ascension 180 deg in its middle."""
+    # A hair inside the edge: 0 and 360 deg are its two sides.
+    longitude = np.radians(np.clip(180.0 - ra_deg % 360.01, -179.99, 179.99)) / 2.0
+    latitude = np.radians(dec_deg)
+    root = np.sqrt(1.0 + np.cos(latitude) * np.cos(longitude))
+    x = np.cos(latitude) * np.sin(longitude) / root
+    y = np.sin(latitude) / root
+    middle, half = PICTURE_WIDTH / 2.0, PICTURE_WIDTH / 2.0 - 12.0
+    return np.column_stack([middle + half * x, MAP_HEAD + MAP_HEIGHT / 2.0 * (1.0 - y)])
+
+
+def _star_points(places: Vector) -> str:
+    return " ".join(f"{x:.1f},{y:.1f}" for x, y in places.tolist())
+
+
+def _color(level: float) -> str:
+    stops = np.linspace(0.0, 1.0, len(COLORS))
+    mixed = [
+        round(float(np.interp(level, stops, channel))) for channel in zip(*COLORS, strict=True)
+    ]
+    return "#" + "".join(f"{each:02x}" for each in mixed)

@@ -1,0 +1,374 @@
+"""`acquire simulate`: skies whose truth is known."""
+
+import io
+from argparse import Namespace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, cast
+
+from service.cli.arguments import (
+    CAMERA_MISSION,
+    MISSION,
+    STANDARD_OUTPUT,
+    add_command,
+    add_group,
+    add_json_file,
+    count,
+    positive,
+)
+from service.cli.configuration import mission_and_catalog
+from service.cli.simulated_rates import add_mission, add_paper
+from service.errors import BadInput, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.observations.batch import Aberration
+    from service.simulate.gyro import GyroWanted
+    from service.simulate.stretches import Pass
+
+
+def add(commands: Any) -> None:
+    """Declare the group with its commands."""
+    group = add_group(
+        commands,
+        "simulate",
+        "Simulate telemetry and frames with known truth, and repeat published experiments.",
+        "acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson",
+    )
+    _add_frames(group)
+    _add_imaging(group)
+    add_mission(group)
+    add_paper(group)
+    _add_telemetry(group)
+
+
+def _add_frames(group: Any) -> None:
+    parser = add_command(
+        group,
+        "frames",
+        "Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds "
+        "the known data of FILE.fits; truth.ndjson holds the truth of all frames.",
+        """
+        acquire simulate frames --spacecraft IMAGER --frames 10 --seed 3 frames/
+        acquire simulate frames --spacecraft IMAGER --frames 5 --psf cross --lost frames/
+        acquire simulate frames --spacecraft IMAGER --frames 5 --rates 0.5 --cosmic-rays 50 frames/
+        """,
+        _run_frames,
+    )
+    parser.add_argument("output", type=Path, metavar="OUTDIR")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=CAMERA_MISSION)
+    parser.add_argument("--frames", required=True, type=count, metavar="N")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+    parser.add_argument(
+        "--tracker", metavar="NAME", help="default: the first tracker with a camera"
+    )
+    parser.add_argument(
+        "--start",
+        metavar="UTC",
+        help="time of the first frame; default 2026-03-01; one frame per minute",
+    )
+    parser.add_argument(
+        "--format", choices=("fits", "tiff", "png", "npy"), default="fits", help="default fits"
+    )
+    parser.add_argument(
+        "--psf",
+        choices=("gaussian", "airy", "cross"),
+        help="the image of a star; default: that of the mission's camera",
+    )
+    prior = parser.add_mutually_exclusive_group()
+    prior.add_argument(
+        "--prior-error",
+        type=float,
+        default=1.0,
+        metavar="DEG",
+        help="maximum error of the a priori attitude; default 1",
+    )
+    prior.add_argument("--lost", action="store_true", help="no a priori attitude")
+    parser.add_argument(
+        "--rates",
+        type=float,
+        default=0.02,
+        metavar="DEG/S",
+        help="maximum body rate per axis; default 0.02",
+    )
+    parser.add_argument(
+        "--response",
+        type=float,
+        default=0.005,
+        metavar="SIGMA",
+        help="standard deviation of the pixel response; default 0.005",
+    )
+    parser.add_argument(
+        "--sky",
+        type=float,
+        default=100.0,
+        metavar="E/S",
+        help="sky background of a pixel; default 100",
+    )
+    parser.add_argument("--hot-pixels", type=int, default=200, metavar="N", help="default 200")
+    parser.add_argument(
+        "--cosmic-rays", type=int, default=5, metavar="N", help="mean number per frame; default 5"
+    )
+
+
+def _run_frames(parsed: Namespace) -> int:
+    """Draw frames into a folder, with a progress bar."""
+    from tqdm import tqdm
+
+    from service.simulate.frames import (
+        DEFAULT_START,
+        TRUTH,
+        FrameSettings,
+        draw_frames,
+        write_frames,
+    )
+    from service.sky.cache import LruCache
+    from service.sky.model import SkyModel
+
+    mission, catalog = mission_and_catalog(parsed.spacecraft)
+    wanted = FrameSettings(
+        frames=parsed.frames,
+        seed=parsed.seed,
+        tracker=parsed.tracker,
+        start=parsed.start or DEFAULT_START,
+        psf=parsed.psf,
+        a_priori_error_deg=None if parsed.lost else parsed.prior_error,
+        rates_deg_per_s=parsed.rates,
+        response_sigma=parsed.response,
+        sky_e_per_s=parsed.sky,
+        hot_pixels=parsed.hot_pixels,
+        cosmic_rays=parsed.cosmic_rays,
+    )
+    drawn = draw_frames(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
+    bar = tqdm(drawn, total=wanted.frames, unit="frame", disable=None)
+    count = write_frames(bar, parsed.output, parsed.format)
+    print(f"{parsed.output}: {count} frames of {mission.name}; truth: {parsed.output / TRUTH}")
+    return 0
+
+
+def _add_imaging(group: Any) -> None:
+    parser = add_command(
+        group,
+        "imaging",
+        "Compare every claim of the star image detection report with a measurement: crosses of "
+        "wire meshes, correlation, estimation, scans and their noise, pattern constants.",
+        """
+        acquire simulate imaging --row IM-4
+        acquire simulate imaging --seed 7 --json claims.json
+        acquire simulate imaging --plots docs/plots --report docs/imaging.md
+        """,
+        _run_imaging,
+    )
+    parser.add_argument(
+        "--row", nargs="+", default=[], metavar="IM-N", help="IM-1 to IM-11; default all"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+    parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
+    add_json_file(parser, "the claims with their figures")
+    parser.add_argument(
+        "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
+    )
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="write everything to a page instead of printing it",
+    )
+
+
+def _run_imaging(parsed: Namespace) -> int:
+    """Hold the star image detection report beside what is measured; 1 where a claim is off."""
+    from studies.star_image_report.command import as_json, run_imaging
+
+    prints_json = parsed.json == STANDARD_OUTPUT
+    rows = run_imaging(
+        parsed.row,
+        parsed.seed,
+        parsed.quick,
+        json_path=None if prints_json else parsed.json,
+        plots_folder=parsed.plots,
+        report_path=parsed.report,
+        out=io.StringIO() if prints_json else None,
+    )
+    if prints_json:
+        print(as_json(rows), end="")
+    return 0 if all(row.holds for row in rows) else 1
+
+
+_SIZES = {
+    "attitude_error": "attitude_error_deg",
+    "spurious": "spurious_stars",
+    "magnitude_error": "magnitude_error_mag",
+    "position_error": "position_error_arcsec",
+}
+_SERIOUS_SHARE = 0.1
+
+
+def _add_telemetry(group: Any) -> None:
+    parser = add_command(
+        group,
+        "telemetry",
+        "Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the "
+        "truth in OUT.truth.ndjson.  The same arguments always give the same pass.",
+        """
+        acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
+        acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
+        acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
+        acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
+        acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
+        """,
+        _run_telemetry,
+    )
+    parser.add_argument("output", type=Path, metavar="OUT.ndjson")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+    parser.add_argument("--batches", required=True, type=count, metavar="N")
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+    parser.add_argument(
+        "--start",
+        metavar="UTC",
+        help="time of the first batch; default 1999-03-01, bands 1996-04-16",
+    )
+    parser.add_argument(
+        "--cadence", type=float, metavar="S", help="seconds between batches; default 30, bands 300"
+    )
+    parser.add_argument(
+        "--stars",
+        type=count,
+        default=5,
+        metavar="N",
+        help="maximum number of stars per tracker; default 5",
+    )
+    parser.add_argument(
+        "--prior",
+        choices=("quaternion", "direction", "mixed"),
+        default="quaternion",
+        help="a priori attitude: full (quaternion), boresight or sun_pointed only (direction), "
+        "or both kinds (mixed)",
+    )
+    parser.add_argument(
+        "--angles",
+        type=float,
+        default=0.25,
+        metavar="SHARE",
+        help="share of stars sent as h_deg, v_deg; default 0.25",
+    )
+    parser.add_argument(
+        "--aberration",
+        default="to_correct",
+        metavar="WORD[=SHARE],...",
+        help="to_correct, applied_upstream, ignore; default to_correct",
+    )
+    _add_gyro(parser)
+    serious = parser.add_argument_group(
+        "periods with errors",
+        "share of the pass with each error, from 0 to 1, and its size",
+    )
+    preset = serious.add_mutually_exclusive_group()
+    preset.add_argument("--nominal", action="store_true", help="no errors")
+    preset.add_argument(
+        "--serious", action="store_true", help="each kind of error for a tenth of the pass"
+    )
+    for flag, unit, share, size, text in (
+        ("attitude-error", "DEG", "0.1", "10, bands 5", "growing a priori attitude error"),
+        ("spurious", "N", "0.1", "1", "false stars in the place of real ones"),
+        ("magnitude-error", "MAG", "0", "0.5", "noise of magnitudes (sigma)"),
+        ("position-error", "ARCSEC", "0", "12", "noise of positions (sigma per tangent axis)"),
+    ):
+        name = f"--{flag}-share"
+        serious.add_argument(name, type=float, metavar="SHARE", help=f"{text}; default {share}")
+        kind: Any = count if unit == "N" else float
+        name = f"--{flag}-{'stars' if unit == 'N' else unit.lower()}"
+        serious.add_argument(name, type=kind, metavar=unit, help=f"default {size}")
+
+
+def _add_gyro(parser: Any) -> None:
+    gyro = parser.add_argument_group(
+        "gyro", "blocks of gyro samples beside the batches, only in NDJSON files"
+    )
+    gyro.add_argument(
+        "--gyro",
+        type=positive,
+        metavar="S",
+        help="seconds between samples; the noise is that of the mission's table [gyro]",
+    )
+    for flag, unit, text in (
+        ("gyro-quantum", "ARCSEC", "one count of the gyro"),
+        ("gyro-gap", "S", "a gap, which begins after 40 %% of the pass"),
+        (
+            "clock-step",
+            "S",
+            "forward step of the trackers' and gyro's clock after 70 %% of the pass",
+        ),
+    ):
+        gyro.add_argument(f"--{flag}", type=float, default=0.0, metavar=unit, help=text)
+
+
+def _run_telemetry(parsed: Namespace) -> int:
+    """Draw a pass and write it with its truth."""
+    from service.simulate.gyro import with_gyro
+    from service.simulate.telemetry import draw_pass, truth_path, write_pass
+    from service.sky.cache import LruCache
+    from service.sky.model import SkyModel
+
+    wanted = _pass_of(parsed)
+    gyro = _gyro_of(parsed)
+    mission, catalog = mission_and_catalog(parsed.spacecraft)
+    drawn = draw_pass(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
+    if gyro is not None:
+        duration_s = (wanted.batches - 1) * wanted.cadence_of(mission)
+        drawn = with_gyro(drawn, mission, gyro, duration_s, wanted.seed)
+    count = write_pass(drawn, parsed.output)
+    print(f"{parsed.output}: {count} batches of {mission.name}; truth: {truth_path(parsed.output)}")
+    return 0
+
+
+def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
+    """The gyro that the arguments describe, if any."""
+    from service.observations.readers.telemetry import telemetry_format
+    from service.simulate.gyro import GyroWanted
+
+    flaws = parsed.gyro_quantum, parsed.gyro_gap, parsed.clock_step
+    if parsed.gyro is None:
+        if any(flaws):
+            raise BadInput(Fault("--gyro", "is missing: without it there is no gyro"))
+        return None
+    if telemetry_format(parsed.output) == "csv":
+        raise BadInput(Fault("--gyro", "needs NDJSON: a CSV file has batches or gyro samples"))
+    return GyroWanted(parsed.gyro, *flaws)
+
+
+def _pass_of(parsed: Namespace) -> "Pass":
+    """The pass that the arguments describe; raises `BadInput` for an impossible one."""
+    from service.simulate.stretches import Pass, Trouble, Troubles
+
+    troubles = {}
+    for kind, size_name in _SIZES.items():
+        usual: Trouble = getattr(Troubles(), kind)
+        size, share = getattr(parsed, size_name), getattr(parsed, f"{kind}_share")
+        if share is None:
+            # A size alone asks for the stretch, too.
+            asked = parsed.serious or size is not None
+            share = 0.0 if parsed.nominal else max(usual.share, _SERIOUS_SHARE * asked)
+        troubles[kind] = Trouble(share, usual.size if size is None else size)
+    return Pass(
+        batches=parsed.batches,
+        seed=parsed.seed,
+        start=parsed.start,
+        cadence_s=parsed.cadence,
+        stars=parsed.stars,
+        prior=parsed.prior,
+        angles_share=parsed.angles,
+        aberration=_shares(parsed.aberration),
+        troubles=Troubles(**troubles),
+    )
+
+
+def _shares(text: str) -> "dict[Aberration, float]":
+    """Words with their shares, as in `to_correct=0.5,ignore=0.5`; a word alone has all."""
+    shares: dict[str, float] = {}
+    for part in text.split(","):
+        word, _, share = part.partition("=")
+        try:
+            shares[word.strip()] = float(share) if share else 1.0
+        except ValueError:
+            message = "must be a word, or words with shares such as to_correct=0.5,ignore=0.5"
+            raise BadInput(Fault("--aberration", message, shown_value(text))) from None
+    return cast("dict[Aberration, float]", shares)

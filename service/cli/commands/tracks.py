@@ -1,0 +1,59 @@
+"""`acquire tracks`: moving points, planets and hot pixels among the unmatched stars of a record."""
+
+from argparse import Namespace
+from pathlib import Path
+from typing import Any
+
+from service.cli.arguments import MISSION, add_command, add_database, add_period, print_json
+from service.cli.configuration import period_of, settings_of_existing
+from service.errors import BadInput, Fault
+
+
+def add(commands: Any) -> None:
+    """Declare the command."""
+    parser = add_command(
+        commands,
+        "tracks",
+        "Link the unmatched stars of recorded batches to tracks: objects that move on the sky, "
+        "planets, and hot pixels, which keep their place on the detector.  Changes nothing.",
+        """
+        acquire tracks XTE --start 1999-060T00:00:00Z --end 1999-060T01:00:00Z
+        acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
+        """,
+        run,
+    )
+    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
+    add_period(parser, "the run to use; default live")
+    parser.add_argument(
+        "--format",
+        choices=("text", "json", "tdm"),
+        default="text",
+        help="text for people (the default), JSON, or the moving tracks as a CCSDS TDM",
+    )
+    parser.add_argument(
+        "-o", "--output", type=Path, metavar="OUT", help="write the TDM to OUT; default: print it"
+    )
+    add_database(parser)
+
+
+def run(parsed: Namespace) -> int:
+    """Link, and print or write."""
+    from service.app.factory import open_app
+    from service.cli.arguments import written_to
+    from service.cli.texts import tracks_text
+
+    if parsed.output is not None and parsed.format != "tdm":
+        raise BadInput(Fault("--output", "is for --format tdm alone"))
+    start, end = period_of(parsed)
+    app = open_app(settings_of_existing(parsed), reads_only=True)
+    try:
+        found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
+        if parsed.format == "tdm":
+            written_to(parsed.output, app.tracks.tdm(found))
+        elif parsed.format == "json":
+            print_json(found)
+        else:
+            print(tracks_text(found))
+    finally:
+        app.close()
+    return 0

@@ -1,0 +1,250 @@
+"""Advice, calibrations, compared runs and tracks as text for a terminal."""
+
+import textwrap
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from service.app.advice import no_changes_text
+from service.app.calibration_estimates import (
+    not_observable_of,
+    notes,
+    residuals_by_tracker,
+    result_of,
+    unknowns_of,
+)
+from service.ingest.reprocess import ReprocessProgress
+from service.storage.models.advice import (
+    Advice,
+    AlignmentAdvice,
+    GroupAdvice,
+    InnovationAdvice,
+    MagnitudeAdvice,
+    NoiseAdvice,
+    ToleranceAdvice,
+    Trial,
+    ZoneAdvice,
+)
+from service.storage.models.compare import RunComparison, RunTransition
+from service.storage.tracks import Track, TrackList
+
+if TYPE_CHECKING:
+    from service.app.calibration_estimates import CalibrationRun
+    from service.calibration.estimate import Calibration
+
+
+Finding = (
+    GroupAdvice
+    | ZoneAdvice
+    | ToleranceAdvice
+    | NoiseAdvice
+    | MagnitudeAdvice
+    | AlignmentAdvice
+    | InnovationAdvice
+)
+WIDTH = 96
+
+
+def advice_text(advice: Advice) -> str:
+    """The advice as lines of text."""
+    lines = [*_heading(advice), ""]
+    sections: tuple[tuple[str, Sequence[Finding]], ...] = (
+        ("Groups of stars", advice.groups),
+        ("Zone", advice.zone),
+        ("Tolerances", advice.tolerances),
+        ("Noise", advice.noise),
+        ("Magnitudes", advice.magnitudes),
+        ("Alignment", advice.alignment),
+        ("Innovations", advice.innovations),
+    )
+    for title, findings in sections:
+        if findings:
+            lines += [title, *_sentences(findings), ""]
+    lines += [*_table(advice.tried), "", *_changes(advice)]
+    return "\n".join(lines)
+
+
+def _heading(advice: Advice) -> list[str]:
+    span = f"{advice.first} to {advice.last}" if advice.first else "no batches"
+    lines = [f"Advice for {advice.spacecraft}, run {advice.run}: {span}"]
+    sampled = f"{advice.batches_sampled} of {advice.batches_in_range} batches were examined"
+    if advice.batches_refused:
+        sampled += f"; {advice.batches_refused} could not be processed again: {advice.refusal}"
+    return [*lines, *textwrap.wrap(sampled + ".", WIDTH)]
+
+
+def _sentences(findings: Iterable[Finding]) -> list[str]:
+    marks = {"keep": "  ok  ", "wait": "  ?   "}
+    return [
+        line
+        for each in findings
+        for line in textwrap.wrap(
+            each.text,
+            WIDTH,
+            initial_indent=marks.get(each.action, "  !!  "),
+            subsequent_indent="      ",
+        )
+    ]
+
+
+def _table(tried: Sequence[Trial]) -> list[str]:
+    wide = max(28, *(len(each.name) for each in tried))
+    heads = "  ".join(("batches", "stars", "ambig. %", "unmat. %", "other"))
+    lines = [
+        "Outcomes of the stars with other settings",
+        f"  {'':<{wide}}  {'':<8}  {heads}",
+    ]
+    for each in tried:
+        observed = each.observed or 1
+        lines.append(
+            f"  {each.name:<{wide}}  {each.identifier:<8}  {each.batches:>7}"
+            f"  {each.observed:>5}  {100 * each.ambiguous / observed:>8.2f}"
+            f"  {100 * each.unmatched / observed:>8.2f}  {each.named_otherwise:>5}"
+        )
+    return [*lines, "  other: stars that verified identification names differently"]
+
+
+def _changes(advice: Advice) -> list[str]:
+    """The lines for the mission file, under the tables that they belong to."""
+    if not advice.changes:
+        return [no_changes_text(advice)]
+    lines = [f"To change in the mission file of {advice.spacecraft}:"]
+    place = None
+    for each in sorted(advice.changes, key=lambda change: (change.table, change.tracker or "")):
+        if (each.table, each.tracker) != place:
+            place = each.table, each.tracker
+            lines.append(
+                f"  [[trackers]]   of {each.tracker}" if each.tracker else f"  [{each.table}]"
+            )
+        lines.append(f"  {each.line}")
+    return lines
+
+
+CERTAIN_SIGMAS = 3.0
+
+
+def calibration_text(result: "CalibrationRun") -> str:
+    """Parameters with sigmas, residuals before and after, and what the stars do not show."""
+    found = result.found
+    summary = (
+        f"{result.used} of {result.sampled} batches had identified stars ({result.total} in the "
+        f"period, {result.first} to {result.last}); {len(found.stars)} stars, "
+        f"{int(np.sum(~found.used))} left out as wrong."
+    )
+    lines = [summary, "", *_residual_lines(found)]
+    if result.tried:
+        tried = ", ".join(
+            f"{each.degree}: {each.residual_over_sigma:.3f}{' (chosen)' if each.chosen else ''}"
+            for each in result.tried
+        )
+        lines += ["", f"Held-out residual over sigma by degree of the distortion: {tried}."]
+    lines += ["", f"{'':2}{'unknown':34}{'value':>14}{'sigma':>12}  unit"]
+    for each in unknowns_of(result):
+        mark = "* " if abs(each.value) > CERTAIN_SIGMAS * each.sigma else "  "
+        lines.append(f"{mark}{each.name:34}{each.value:>14.6g}{each.sigma:>12.2g}  {each.unit}")
+    lines.append(f"* differs from the mission's by more than {CERTAIN_SIGMAS:g} sigmas")
+    lines += ["", "Not observable:"]
+    lines += [f"  {each.name}: {each.reason}." for each in not_observable_of(result)]
+    lines += ["", *(f"Note: {each}." for each in notes(result))]
+    return "\n".join(lines).rstrip()
+
+
+def _residual_lines(found: "Calibration") -> list[str]:
+    lines = ["Residuals per axis, rms (with the present mission file -> calibrated):"]
+    lines += [
+        (
+            f"  {each.tracker}: {each.before_arcsec:.2f} -> {each.after_arcsec:.2f} "
+            f"arcsec, {each.before_over_sigma:.2f} -> {each.after_over_sigma:.2f} sigmas, "
+            f"{each.stars} stars"
+        )
+        for each in residuals_by_tracker(found)
+    ]
+    lines.append(f"  together, per degree of freedom: {found.residual_over_sigma:.3f} sigmas")
+    return lines
+
+
+def calibration_json(result: "CalibrationRun") -> dict[str, Any]:
+    """The result as `GET /api/v1/calibrations/{id}` has it, with its covariance."""
+    found: dict[str, Any] = msgspec.to_builtins(result_of(result))
+    return found | {"covariance": result.covariance.tolist()}
+
+
+WORDS = {"good": "attitudes good", "suspect": "attitudes suspect", "none": "no attitude"}
+
+
+def progress_text(progress: ReprocessProgress) -> str:
+    """The number of processed batches."""
+    done = (
+        f"{progress.recorded} recorded, {progress.before} there already, {progress.refused} refused"
+    )
+    return f"run {progress.run}, of {progress.total} batches:\n  {done}"
+
+
+def comparison_text(compared: RunComparison) -> str:
+    """The stars and attitudes of both runs."""
+    stars, attitudes = compared.stars, compared.attitudes
+    observed = stars.observed or 1
+    lines = [
+        "",
+        f"{'':<26}{compared.run or 'every run':>16}{compared.other:>28}",
+        f"{'batches in both':<26}{compared.batches:>16}{compared.batches:>28}",
+        f"{'stars':<26}{stars.observed:>16}{stars.observed:>28}",
+    ]
+    for outcome in ("unique", "ambiguous", "unmatched"):
+        before, after = (getattr(each, outcome) for each in (stars.before, stars.after))
+        lines.append(f"  {outcome:<24}{_share(before, observed):>16}{_share(after, observed):>28}")
+    for status, name in WORDS.items():
+        before, after = (getattr(each, status) for each in (attitudes.before, attitudes.after))
+        lines.append(f"{name:<26}{before:>16}{after:>28}")
+    angle = attitudes.angle_arcsec
+    if angle is not None:
+        lines += ["", f"angle between the {attitudes.in_both} attitudes that both have:"]
+        lines.append(
+            f"  median {angle.median:.3f}″, 95 % within {angle.p95:.3f}″, at most {angle.max:.3f}″"
+        )
+    changed = [each for each in stars.transitions if each.is_change]
+    if changed:
+        lines += ["", "stars that came out otherwise:"]
+        lines += [f"  {each.stars:>8}  {_words(each)}" for each in changed]
+    elif compared.batches:
+        lines += ["", "every star came out alike"]
+    return "\n".join(lines)
+
+
+def _share(count: int, observed: int) -> str:
+    return f"{count} ({100 * count / observed:.2f} %)"
+
+
+def _words(each: RunTransition) -> str:
+    if each.before == each.after:
+        return "unique in both, but not the same star"
+    return f"{each.before} before, {each.after} after"
+
+
+_HEADING = (
+    f"{'track':<24}{'middle':<26}{'points':>6}  {'RA, Dec':<24}"
+    f"{'rate, arcsec/s':>20}  {'magnitude':>13}"
+)
+
+
+def tracks_text(found: TrackList) -> str:
+    """The tracks as a table."""
+    counts = (
+        f"{found.batches:,} batches, {found.without_attitude:,} without attitude; "
+        f"{found.unexplained:,} unmatched stars, {found.linked:,} of them on tracks"
+    )
+    return "\n".join([counts, _HEADING, *map(_line, found.items)] if found.items else [counts])
+
+
+def _line(track: Track) -> str:
+    name = track.planet or track.kind.replace("_", " ")
+    rate = f"{track.rate_arcsec_per_s:.4f} ± {track.sigma_rate_arcsec_per_s:.4f}"
+    magnitude = "–" if track.magnitude is None else f"{track.magnitude:.2f}"
+    if track.sigma_magnitude is not None:
+        magnitude += f" ± {track.sigma_magnitude:.2f}"
+    place = f"{track.ra_deg:.5f}° {track.dec_deg:+.5f}°"
+    return (
+        f"{name:<24}{track.time:<26}{len(track.points):>6}  {place:<24}{rate:>20}  {magnitude:>13}"
+    )

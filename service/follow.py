@@ -1,0 +1,303 @@
+"""Follows a stream of NATS JetStream: a durable consumer whose messages go to a service.
+
+    stream ──► consumer ──► follower ──► service ──► committed ──► acknowledged
+                               └──► refused: subject of refusals, and terminated
+
+A message is a batch or a gyro block, as JSON.  It is acknowledged after the service has committed
+it; one that is delivered again, because a follower ended in between, gets the stored answer.
+Several followers of one consumer share its messages: the distributed queue is that of NATS.
+"""
+
+import asyncio
+import json
+import logging
+import ssl
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import nats
+from acquire_client import AsyncClient
+from acquire_client import errors as answers
+from acquire_client.encoding import path_of
+from acquire_client.retrying import Repeat
+from nats.aio.client import Client
+from nats.aio.msg import Msg
+from nats.errors import Error as NatsError
+from nats.js import JetStreamContext
+from nats.js.api import AckPolicy, ConsumerConfig
+from nats.js.errors import NoStreamResponseError, NotFoundError
+from prometheus_client import CollectorRegistry, Counter, Gauge
+
+from service.errors import BadConfiguration
+from service.gyro import is_gyro_line
+
+ACK_WAIT_S = 30.0
+"""After so long without a sign from its follower a message is delivered to another one."""
+BEAT_S = 10.0
+FETCH_S = 1.0
+PAUSE_S = 1.0
+TRIES = 5
+"""Deliveries of a message at which the service fails, before it is refused."""
+STATE_EVERY_S = 5.0
+SEQUENCE, DELIVERED = "Acquire-Sequence", "Acquire-Delivered"
+"""Headers of refusals and answers: the message's place in its stream, and its deliveries."""
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Source:
+    """The stream, consumer and subjects that a follower uses."""
+
+    servers: str
+    stream: str
+    consumer: str
+    refusals: str
+    """The subject that refused messages go to, with the problem."""
+    answers: str | None = None
+    """The subject that answers are published to; None: to none."""
+    credentials: Path | None = None
+    authority: Path | None = None
+    """The certificate of the authority that NATS is trusted by; None: those of the system."""
+    concurrency: int = 16
+    """Messages that are at work together."""
+
+
+class Metrics:
+    """Counters of a follower for Prometheus, and for its summary."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self._messages = Counter(
+            "starid_follow_messages",
+            "Messages of the stream by what came of them: recorded, repeated or refused.",
+            ["outcome"],
+            registry=self.registry,
+        )
+        self._redelivered = Counter(
+            "starid_follow_redelivered",
+            "Messages that had been delivered before.",
+            registry=self.registry,
+        )
+        self._lag = Gauge(
+            "starid_follow_lag",
+            "Messages of the stream that the consumer has not delivered yet.",
+            registry=self.registry,
+        )
+        self.counts = dict.fromkeys(("recorded", "repeated", "refused", "redelivered"), 0)
+        self.lag = 0
+
+    def count(self, outcome: str) -> None:
+        """Count a message that is done."""
+        self.counts[outcome] += 1
+        self._messages.labels(outcome).inc()
+
+    def count_redelivered(self) -> None:
+        """Count a message that another follower had before."""
+        self.counts["redelivered"] += 1
+        self._redelivered.inc()
+
+    def set_lag(self, pending: int) -> None:
+        """Note how many messages the consumer has still to deliver."""
+        self.lag = pending
+        self._lag.set(pending)
+
+
+class Follower:
+    """Takes messages until it is stopped; what it has not finished then goes to another one."""
+
+    def __init__(
+        self,
+        source: Source,
+        client: AsyncClient,
+        metrics: Metrics,
+        progress: Callable[[Metrics], object] = lambda metrics: None,
+    ) -> None:
+        """`progress` is called every few seconds."""
+        self._source, self._client = source, client
+        self._metrics, self._progress = metrics, progress
+        self._stopped = asyncio.Event()
+
+    def stop(self) -> None:
+        """Take no more messages, and end after those at work."""
+        self._stopped.set()
+
+    async def run(self, until_empty: bool = False) -> None:
+        """Follow the stream; with `until_empty`, until nothing is left to deliver.
+
+        Raises `BadConfiguration` where NATS has no such stream or refuses the connection, or the
+        token may not submit, and what the client raises where the service wants another token.
+        """
+        if "submit" not in (await self._client.session()).scopes:
+            raise BadConfiguration("ACQUIRE_TOKEN: the token lacks the scope `submit`")
+        connection = await self._connected()
+        try:
+            stream = connection.jetstream()
+            await self._require_consumer(stream)
+            subscription = await stream.pull_subscribe_bind(
+                consumer=self._source.consumer, stream=self._source.stream
+            )
+            beside = asyncio.create_task(self._report(stream))
+            try:
+                while not self._stopped.is_set():
+                    try:
+                        fetched = await subscription.fetch(
+                            self._source.concurrency, timeout=FETCH_S
+                        )
+                    except TimeoutError:
+                        if until_empty and await self._is_empty(stream):
+                            return
+                        continue
+                    except NatsError as error:
+                        log.warning("no messages come now: %s", error)
+                        await asyncio.sleep(PAUSE_S)
+                        continue
+                    async with asyncio.TaskGroup() as tasks:
+                        for message in fetched:
+                            tasks.create_task(self._take(stream, message))
+            finally:
+                beside.cancel()
+        finally:
+            with suppress(NatsError, OSError, TimeoutError):
+                # The client may not have sent the last acknowledgements yet.
+                await connection.flush(timeout=5)
+            await connection.close()
+
+    async def _connected(self) -> Client:
+        source = self._source
+        context = None
+        if source.authority is not None or source.servers.startswith("tls://"):
+            context = ssl.create_default_context(cafile=source.authority)
+
+        async def note(error: Exception) -> None:
+            log.warning("NATS: %s", error)
+
+        try:
+            return await nats.connect(
+                source.servers,
+                name=f"acquire follow {source.consumer}",
+                user_credentials=None if source.credentials is None else str(source.credentials),
+                tls=context,
+                max_reconnect_attempts=-1,
+                reconnect_time_wait=PAUSE_S,
+                error_cb=note,
+                allow_reconnect=True,
+                connect_timeout=5,
+            )
+        except (NatsError, OSError, ssl.SSLError) as error:
+            raise BadConfiguration(f"{source.servers}: NATS cannot be reached: {error}") from None
+
+    async def _require_consumer(self, stream: JetStreamContext) -> None:
+        """Make the durable consumer where there is none."""
+        source = self._source
+        try:
+            await stream.stream_info(source.stream)
+        except NotFoundError:
+            raise BadConfiguration(
+                f"{source.servers}: NATS has no stream {source.stream}"
+            ) from None
+        try:
+            await stream.consumer_info(source.stream, source.consumer)
+        except NotFoundError:
+            config = ConsumerConfig(
+                durable_name=source.consumer, ack_policy=AckPolicy.EXPLICIT, ack_wait=ACK_WAIT_S
+            )
+            await stream.add_consumer(source.stream, config)
+
+    async def _is_empty(self, stream: JetStreamContext) -> bool:
+        info = await stream.consumer_info(self._source.stream, self._source.consumer)
+        return not info.num_pending and not info.num_ack_pending
+
+    async def _report(self, stream: JetStreamContext) -> None:
+        while True:
+            with suppress(NatsError, TimeoutError):
+                info = await stream.consumer_info(self._source.stream, self._source.consumer)
+                self._metrics.set_lag(info.num_pending or 0)
+            self._progress(self._metrics)
+            await asyncio.sleep(STATE_EVERY_S)
+
+    # ---- one message -------------------------------------------------------------------------
+
+    async def _take(self, stream: JetStreamContext, message: Msg) -> None:
+        if message.metadata.num_delivered > 1:
+            self._metrics.count_redelivered()
+        beat = asyncio.create_task(self._keep(message))
+        try:
+            await self._settle(stream, message)
+        except NatsError as error:
+            # It is delivered again, and then found to be recorded.
+            log.warning("message %d is not settled: %s", message.metadata.sequence.stream, error)
+        finally:
+            beat.cancel()
+
+    async def _keep(self, message: Msg) -> None:
+        """Let no other follower have the message while the service is at work on it."""
+        while True:
+            await asyncio.sleep(BEAT_S)
+            with suppress(NatsError):
+                await message.in_progress()
+
+    async def _settle(self, stream: JetStreamContext, message: Msg) -> None:
+        while not self._stopped.is_set():
+            try:
+                body, is_repeated = await self._submitted(message.data)
+            except answers.Unauthenticated:
+                # Of the token, not of the message: that waits for a follower that may.
+                await message.nak()
+                raise
+            except (answers.Busy, answers.RateLimited, answers.NoAnswer) as error:
+                log.warning("the service does not take messages now: %s", error)
+                await asyncio.sleep(PAUSE_S)
+            except answers.Problem as problem:
+                is_last = message.metadata.num_delivered >= TRIES
+                if isinstance(problem, answers.ServiceFailed) and not is_last:
+                    await message.nak(PAUSE_S)
+                    return
+                await self._publish(stream, self._source.refusals, message, _refusal(problem))
+                await message.term()
+                self._metrics.count("refused")
+                return
+            else:
+                if self._source.answers is not None:
+                    await self._publish(stream, self._source.answers, message, body)
+                await message.ack()
+                self._metrics.count("repeated" if is_repeated else "recorded")
+                return
+        await message.nak()
+
+    async def _submitted(self, sent: bytes) -> tuple[bytes, bool]:
+        """The answer of the service once it has committed, and whether it had it before."""
+        path, body = path_of("batches"), sent
+        if is_gyro_line(sent):
+            block = json.loads(sent)
+            path = path_of("spacecraft", str(block.pop("spacecraft", "")), "gyro")
+            body = json.dumps(block).encode()
+        response = await self._client.request("POST", path, body=body, repeat=Repeat.ALWAYS)
+        return response.content, response.headers.get("Replayed") == "true"
+
+    async def _publish(
+        self, stream: JetStreamContext, subject: str, message: Msg, body: bytes
+    ) -> None:
+        """Publish about a message; a stream that keeps the subject takes it once."""
+        place = message.metadata
+        headers = {
+            "Nats-Msg-Id": f"{place.stream}-{place.sequence.stream}-{subject}",
+            SEQUENCE: str(place.sequence.stream),
+            DELIVERED: str(place.num_delivered),
+        }
+        try:
+            await stream.publish(subject, body, headers=headers)
+        except NoStreamResponseError:
+            log.debug("no stream keeps %s: who listens now hears of it", subject)
+
+
+def _refusal(problem: answers.Problem) -> bytes:
+    """The problem of a refused message."""
+    errors = [
+        {"field": each.field, "message": each.message, "value": each.value}
+        for each in problem.errors or ()
+    ]
+    told = {"type": problem.type, "status": problem.status, "detail": problem.detail}
+    return json.dumps(told | {"errors": errors}).encode()

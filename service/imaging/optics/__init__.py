@@ -1,1 +1,0 @@
-"""Images of a point source through an aperture."""

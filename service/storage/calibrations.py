@@ -1,0 +1,397 @@
+"""Calibrations in the records: what was found, and what an operator adopted of it."""
+
+import json
+from collections.abc import Collection
+from typing import Annotated, ClassVar, Literal
+
+import msgspec
+from pydantic import Field
+from sqlalchemy import Connection, Select, func, insert, select, update
+
+from service.errors import NotFound, shown_value
+from service.storage.models.base import (
+    Components,
+    Count,
+    Digest,
+    Id,
+    MissionSettings,
+    Moment,
+    Page,
+    Record,
+    Stamp,
+    doc,
+)
+from service.storage.recording.ids import following_ulid
+from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
+from service.storage.sql.columns import Row
+from service.storage.sql.statements import execute
+
+CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
+UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag", "magnitude"]
+Terms = Annotated[
+    list[Components],
+    doc("Powers of the measured h and v in degrees, and the coefficient, as in mission files."),
+]
+
+
+class FocalPlane(Record, frozen=True, kw_only=True):
+    """A tracker's focal-plane calibration, as in mission files."""
+
+    component: ClassVar[str] = "FocalPlane"
+    scale: float
+    h_terms: Terms
+    v_terms: Terms
+
+
+class TrackerMagnitudes(Record, frozen=True, kw_only=True):
+    """A tracker's magnitude calibration, as in mission files."""
+
+    component: ClassVar[str] = "TrackerMagnitudes"
+    zero_mag: float
+    scale: float
+    color_mag: float
+
+
+class TrackerGeometry(Record, frozen=True, kw_only=True):
+    """Alignment, focal plane and magnitudes of a tracker, as in mission files."""
+
+    component: ClassVar[str] = "TrackerGeometry"
+    name: str
+    x_axis_body: Components
+    y_axis_body: Components
+    z_axis_body: Components
+    calibration: FocalPlane
+    magnitudes: Annotated[
+        TrackerMagnitudes | None, doc("Null: as the mission file has them (earlier versions).")
+    ] = None
+
+
+class CalibrationBatches(Record, frozen=True, kw_only=True):
+    """The batches that a calibration came from."""
+
+    component: ClassVar[str] = "CalibrationBatches"
+    total: Annotated[Count, doc("Batches in the period.")]
+    sampled: Annotated[Count, doc("Batches that were processed again.")]
+    used: Annotated[Count, doc("Batches with identified stars.")]
+    refused: Annotated[Count, doc("Batches that no longer fit the mission.")]
+    first: Moment | None
+    last: Moment | None
+
+
+class CalibrationHeldOut(Record, frozen=True, kw_only=True):
+    """How well a distortion of a degree predicts blocks of time that it was not fitted to."""
+
+    component: ClassVar[str] = "CalibrationHeldOut"
+    degree: Count
+    residual_over_sigma: float
+    chosen: bool
+
+
+class CalibrationResiduals(Record, frozen=True, kw_only=True):
+    """Root mean square of a tracker's residuals per axis, before and after."""
+
+    component: ClassVar[str] = "CalibrationResiduals"
+    tracker: str
+    stars: Count
+    before_arcsec: float
+    after_arcsec: float
+    before_over_sigma: float
+    after_over_sigma: float
+
+
+class CalibrationUnknown(Record, frozen=True, kw_only=True):
+    """An estimated correction to the settings that the calibration started from."""
+
+    component: ClassVar[str] = "CalibrationUnknown"
+    name: str
+    tracker: str
+    kind: UnknownKind
+    value: float
+    sigma: Annotated[float, doc("One standard deviation.")]
+    unit: str
+
+
+class CalibrationNotObservable(Record, frozen=True, kw_only=True):
+    """Something that the stars cannot show, and why."""
+
+    component: ClassVar[str] = "CalibrationNotObservable"
+    name: str
+    reason: str
+
+
+class ResidualCell(Record, frozen=True, kw_only=True):
+    """Mean residuals of the stars in a cell of the focal plane, observed minus predicted."""
+
+    component: ClassVar[str] = "ResidualCell"
+    h_deg: Annotated[float, doc("Of the cell's centre.")]
+    v_deg: float
+    stars: Count
+    before_arcsec: Annotated[list[float], Field(min_length=2, max_length=2, description="h, v.")]
+    after_arcsec: Annotated[list[float], Field(min_length=2, max_length=2, description="h, v.")]
+
+
+class ResidualMap(Record, frozen=True, kw_only=True):
+    """A tracker's residuals over its focal plane; cells without stars are left out."""
+
+    component: ClassVar[str] = "ResidualMap"
+    tracker: str
+    radius_deg: float
+    step_deg: Annotated[float, doc("The width of a cell.")]
+    cells: list[ResidualCell]
+
+
+class CalibrationResult(Record, frozen=True, kw_only=True):
+    """What the stars say of the trackers."""
+
+    component: ClassVar[str] = "CalibrationResult"
+    batches: CalibrationBatches
+    stars: Count
+    stars_left_out: Annotated[Count, doc("Stars that were left out as wrong.")]
+    degree: Annotated[Count, doc("Of the distortion; 0: none.")]
+    held_out: Annotated[list[CalibrationHeldOut], doc("Empty where the degree was given.")]
+    residual_over_sigma: Annotated[float, doc("Per degree of freedom.")]
+    residuals: list[CalibrationResiduals]
+    unknowns: list[CalibrationUnknown]
+    not_observable: list[CalibrationNotObservable]
+    notes: Annotated[list[str], doc("What a mission file cannot hold of it.")]
+    maps: list[ResidualMap]
+    trackers: Annotated[list[TrackerGeometry], doc("Every tracker of the mission, calibrated.")]
+    mission_file: Annotated[str, doc("The lines for the mission file, as TOML.")]
+
+
+class CalibrationProgress(Record, frozen=True, kw_only=True):
+    """What every calibration has from its start on."""
+
+    id: Id
+    spacecraft: str
+    version: Annotated[Count, doc("From 1 for each spacecraft.")]
+    run: str
+    state: CalibrationStateName
+    who: str
+    created: Stamp
+    ended: Stamp | None
+    done: Annotated[Count, doc("Batches that have been processed again.")]
+    total: Count
+    mission: Annotated[Digest, doc("The settings that it started from.")]
+
+
+class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
+    """A calibration without its covariance and maps; `result` fields are null until it is done."""
+
+    component: ClassVar[str] = "CalibrationSummary"
+    fault: str | None
+    residual_over_sigma: float | None
+    degree: Count | None
+    first: Annotated[Moment | None, doc("Time of the earliest batch.")]
+    last: Moment | None
+    unknowns: list[CalibrationUnknown]
+    trackers: list[TrackerGeometry]
+
+
+class Calibration(CalibrationProgress, frozen=True, kw_only=True):
+    """A calibration: what was asked, how far it is, and what was found."""
+
+    component: ClassVar[str] = "Calibration"
+    request: MissionSettings
+    fault: str | None
+    result: CalibrationResult | None
+    covariance: Annotated[
+        list[list[float]] | None, doc("Of the unknowns, in their order and units.")
+    ]
+
+
+class CalibrationPage(Record, frozen=True, kw_only=True):
+    """A page of calibrations, newest first."""
+
+    component: ClassVar[str] = "CalibrationPage"
+    items: list[CalibrationSummary]
+    next_cursor: str | None
+
+
+class CalibrationAdoption(Record, frozen=True, kw_only=True):
+    """A change of the calibration in force, by whom and when."""
+
+    component: ClassVar[str] = "CalibrationAdoption"
+    id: Id
+    spacecraft: str
+    adopted: Stamp
+    who: str
+    note: str
+    calibration: Annotated[Id | None, doc("Null: back to the mission file.")]
+    version: Annotated[Count | None, doc("The version of the calibration.")]
+    file: Annotated[Digest, doc("The mission file's own settings at that time.")]
+    mission: Annotated[Digest, doc("The settings in force since then.")]
+    trackers: list[TrackerGeometry] | None
+
+
+class CalibrationInForce(Record, frozen=True, kw_only=True):
+    """The calibration that new batches of a spacecraft use, and what held before."""
+
+    component: ClassVar[str] = "CalibrationInForce"
+    spacecraft: str
+    mission: Annotated[Digest, doc("The settings in force.")]
+    calibration: Annotated[Id | None, doc("Null: the mission file holds.")]
+    overridden: Annotated[
+        bool, doc("Whether the mission file was changed after the adoption, so that it holds.")
+    ]
+    history: Annotated[list[CalibrationAdoption], doc("Newest first.")]
+
+
+_GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])
+_RESULT = msgspec.json.Decoder(CalibrationResult)
+UNFINISHED = ("queued", "running")
+_NEWEST_ADOPTION = "SELECT max(id) FROM calibration_adoptions"
+_PLAIN = (
+    "id",
+    "spacecraft",
+    "version",
+    "run",
+    "state",
+    "who",
+    "created",
+    "ended",
+    "done",
+    "total",
+    "fault",
+)
+_SUMMARY = tuple(calibrations.c[name] for name in (*_PLAIN, "mission_digest", "result"))
+
+
+def add_calibration(connection: Connection, row: Row) -> None:
+    """Record a calibration that begins, as the next version of its spacecraft."""
+    latest = select(func.max(calibrations.c.version)).where(
+        calibrations.c.spacecraft == row["spacecraft"]
+    )
+    version = int(connection.scalar(latest) or 0) + 1
+    connection.execute(insert(calibrations), row | {"version": version})
+
+
+def change_calibration(connection: Connection, id: str, changes: Row) -> None:
+    """Note the progress of a calibration, or its end."""
+    connection.execute(update(calibrations).where(calibrations.c.id == id).values(changes))
+
+
+def unfinished_calibrations(connection: Connection) -> set[str]:
+    """The ids of the calibrations that are computed, or wait for that."""
+    unfinished = calibrations.c.state.in_(UNFINISHED)
+    return set(connection.scalars(select(calibrations.c.id).where(unfinished)))
+
+
+def interrupt_calibrations(
+    connection: Connection, now: str, only: Collection[str] | None = None
+) -> None:
+    """Close the calibrations that a stopped process left unfinished; with `only`, of these alone.
+
+    One that another process is at work on is set to what it came to when that process ends it.
+    """
+    left = [calibrations.c.state.in_(UNFINISHED)]
+    if only is not None:
+        left.append(calibrations.c.id.in_(only))
+    connection.execute(update(calibrations).where(*left).values(state="interrupted", ended=now))
+
+
+def read_calibration(connection: Connection, id: str) -> Calibration:
+    """One calibration with all that was found; raises `NotFound`."""
+    row = connection.execute(select(calibrations).where(calibrations.c.id == id)).mappings().first()
+    if row is None:
+        raise NotFound(f"there is no calibration with the id {shown_value(id)}")
+    return Calibration(
+        **{name: row[name] for name in _PLAIN},
+        mission=row["mission_digest"],
+        request=json.loads(row["request"]),
+        result=None if row["result"] is None else _RESULT.decode(row["result"]),
+        covariance=None if row["covariance"] is None else json.loads(row["covariance"]),
+    )
+
+
+def list_calibrations(
+    connection: Connection, spacecraft: str | None, limit: int, cursor: str | None
+) -> Page[CalibrationSummary]:
+    """Calibrations, newest first; a cursor is the id of the last one shown."""
+    query = select(*_SUMMARY).order_by(calibrations.c.id.desc()).limit(limit + 1)
+    if spacecraft is not None:
+        query = query.where(calibrations.c.spacecraft == spacecraft)
+    if cursor is not None:
+        query = query.where(calibrations.c.id < cursor)
+    rows = [_summary(dict(row)) for row in connection.execute(query).mappings()]
+    return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+
+
+def _summary(row: Row) -> CalibrationSummary:
+    found = None if row["result"] is None else _RESULT.decode(row["result"])
+    return CalibrationSummary(
+        **{name: row[name] for name in _PLAIN},
+        mission=row["mission_digest"],
+        residual_over_sigma=None if found is None else found.residual_over_sigma,
+        degree=None if found is None else found.degree,
+        first=None if found is None else found.batches.first,
+        last=None if found is None else found.batches.last,
+        unknowns=found.unknowns if found else [],
+        trackers=found.trackers if found else [],
+    )
+
+
+def add_adoption(connection: Connection, row: Row) -> None:
+    """Record a change of the calibration in force."""
+    connection.execute(insert(calibration_adoptions), row)
+
+
+def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationAdoption]:
+    """What a spacecraft's calibration was from when on, newest first."""
+    query = _adoptions().where(calibration_adoptions.c.spacecraft == spacecraft)
+    return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
+
+
+def newest_adoption(connection: Connection) -> str:
+    """The id of the last change of any spacecraft; empty where there was none."""
+    ((newest,),) = execute(connection, _NEWEST_ADOPTION)
+    return newest or ""
+
+
+def begin_adoption(connection: Connection, id: str) -> str:
+    """An id for a change, at least this one: it follows all others, whatever clocks say.
+
+    Until the end of the transaction no other process adds one.
+    """
+    if connection.dialect.name == "postgresql":
+        connection.exec_driver_sql("LOCK TABLE calibration_adoptions IN SHARE ROW EXCLUSIVE MODE")
+    newest = newest_adoption(connection)
+    return id if id > newest else following_ulid(newest)
+
+
+def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:
+    """The last change of every spacecraft."""
+    latest = select(func.max(calibration_adoptions.c.id)).group_by(
+        calibration_adoptions.c.spacecraft
+    )
+    query = _adoptions().where(calibration_adoptions.c.id.in_(latest))
+    return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
+
+
+def _adoptions() -> Select[tuple[object, ...]]:
+    return (
+        select(calibration_adoptions, calibrations.c.version)
+        .join_from(
+            calibration_adoptions,
+            calibrations,
+            calibration_adoptions.c.calibration_id == calibrations.c.id,
+            isouter=True,
+        )
+        .order_by(calibration_adoptions.c.id.desc())
+    )
+
+
+def _adoption(row: Row) -> CalibrationAdoption:
+    trackers = row["trackers"]
+    return CalibrationAdoption(
+        id=row["id"],
+        spacecraft=row["spacecraft"],
+        adopted=row["adopted"],
+        who=row["who"],
+        note=row["note"],
+        calibration=row["calibration_id"],
+        version=row["version"],
+        file=row["file_digest"],
+        mission=row["mission_digest"],
+        trackers=None if trackers is None else _GEOMETRIES.decode(trackers),
+    )

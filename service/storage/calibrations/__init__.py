@@ -1,1 +1,0 @@
-"""Calibrations in the records: what was found, and what was adopted of it."""

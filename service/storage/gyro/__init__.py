@@ -1,1 +1,0 @@
-"""Gyro blocks in the records."""

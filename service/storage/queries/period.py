@@ -1,0 +1,346 @@
+"""The batches of a period: a bounded sample of them, and the arrays that its charts show.
+
+Nothing is identified here.  Directions are computed from what was sent, with the
+settings of the mission as they were for each result.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+import numpy.typing as npt
+from sqlalchemy import BigInteger, Connection, Select, bindparam, select
+
+from service.acquire.choices import aberration_velocity
+from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
+from service.missions.mission import Mission, Tracker
+from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.calibrate import CorrectedObservations, correct
+from service.observations.schema import submission_from_json
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import apparent, sun_direction
+from service.sky.model import SkyModel
+from service.sky.zones import SearchRegion
+from service.storage.models.answers import Answer, Star
+from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
+from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.results import answer_from_json
+from service.storage.queries.time_buckets import BucketFilter, read_buckets
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import batches, results
+from service.times import HOUR_S, utc_of_unix
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Matrix,
+    Vector,
+    angle_between_deg,
+    matrix_from_quaternion,
+    unit,
+)
+
+MOST_READ = 600
+"""Batches that are read in full: their stars take less than a second."""
+
+_SHOWN: Select[tuple[str, str, int, str, str]] = select(
+    results.c.answer,
+    results.c.mission_digest,
+    results.c.time_ns,
+    results.c.batch_id,
+    batches.c.input,
+).join_from(results, batches, results.c.batch_id == batches.c.id)
+_FROM_NS = bindparam("from_ns", type_=BigInteger)
+
+
+@dataclass(frozen=True)
+class PeriodSample:
+    """Rows of some of `total` batches in order of time, with their missions by digest.
+
+    `follows` (b,) says whether no other batch lies between one and that before it.
+    """
+
+    total: int
+    follows: npt.NDArray[np.bool_]
+    rows: tuple[Row, ...]
+    missions: dict[str, Mission]
+
+
+def sample_period(
+    connection: Connection, span: BucketFilter, most: int = MOST_READ
+) -> PeriodSample:
+    """All batches of a period, or pairs of neighbours spread evenly, at most `most` batches.
+
+    Where the pairs are is drawn, one from each of equal parts of the batches, so that
+    nothing periodic is met always or never.  The batches of an hour count as spread evenly
+    over it.  Of a long period its hours are read, and no more batches than of a short one.
+    """
+    hours = read_buckets(connection, span, "hour", ("batches",))
+    total = int(hours["batches"].sum())
+    selected = ResultFilter(span.run, span.spacecraft, span.start, span.end)
+    query = _SHOWN.order_by(*PLACE)
+    if total <= most:
+        rows = _rows(connection, query.where(*selected.conditions()).limit(most))
+        follows = np.arange(len(rows)) > 0
+    else:
+        drawn = _drawn_times_ns(hours["unix_s"], hours["batches"], most // 2)
+        # The first hour may begin before the period.
+        pairs = _pairs(connection, selected, [max(each, span.start.tai_ns) for each in drawn])
+        chosen = {id for pair in pairs for id in pair}
+        # Without the period, through which the ids would be looked for one after another.
+        own = (results.c.current, results.c.batch_id.in_(chosen))
+        rows = _rows(connection, query.where(*own))
+        ids = [row["batch_id"] for row in rows]
+        follows = np.array([False, *(pair in pairs for pair in pairwise(ids))])
+    digests = {row["mission_digest"] for row in rows}
+    missions = {digest: recorded_mission(connection, digest) for digest in digests}
+    return PeriodSample(total, follows, tuple(rows), missions)
+
+
+def _drawn_times_ns(
+    unix_s: npt.NDArray[np.float64], count: npt.NDArray[np.float64], pairs: int
+) -> list[int]:
+    """A moment in each of so many parts that have equally many of the hours' batches."""
+    rng = np.random.default_rng(0)
+    rank = (np.arange(pairs) + rng.random(pairs)) * count.sum() / pairs
+    before = np.concatenate([[0.0], np.cumsum(count)])
+    place = np.clip(np.searchsorted(before, rank, side="right") - 1, 0, len(count) - 1)
+    at_s = unix_s[place] + (rank - before[place]) / count[place] * HOUR_S
+    return [utc_of_unix(each).tai_ns for each in at_s.tolist()]
+
+
+def _pairs(
+    connection: Connection, selected: ResultFilter, begins_ns: Sequence[int]
+) -> set[tuple[str, str]]:
+    """The first two batches from each moment on; near the end of the period the last two."""
+    forward = (
+        select(results.c.batch_id)
+        # With one lower bound alone the index is entered at it.
+        .where(*replace(selected, start=None).conditions(), results.c.time_ns >= _FROM_NS)
+        .order_by(*PLACE)
+        .limit(2)
+    )
+    backward = (
+        select(results.c.batch_id)
+        .where(*selected.conditions())
+        .order_by(*(column.desc() for column in PLACE))
+        .limit(2)
+    )
+    found = set()
+    for begin_ns in begins_ns:
+        pair = [row[0] for row in connection.execute(forward, {"from_ns": begin_ns})]
+        if len(pair) < 2:
+            pair = [row[0] for row in connection.execute(backward)][::-1]
+        found.add((pair[0], pair[1]))
+    return found
+
+
+def _rows(connection: Connection, query: Select[tuple[str, str, int, str, str]]) -> list[Row]:
+    return [dict(row) for row in connection.execute(query).mappings()]
+
+
+LEAST_EXPECTED = 0.1
+"""Of a star's sigma.  A star that the attitude all but follows says nothing of the noise."""
+ALIGNED_DEG = 0.01
+_UNKNOWN_DIRECTION = (np.nan, np.nan, np.nan)
+
+
+@dataclass
+class _Collected:
+    """The parts of one tracker's arrays, batch by batch."""
+
+    tracker: Tracker
+    boresight: list[Vector]
+    place_deg: list[Vector] = field(default_factory=list)
+    residual_arcsec: list[Vector] = field(default_factory=list)
+    expected_arcsec: list[Vector] = field(default_factory=list)
+    observed_mag: list[Vector] = field(default_factory=list)
+    catalog_mag: list[Vector] = field(default_factory=list)
+    region: SearchRegion | None = None
+
+
+class _Catalogs:
+    """Run catalogs by epoch, with the rows of their stars by name."""
+
+    def __init__(self, sky: SkyModel) -> None:
+        self._sky = sky
+        self._rows: dict[str, dict[str, int]] = {}
+
+    def of(self, mission: Mission, batch: ObservationBatch) -> tuple[RunCatalog, dict[str, int]]:
+        run_catalog = self._sky.run_catalog(mission, batch.time)
+        rows = self._rows.get(run_catalog.digest)
+        if rows is None:
+            rows = {name: row for row, name in enumerate(run_catalog.star_id)}
+            self._rows[run_catalog.digest] = rows
+        return run_catalog, rows
+
+
+def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
+    """Attitudes, boresights, residuals and magnitudes of a sample of batches."""
+    catalogs = _Catalogs(sky)
+    read = [
+        (
+            submission_from_json(row["input"]).batch,
+            answer_from_json(row["answer"]),
+            sample.missions[row["mission_digest"]],
+        )
+        for row in sample.rows
+    ]
+    collected: dict[str, _Collected] = {}
+    other_catalog = 0
+    for place, (batch, answer, mission) in enumerate(read):
+        run_catalog, rows = catalogs.of(mission, batch)
+        is_known = run_catalog.digest == answer.provenance.run_catalog
+        other_catalog += not is_known
+        presumed = _presumed(batch, answer, mission)
+        for tracker in mission.trackers:
+            into = collected.setdefault(
+                tracker.name, _Collected(tracker, [np.array(_UNKNOWN_DIRECTION)] * len(read))
+            )
+            into.boresight[place] = _boresight(tracker, answer, presumed, mission)
+        for seen, found in zip(correct(batch, mission), answer.observations, strict=True):
+            into = collected[seen.tracker.name]
+            into.tracker = seen.tracker
+            into.region = _region(seen.tracker, presumed, mission)
+            if is_known:
+                _add(into, batch, answer, seen, found.stars, run_catalog, rows)
+    times = [batch.time for batch, _, _ in read]
+    return PeriodStars(
+        total=sample.total,
+        attitudes=_attitudes(sample, [answer for _, answer, _ in read]),
+        trackers=tuple(_joined(each) for each in collected.values()),
+        other_catalog=other_catalog,
+        sun=np.array([sun_direction(each.time, each.position_km) for each, _, _ in read]),
+        first=times[0] if times else None,
+        last=times[-1] if times else None,
+    )
+
+
+def _presumed(batch: ObservationBatch, answer: Answer, mission: Mission) -> PriorAttitude | None:
+    """The attitude about which stars were searched for; None where nothing gave one."""
+    prior = batch.a_priori
+    if answer.attitude is not None and answer.path != "zone":
+        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
+    return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
+
+
+def _boresight(
+    tracker: Tracker, answer: Answer, presumed: PriorAttitude | None, mission: Mission
+) -> Vector:
+    """Where a tracker looked, inertial; NaN where neither stars nor a priori knowledge tell."""
+    if answer.attitude is not None:
+        attitude = matrix_from_quaternion(answer.attitude.quaternion)
+    elif presumed is None or not _knows(tracker, presumed, mission):
+        return np.array(_UNKNOWN_DIRECTION)
+    else:
+        attitude = presumed.attitude
+    return np.asarray(tracker.boresight_body @ attitude)
+
+
+def _knows(tracker: Tracker, presumed: PriorAttitude, mission: Mission) -> bool:
+    """Whether a priori knowledge tells where a tracker looks: with the roll, or without it."""
+    off_deg = angle_between_deg(tracker.boresight_body, mission.axis_body)
+    return presumed.roll_known or bool(off_deg <= ALIGNED_DEG)
+
+
+def _region(
+    tracker: Tracker, presumed: PriorAttitude | None, mission: Mission
+) -> SearchRegion | None:
+    is_cap = mission.zone.kind == "cap"
+    if presumed is None or (is_cap and not _knows(tracker, presumed, mission)):
+        return None
+    return search_region(tracker, presumed, mission, "observations")
+
+
+def _add(
+    into: _Collected,
+    batch: ObservationBatch,
+    answer: Answer,
+    seen: CorrectedObservations,
+    stars: list[Star],
+    run_catalog: RunCatalog,
+    rows: dict[str, int],
+) -> None:
+    """Add the unique stars of one tracker of one batch."""
+    pairs = [(k, rows[each.star.id]) for k, each in enumerate(stars) if each.star is not None]
+    if not pairs:
+        return
+    own, row = np.array(pairs).T
+    turned = into.tracker.body_from_tracker
+    direction = seen.direction_body[own] @ turned
+    x, y, z = direction.T
+    into.place_deg.append(np.degrees(np.stack([np.arctan2(x, z), np.arctan2(y, z)], axis=1)))
+    into.observed_mag.append(seen.magnitude_mag[own])
+    into.catalog_mag.append(run_catalog.magnitude_mag[row])
+    residual, expected = np.full((2, len(own), 2), np.nan)
+    if answer.attitude is not None:
+        to_tracker = turned.T @ matrix_from_quaternion(answer.attitude.quaternion)
+        natural = run_catalog.direction_at(batch.time)[row]
+        predicted = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
+        covariance = turned.T @ np.array(answer.attitude.covariance_arcsec2) @ turned
+        residual, expected = _residuals(direction, predicted, covariance, seen.sigma_arcsec[own])
+        is_used = np.array([stars[k].residual_arcsec is not None for k in own.tolist()])
+        residual[~is_used] = expected[~is_used] = np.nan
+    into.residual_arcsec.append(residual)
+    into.expected_arcsec.append(expected)
+
+
+def _residuals(
+    direction: Vector, predicted: Vector, covariance_arcsec2: Matrix, sigma_arcsec: Vector
+) -> tuple[Vector, Vector]:
+    """Residuals (n, 2) along h and v, and their standard deviations.
+
+    All in tracker axes.  An attitude error e moves a direction d by e x d, that is along
+    the tangent h by e . v and along v by -e . h.  The optimal attitude takes up just so
+    much of the star's own noise, so that sigma^2 - v' P v remains along h.
+    """
+    along_h = unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
+    along_v = np.cross(direction, along_h)
+    off = (direction - predicted) * ARCSEC_PER_RADIAN
+    residual = np.stack([np.sum(off * along_h, axis=1), np.sum(off * along_v, axis=1)], axis=1)
+    taken = np.stack(
+        [
+            np.einsum("ni,ij,nj->n", along, covariance_arcsec2, along)
+            for along in (along_v, along_h)
+        ],
+        axis=1,
+    )
+    left = sigma_arcsec[:, None] ** 2 - taken
+    is_free = left > (LEAST_EXPECTED * sigma_arcsec[:, None]) ** 2
+    return residual, np.where(is_free, np.sqrt(np.where(is_free, left, 1.0)), np.nan)
+
+
+def _attitudes(sample: PeriodSample, answers: list[Answer]) -> PeriodAttitudes:
+    count = len(answers)
+    quaternion, covariance = np.full((count, 4), np.nan), np.full((count, 3, 3), np.nan)
+    for place, answer in enumerate(answers):
+        if answer.attitude is not None:
+            quaternion[place] = answer.attitude.quaternion
+            covariance[place] = answer.attitude.covariance_arcsec2
+    return PeriodAttitudes(
+        time_ns=np.array([row["time_ns"] for row in sample.rows], dtype=np.int64),
+        time=tuple(answer.time for answer in answers),
+        status=tuple(
+            "no_attitude" if answer.attitude is None else answer.attitude.status
+            for answer in answers
+        ),
+        quaternion=quaternion,
+        covariance_arcsec2=covariance,
+        follows=sample.follows,
+    )
+
+
+def _joined(parts: _Collected) -> TrackerStarsOfPeriod:
+    pairs, single = np.empty((0, 2)), np.empty(0)
+    return TrackerStarsOfPeriod(
+        tracker=parts.tracker.name,
+        field_of_view_radius_deg=parts.tracker.field_of_view_radius_deg,
+        sigma_arcsec=parts.tracker.sigma_arcsec,
+        boresight=np.stack(parts.boresight),
+        place_deg=np.concatenate([pairs, *parts.place_deg]),
+        residual_arcsec=np.concatenate([pairs, *parts.residual_arcsec]),
+        expected_arcsec=np.concatenate([pairs, *parts.expected_arcsec]),
+        observed_mag=np.concatenate([single, *parts.observed_mag]),
+        catalog_mag=np.concatenate([single, *parts.catalog_mag]),
+        region=parts.region,
+    )

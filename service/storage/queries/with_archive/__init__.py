@@ -1,1 +1,0 @@
-"""Queries over recorded and archived batches together."""

@@ -1,1 +1,0 @@
-"""Tracks of points that no catalog star explains: what is read for them, and their records."""

@@ -1,0 +1,226 @@
+"""Residuals of a tracker over its focal plane: of a period, and before and after a calibration."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from service.storage.calibrations import ResidualCell, ResidualMap
+from service.storage.models.charts import TrackerStarsOfPeriod
+from service.vectors import Vector
+
+SIZE = 420.0
+CELLS = 8
+"""Cells along each side of the square about the field of view."""
+LEAST_STARS = 5
+"""Fewer stars have no mean that is worth an arrow."""
+LONGEST = 1.1
+"""The length of the longest arrow, in cells."""
+CLEAR = 3.3
+"""Standard errors.  Of cells without any distortion one in 300 has so long a mean residual."""
+STEPS = (1.25, 1.5, 2.0, 3.0)
+"""Spread over what is expected, from which on a cell has the next shade."""
+ROUND = (1.0, 2.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One cell: its centre, its stars, their mean residual, and its spread over the expected.
+
+    `is_clear` says whether the mean is certainly not that of noise alone.
+    """
+
+    h_deg: float
+    v_deg: float
+    stars: int
+    mean_arcsec: tuple[float, float]
+    spread: float
+    is_clear: bool
+    x: float
+    y: float
+    shade: int
+    arrow: str
+    """A path; empty for too few stars."""
+
+
+@dataclass(frozen=True)
+class FocalPlaneMap:
+    """The map; `key_px` is the length of an arrow of `key_arcsec`."""
+
+    tracker: str
+    cells: tuple[Cell, ...]
+    stars: int
+    spread: float
+    radius_deg: float
+    key_arcsec: float
+    key_px: float
+    side: float = SIZE / CELLS
+    size: float = SIZE
+    steps: tuple[float, ...] = STEPS
+
+
+def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
+    """The map of a tracker; None where no star has a residual."""
+    known = np.isfinite(tracker.residual_arcsec[:, 0]) & np.isfinite(tracker.expected_arcsec).all(
+        axis=1
+    )
+    place, residual = tracker.place_deg[known], tracker.residual_arcsec[known]
+    expected, radius_deg = tracker.expected_arcsec[known], tracker.field_of_view_radius_deg
+    if not len(place):
+        return None
+    step_deg = 2.0 * radius_deg / CELLS
+    # Stars beyond the field of view belong to the cells at its edge.
+    number = np.clip(np.floor((place + radius_deg) / step_deg), 0, CELLS - 1).astype(int)
+    cell = number[:, 1] * CELLS + number[:, 0]
+    found = [_of_cell(residual[cell == k], expected[cell == k]) for k in np.unique(cell)]
+    lengths = [math.hypot(*mean) for count, mean, *_ in found if count >= LEAST_STARS]
+    longest = max(lengths, default=0.0)
+    px_per_arcsec = LONGEST * SIZE / CELLS / longest if longest else 0.0
+    cells = [
+        _drawn(int(k), each, radius_deg, px_per_arcsec)
+        for k, each in zip(np.unique(cell), found, strict=True)
+    ]
+    key_arcsec = round_below(longest)
+    return FocalPlaneMap(
+        tracker=tracker.tracker,
+        cells=tuple(cells),
+        stars=len(place),
+        spread=_spread(residual, expected),
+        radius_deg=radius_deg,
+        key_arcsec=key_arcsec,
+        key_px=key_arcsec * px_per_arcsec,
+    )
+
+
+_Found = tuple[int, tuple[float, float], float, bool]
+
+
+def _of_cell(residual: Vector, expected: Vector) -> _Found:
+    """Stars, mean residual, spread over the expected, and whether the mean is clear."""
+    mean = residual.mean(axis=0)
+    error = np.sqrt(np.mean(expected**2, axis=0) / len(residual))
+    spread = _spread(residual, expected)
+    # Noisier stars than expected have a less certain mean.
+    far = float(np.max(np.abs(mean) / error)) / max(spread, 1.0)
+    is_clear = len(residual) >= LEAST_STARS and far > CLEAR
+    return len(residual), (float(mean[0]), float(mean[1])), spread, is_clear
+
+
+def _spread(residual: Vector, expected: Vector) -> float:
+    """The root mean square of residuals over what is expected of them; 1 is normal."""
+    return float(np.sqrt(np.mean((residual / expected) ** 2)))
+
+
+def _drawn(number: int, found: _Found, radius_deg: float, px_per_arcsec: float) -> Cell:
+    row, column = divmod(number, CELLS)
+    stars, mean, spread, is_clear = found
+    side, step_deg = SIZE / CELLS, 2.0 * radius_deg / CELLS
+    x, y = (column + 0.5) * side, SIZE - (row + 0.5) * side
+    along, down = mean[0] * px_per_arcsec, -mean[1] * px_per_arcsec
+    return Cell(
+        h_deg=(column + 0.5) * step_deg - radius_deg,
+        v_deg=(row + 0.5) * step_deg - radius_deg,
+        stars=stars,
+        mean_arcsec=mean,
+        spread=spread,
+        is_clear=is_clear,
+        x=x,
+        y=y,
+        shade=sum(spread >= step for step in STEPS),
+        arrow=arrow(x - along / 2, y - down / 2, along, down) if stars >= LEAST_STARS else "",
+    )
+
+
+def arrow(x: float, y: float, along: float, down: float) -> str:
+    """The path of an arrow with its head."""
+    length = math.hypot(along, down)
+    if length < 1.0:
+        return f"M{x:.1f} {y:.1f}h0"
+    u, v = along / length, down / length
+    back, wide = min(6.0, length * 0.5), min(3.0, length * 0.3)
+    head_x, head_y = x + along - u * back, y + down - v * back
+    return (
+        f"M{x:.1f} {y:.1f}l{along:.1f} {down:.1f}"
+        f"M{head_x - v * wide:.1f} {head_y + u * wide:.1f}L{x + along:.1f} {y + down:.1f}"
+        f"L{head_x + v * wide:.1f} {head_y - u * wide:.1f}"
+    )
+
+
+def round_below(longest: float) -> float:
+    """The largest of 1, 2 and 5 times a power of ten that is not longer; 0 for nothing."""
+    if longest <= 0.0:
+        return 0.0
+    power = 10.0 ** math.floor(math.log10(longest))
+    return max(factor * power for factor in ROUND if factor * power <= longest * 1.000001)
+
+
+LONGEST_RESIDUAL = 1.3
+"""The length of the longest arrow, in cells."""
+
+Side = Literal["before", "after"]
+
+
+@dataclass(frozen=True)
+class ResidualPicture:
+    """One picture; `key_px` is the length of an arrow of `key_arcsec`, `shades` are cells."""
+
+    title: str
+    tracker: str
+    radius_deg: float
+    cells: tuple[tuple[float, float, int], ...]
+    """Left and upper edge, and the number of stars."""
+    side: float
+    arrows: str
+    key_arcsec: float
+    key_px: float
+    size: float = SIZE
+
+
+def residual_pictures(map: ResidualMap) -> tuple[ResidualPicture, ...]:
+    """Before, after at the same scale, and after with longer arrows.
+
+    A cell of fewer than `LEAST_STARS` has no arrow.
+    """
+    longest = {side: _longest(map.cells, side) for side in ("before", "after")}
+    return (
+        _picture("before", map, "before", longest["before"]),
+        _picture("after, same scale", map, "after", longest["before"]),
+        _picture("after, enlarged", map, "after", longest["after"]),
+    )
+
+
+def _of(cell: ResidualCell, side: str) -> Sequence[float]:
+    return cell.before_arcsec if side == "before" else cell.after_arcsec
+
+
+def _longest(cells: Sequence[ResidualCell], side: str) -> float:
+    lengths = (math.hypot(*_of(each, side)) for each in cells if each.stars >= LEAST_STARS)
+    return max(lengths, default=0.0)
+
+
+def _picture(title: str, map: ResidualMap, side: Side, longest: float) -> ResidualPicture:
+    px_per_deg = SIZE / (2.0 * map.radius_deg)
+    cell_px = map.step_deg * px_per_deg
+    px_per_arcsec = LONGEST_RESIDUAL * cell_px / longest if longest else 0.0
+    cells, arrows = [], []
+    for each in map.cells:
+        x = (each.h_deg + map.radius_deg) * px_per_deg
+        y = SIZE - (each.v_deg + map.radius_deg) * px_per_deg
+        cells.append((x - cell_px / 2.0, y - cell_px / 2.0, each.stars))
+        if each.stars >= LEAST_STARS:
+            h, v = _of(each, side)
+            along, down = h * px_per_arcsec, -v * px_per_arcsec
+            arrows.append(arrow(x - along / 2.0, y - down / 2.0, along, down))
+    key_arcsec = round_below(longest)
+    return ResidualPicture(
+        title=title,
+        tracker=map.tracker,
+        radius_deg=map.radius_deg,
+        cells=tuple(cells),
+        side=cell_px,
+        arrows="".join(arrows),
+        key_arcsec=key_arcsec,
+        key_px=key_arcsec * px_per_arcsec,
+    )

@@ -1,0 +1,282 @@
+"""Panels of one axis: traces of several grades, a band, marks, on a linear or logarithmic scale."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+
+import numpy as np
+import numpy.typing as npt
+
+from service.filtering.result import Integers
+from service.filtering.state import Status
+from service.storage.grades.period import GradesOfPeriod
+from service.times import Utc
+from service.vectors import Vector
+from service.web.console.charts.attitude import HEIGHT, PAD, WIDTH, band_path, line_path
+
+Mask = npt.NDArray[np.bool_]
+FINE_HEIGHT = 10 * HEIGHT
+"""Of panels whose values are read to a thousandth of their range."""
+DAY_S = 86_400
+TIME_STEPS_S = (
+    *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
+    *(days * DAY_S for days in (1, 2, 7, 14, 28, 56, 91, 182)),
+)
+MOST_TICKS = 4
+EDGE_PERCENT = 5.0
+ROOM = 0.04
+"""Above the greatest and below the least value, of the height."""
+
+
+@dataclass(frozen=True)
+class Trace:
+    """A path of one kind, such as a grade: `line` for joined values, `dots` for lone ones."""
+
+    kind: str
+    line: str
+    dots: str
+
+
+@dataclass(frozen=True)
+class GradePanel:
+    """One axis.  `marks` are of rejected values; those beyond an edge stand at it."""
+
+    axis: str
+    traces: tuple[Trace, ...]
+    band: str
+    marks: str
+    bounds: tuple[int, ...]
+    """Heights of horizontal lines."""
+    note: str
+    """The range of the values, and what else there is to say."""
+    scale: "Scale"
+    unit: str
+
+    @property
+    def ticks(self) -> list[tuple[float, str]]:
+        """Values of the vertical axis: percent from the top, and their text."""
+        values = self.scale.ticks()
+        heights = 100.0 * self.scale.y(np.array(values)) / self.scale.height
+        texts = [f"{value:.6g}".replace("-", "−") + self.unit for value in values]
+        return list(zip(np.round(heights, 1).tolist(), texts, strict=True))
+
+
+@dataclass(frozen=True)
+class GradeChart:
+    """Panels of one unit; `rows` are the same as a table: the axis, then a cell a column."""
+
+    id: str
+    title: str
+    panels: tuple[GradePanel, ...]
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    width: int = WIDTH
+    height: int = HEIGHT
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """The period that a chart shows."""
+
+    start: Utc
+    end: Utc
+
+    def x(self, time_ns: Integers) -> Integers:
+        """Units from the left edge (n,)."""
+        length = max(self.end.tai_ns - self.start.tai_ns, 1)
+        along = np.clip((time_ns - self.start.tai_ns) / length, 0.0, 1.0)
+        return np.asarray(np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(np.int64))
+
+    def ticks(self) -> list[tuple[float, str]]:
+        """Round times of the period: percent from the left, and their text in UTC."""
+        length_s = (self.end.tai_ns - self.start.tai_ns) * 1e-9
+        step_s = next((step for step in TIME_STEPS_S if length_s <= MOST_TICKS * step), None)
+        if step_s is None or length_s <= 0.0:
+            return []
+        begin = datetime.fromisoformat(self.start.text.replace("Z", "+00:00").replace(":60", ":59"))
+        first_s = math.ceil(begin.timestamp() / step_s) * step_s - begin.timestamp()
+        form = "%H:%M:%S" if step_s < 60 else "%H:%M" if step_s < DAY_S else "%m-%d"
+        found = []
+        for after_s in np.arange(first_s, length_s, step_s).tolist():
+            part = (PAD + after_s / length_s * (WIDTH - 2 * PAD)) / WIDTH
+            moment = begin + timedelta(seconds=after_s)
+            found.append((round(100.0 * part, 1), moment.strftime(form)))
+        return [each for each in found if EDGE_PERCENT < each[0] < 100.0 - EDGE_PERCENT]
+
+
+@dataclass(frozen=True)
+class Scale:
+    """From values to heights; logarithmic or linear, between `low` and `high`."""
+
+    low: float
+    high: float
+    is_log: bool = False
+    height: int = HEIGHT
+
+    def ticks(self) -> list[float]:
+        """Two to five round values of the scale; powers of ten of a logarithmic one."""
+        low, high = self.low, self.high
+        if self.is_log:
+            powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
+            return [10.0**power for power in powers] or [low, high]
+        if not high > low:
+            return [low]
+        step = 10.0 ** math.floor(math.log10((high - low) / 2.0))
+        step *= max(part for part in (1.0, 2.0, 5.0) if part * step <= (high - low) / 2.0)
+        first = math.ceil(low / step)
+        return [k * step for k in range(first, math.floor(high / step) + 1)]
+
+    def y(self, value: Vector) -> Integers:
+        """Units from the top (n,); values beyond an edge are at it."""
+        low, high = self.low, self.high
+        if self.is_log:
+            value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
+        room = ROOM * (high - low) or 1.0
+        part = (value - low + room) / (high - low + 2.0 * room)
+        units = self.height * (1.0 - np.clip(part, 0.0, 1.0))
+        return np.asarray(np.rint(units).astype(np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """Values of one axis at moments; `joins` (n,): whether each is joined with the one before."""
+
+    time_ns: Integers
+    value: Vector
+    joins: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def trace(self, kind: str, axis: TimeAxis, scale: Scale) -> Trace:
+        """The path of the values; of those that are unknown there is none."""
+        known = np.isfinite(self.value)
+        joins = self.joins if len(self.joins) else np.zeros(len(known), dtype=bool)
+        # One that follows an unknown one begins a part.
+        joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
+        x, y = axis.x(self.time_ns[known]), scale.y(self.value[known])
+        parts = parts_of(joins)
+        return Trace(
+            kind,
+            "".join(line_path(x[part], y[part]) for part in parts if len(part) > 1),
+            "".join(line_path(x[part], y[part]) + "h0" for part in parts if len(part) == 1),
+        )
+
+
+def parts_of(joins: Mask) -> list[npt.NDArray[np.int64]]:
+    """The places of each joined part."""
+    if not len(joins):
+        return []
+    return np.split(np.arange(len(joins)), np.flatnonzero(~joins[1:]) + 1)
+
+
+def band_of(
+    time_ns: Integers, low: Vector, high: Vector, joins: Mask, axis: TimeAxis, scale: Scale
+) -> str:
+    """The area between two lines, where both are known."""
+    known = np.isfinite(low) & np.isfinite(high)
+    joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
+    if not len(joins):
+        return ""
+    x = axis.x(time_ns[known])
+    return band_path(x, scale.y(high[known]), scale.y(low[known]), parts_of(joins))
+
+
+def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> str:
+    """A cross at each value."""
+    known = np.isfinite(value)
+    x, y = axis.x(time_ns[known]), np.clip(scale.y(value[known]), 8, HEIGHT - 8)
+    places = zip(x.tolist(), y.tolist(), strict=True)
+    return "".join(f"M{a - 7} {b - 7}l14 14m0 -14l-14 14" for a, b in places)
+
+
+def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
+    """Which moments (n,) belong together with the one before.
+
+    They do unless they are farther apart than three parts of the period and three times what
+    is usual, or `same` (n,) says that they are not of the same stretch.
+    """
+    step = np.diff(time_ns, prepend=time_ns[:1])
+    part = (axis.end.tai_ns - axis.start.tai_ns) / parts
+    usual = float(np.median(step[1:])) if len(step) > 1 else 0.0
+    return np.asarray((step <= 3.0 * max(part, usual)) & same)
+
+
+def scale_of(values: Mapping[str, Vector], *, is_log: bool = False) -> Scale | None:
+    """A scale that holds all known values; None where none is known."""
+    found = np.concatenate([each[np.isfinite(each)] for each in values.values()])
+    if is_log:
+        found = found[found > 0.0]
+    if not len(found):
+        return None
+    low, high = float(found.min()), float(found.max())
+    if is_log and high < 1.2 * low:
+        low, high = low / 1.2, high * 1.2
+    return Scale(low, high, is_log)
+
+
+STRIP_HEIGHT = 24
+WORDS = {
+    Status.GOOD: "good",
+    Status.STARTING: "suspect",
+    Status.DOUBTFUL: "suspect",
+    Status.LOST: "none",
+    Status.NONE: "none",
+}
+
+
+@dataclass(frozen=True)
+class Strip:
+    """Bars by their kind as one path each; kinds differ in height, so that colour only helps."""
+
+    id: str
+    title: str
+    bars: dict[str, str]
+    width: int = WIDTH
+    height: int = STRIP_HEIGHT
+
+
+def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
+    """Which model the filter had, and what both grades are worth."""
+    drawn = [
+        Strip(
+            "model",
+            "Model",
+            _bars(
+                [model for model, _, _ in found.stretches],
+                axis.x(np.array([start for _, start, _ in found.stretches])),
+                axis.x(np.array([end for _, _, end in found.stretches])),
+                {"gyro": 4, "constant_rate": 14},
+            ),
+        )
+    ]
+    for grade, samples in found.samples.items():
+        x = axis.x(samples.tai_ns)
+        words = [WORDS[Status(code)] for code in samples.status.tolist()]
+        drawn.append(
+            Strip(grade, grade, _bars(words, x, x, {"good": 4, "suspect": 14, "none": 20}))
+        )
+    return drawn
+
+
+def _bars(
+    kinds: Sequence[str],
+    left: npt.NDArray[np.int64],
+    right: npt.NDArray[np.int64],
+    tops: dict[str, int],
+) -> dict[str, str]:
+    """A path for each kind; bars of a kind that touch are one."""
+    paths = dict.fromkeys(tops, "")
+    begin = end = None
+    before = ""
+    for kind, a, b in zip(kinds, left.tolist(), right.tolist(), strict=True):
+        if begin is not None and end is not None and (kind != before or a - end > 6):
+            paths[before] += _bar(begin, end, tops[before])
+            begin = None
+        begin = a if begin is None else begin
+        end, before = max(b, a + 2), kind
+    if begin is not None and end is not None:
+        paths[before] += _bar(begin, end, tops[before])
+    return {kind: path for kind, path in paths.items() if path}
+
+
+def _bar(begin: int, end: int, top: int) -> str:
+    return f"M{begin} {STRIP_HEIGHT}V{top}H{end}V{STRIP_HEIGHT}z"

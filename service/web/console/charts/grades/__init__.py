@@ -1,1 +1,0 @@
-"""Charts of filtered and smoothed attitudes: traces by grade, innovations, time line."""

@@ -1,1 +1,0 @@
-"""The geometry of the charts of a period: places in pixels and paths, no markup."""

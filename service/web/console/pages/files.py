@@ -1,0 +1,137 @@
+"""The page of files: attitudes of a period by grade, with what each is, and tables."""
+
+from dataclasses import dataclass
+from itertools import islice
+from typing import Annotated
+from urllib.parse import quote, urlencode
+
+from fastapi import Path
+from fastapi import Query as InQuery
+from pydantic import Field, field_validator
+from starlette.responses import Response
+
+from service.app.products import TABLE_KINDS
+from service.missions.product_settings import MAX_LARGEST_GAP_S
+from service.products.attitudes import AttitudeSeries, ProductGrade
+from service.products.formats import attitude_formats, table_formats
+from service.web.console.page_context import ContextDep, PageContext
+from service.web.console.pages.spacecraft import (
+    RANGES_S,
+    ShownPeriod,
+    SpacecraftQuery,
+    shown_period,
+)
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+
+GRADES: dict[ProductGrade, str] = {
+    "smoothed": "The definitive attitude: every measurement of the day, before and after each "
+    "moment, with the gyro. The most accurate; it exists once the day was smoothed.",
+    "filtered": "From the measurements before each moment, with the gyro, as a filter on board "
+    "would have it.",
+    "raw": "One attitude for each batch, from its stars alone, independent of its neighbours.",
+}
+MOST_COUNTED = 5_000
+"""Attitudes of a period whose stretches are counted: reading them takes about 0.1 s."""
+FEW_PER_STRETCH = 10
+"""A file whose stretches have fewer attitudes than that is hardly of use for interpolation."""
+
+
+class FilesQuery(SpacecraftQuery):
+    """The period, and the largest gap within a stretch; empty: that of the mission or cadence."""
+
+    gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
+
+    @field_validator("gap_s", mode="before")
+    @classmethod
+    def _without_empty_gap(cls, value: object) -> object:
+        return None if value == "" else value
+
+
+@dataclass(frozen=True)
+class GradeOfFile:
+    """One grade of a period: how many attitudes, in how many stretches, and its largest gap.
+
+    `is_cut` says that only the first `MOST_COUNTED` of them were counted.
+    """
+
+    grade: ProductGrade
+    what: str
+    attitudes: int
+    stretches: int
+    largest_gap_s: float
+    is_cut: bool
+
+    @property
+    def is_shattered(self) -> bool:
+        """Whether a file falls into more stretches than a tenth of its attitudes."""
+        return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
+
+
+@console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
+def files_page(
+    name: Annotated[str, Path()], query: Annotated[FilesQuery, InQuery()], context: ContextDep
+) -> Response:
+    """Attitudes of a period as files of every grade and format, and its tables."""
+    context.app.context.mission(name)
+    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
+    shown = shown_period(context, name, query, latest)
+
+    def address(product: str, format: str, **more: str) -> str:
+        assert shown is not None
+        asked = {
+            "run": query.run,
+            "start": shown.start.text,
+            "end": shown.end.text,
+            "format": format,
+        }
+        if product == "attitude" and query.gap_s is not None:
+            asked["largest_gap_s"] = f"{query.gap_s:g}"
+        return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked | more)}"
+
+    return rendered(
+        "files.html.jinja",
+        context.layout(query.run),
+        name=name,
+        query=query,
+        stretch=shown,
+        ranges=list(RANGES_S),
+        grades=_grades(context, name, query, shown) if shown else [],
+        attitude_formats=attitude_formats(),
+        formats=table_formats(),
+        table_kinds=TABLE_KINDS,
+        most_counted=MOST_COUNTED,
+        address=address,
+    )
+
+
+def _grades(
+    context: PageContext, name: str, query: FilesQuery, shown: ShownPeriod
+) -> list[GradeOfFile]:
+    found = []
+    for grade, what in GRADES.items():
+        series = context.app.products.attitudes(
+            name,
+            run=query.run,
+            start=shown.start,
+            end=shown.end,
+            grade=grade,
+            largest_gap_s=query.gap_s,
+        )
+        found.append(_counted(grade, what, series))
+    return found
+
+
+def _counted(grade: ProductGrade, what: str, series: AttitudeSeries) -> GradeOfFile:
+    attitudes = stretches = 0
+    last = None
+    for block in islice(series.blocks, MOST_COUNTED):
+        attitudes += len(block)
+        begun = len(set(block.stretch.tolist()))
+        stretches += begun - (last == int(block.stretch[0]))
+        last = int(block.stretch[-1])
+        if attitudes >= MOST_COUNTED:
+            break
+    is_cut = attitudes >= MOST_COUNTED
+    return GradeOfFile(grade, what, attitudes, stretches, series.about.largest_gap_s, is_cut)

@@ -1,0 +1,93 @@
+"""The page of a period's stars and attitudes: sky, residuals, magnitudes, attitude and rate."""
+
+from dataclasses import dataclass
+from typing import Annotated
+
+from fastapi import Path
+from fastapi import Query as InQuery
+from starlette.responses import Response
+
+from service.storage.models.charts import TrackerStarsOfPeriod
+from service.web.console.charts.all_sky import all_sky_chart
+from service.web.console.charts.attitude import attitude_charts
+from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
+from service.web.console.charts.histogram import (
+    Histogram,
+    MagnitudeChart,
+    magnitude_chart,
+    residual_histogram,
+)
+from service.web.console.page_context import ContextDep
+from service.web.console.pages.spacecraft import (
+    RANGES_S,
+    SpacecraftQuery,
+    shown_period,
+)
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+
+MOST_LINKED = 600
+"""Batches whose tracks are looked for: reading and linking them takes about a second."""
+
+
+@dataclass(frozen=True)
+class TrackerCharts:
+    """The charts of one tracker; None where it has no data for one."""
+
+    tracker: str
+    sigma_arcsec: float
+    focal_plane: FocalPlaneMap | None
+    histogram: Histogram | None
+    magnitudes: MagnitudeChart | None
+
+
+@console_page(
+    "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
+)
+def period_page(
+    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
+) -> Response:
+    """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
+    mission = context.app.context.mission(name)
+    retired = context.app.context.retired.trackers.get(name, ())
+    if query.tracker is not None and query.tracker not in retired:
+        mission.tracker(query.tracker, "tracker")
+    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
+    shown = shown_period(context, name, query, latest)
+    found, tracks, trackers = None, None, list[TrackerStarsOfPeriod]()
+    if shown is not None:
+        found = context.app.results.period(name, run=query.run, start=shown.start, end=shown.end)
+        if found.total <= MOST_LINKED:
+            tracks = context.app.tracks.of_period(
+                name, run=query.run, start=shown.start, end=shown.end
+            )
+        trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
+    is_any = found is not None and found.read > 0
+    return rendered(
+        "period.html.jinja",
+        context.layout(query.run),
+        name=name,
+        tracker=query.tracker,
+        tracker_names=[*(each.name for each in mission.trackers), *retired],
+        stretch=shown,
+        ranges=list(RANGES_S),
+        found=found,
+        tracks=tracks,
+        most_linked=MOST_LINKED,
+        sky=all_sky_chart(found, trackers) if is_any and found else None,
+        trackers=[_tracker_charts(each) for each in trackers],
+        attitude=attitude_charts(found.attitudes, shown.start, shown.end)
+        if found and shown
+        else [],
+    )
+
+
+def _tracker_charts(tracker: TrackerStarsOfPeriod) -> TrackerCharts:
+    return TrackerCharts(
+        tracker=tracker.tracker,
+        sigma_arcsec=tracker.sigma_arcsec,
+        focal_plane=focal_plane_map(tracker),
+        histogram=residual_histogram(tracker),
+        magnitudes=magnitude_chart(tracker),
+    )

@@ -1,0 +1,389 @@
+"""The page of one spacecraft: trends over a period, its worst and its latest batches."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal
+from urllib.parse import quote, urlencode
+
+from fastapi import Path
+from fastapi import Query as InQuery
+from msgspec import structs
+from pydantic import Field, ValidationInfo, field_validator
+from starlette.responses import Response
+
+from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
+from service.alarms.subjects import limited_trackers
+from service.observations.schema import Key
+from service.products.formats import table_formats
+from service.storage.models.alarms import Annotation
+from service.storage.models.answers import Summary
+from service.storage.models.base import Page
+from service.storage.models.spacecraft import MissionThen, Ranking
+from service.storage.recording.unsaved_result import LIVE
+from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
+from service.web.console.page_context import ContextDep, PageContext, PageQuery
+from service.web.console.registry import console_page
+from service.web.console.rendering import rendered
+from service.web.requests.access import Policy
+from service.web.requests.query_parameters import End, Start
+
+RANGES_S: dict[str, int] = {
+    "hour": HOUR_S,
+    "day": DAY_S,
+    "week": 7 * DAY_S,
+    "month": 30 * DAY_S,
+    "year": 365 * DAY_S,
+}
+UNITS_S = {"min": 60, "h": HOUR_S, "d": DAY_S, "w": 7 * DAY_S}
+Range = Annotated[
+    str, Field(pattern=rf"^({'|'.join(RANGES_S)}|[1-9][0-9]{{0,3}}({'|'.join(UNITS_S)}))$")
+]
+"""The length of a period that ends with the latest batch: by its name, or such as `6h`."""
+WORST, LATEST = 10, 10
+MOST_BESIDE = 4
+Vertical = Literal["robust", "all", "log", "hold"]
+VERTICAL: dict[Vertical, str] = {
+    "robust": "robust, outliers at the edge",
+    "all": "all values",
+    "log": "logarithmic",
+    "hold": "as it is now",
+}
+ANNOTATIONS = 100
+FIRST_LOOKED_AT: tuple[RankedName, ...] = (
+    "ambiguous_share",
+    "unmatched_share",
+    "a_priori_angle_deg",
+)
+
+
+class SpacecraftQuery(PageQuery):
+    """Which period: a range that ends with the latest batch, or explicit bounds.
+
+    Without any, a day of live batches, and of a named run the shortest range that holds it.
+    """
+
+    range: Range | None = None
+    start: Start = None
+    end: End = None
+    by: RankedName | None = None
+    tracker: Key | None = None
+    until: Literal["latest", "now"] = "latest"
+    """Where a range of live batches ends."""
+    y: Vertical = "robust"
+    beside: Annotated[str, Field(max_length=300)] = ""
+    """Other spacecraft in the same charts, with commas between them."""
+
+    @property
+    def others(self) -> list[str]:
+        """The other spacecraft, as many as can be told apart."""
+        names = (name.strip() for name in self.beside.split(","))
+        return list(dict.fromkeys(filter(None, names)))[:MOST_BESIDE]
+
+    @property
+    def kept(self) -> dict[str, str | None]:
+        """What stays in the address while the period changes."""
+        return {
+            "by": self.by,
+            "tracker": self.tracker,
+            "until": self.until if self.until == "now" else None,
+            "y": self.y if self.y != "robust" else None,
+            "beside": self.beside or None,
+        }
+
+    @field_validator("start", "end", "range", mode="before")
+    @classmethod
+    def _without_empty_fields(cls, value: object, info: ValidationInfo) -> object:
+        """A field of the form that was left empty counts as not given."""
+        default = cls.model_fields[info.field_name or ""].default
+        return default if value == "" else value
+
+
+def range_s(text: str) -> int:
+    """The length of a range."""
+    if text in RANGES_S:
+        return RANGES_S[text]
+    number = text.rstrip("".join(UNITS_S))
+    return int(number) * UNITS_S[text.removeprefix(number)]
+
+
+@dataclass(frozen=True)
+class ShownPeriod:
+    """The shown period; `range` is None where the address has explicit bounds."""
+
+    range: str | None
+    start: Utc
+    end: Utc
+
+    @property
+    def seconds(self) -> float:
+        """Its length."""
+        return (self.end.tai_ns - self.start.tai_ns) / 1e9
+
+    def moved(self, by: float, scale: float = 1.0) -> dict[str, str]:
+        """The bounds of a period moved by parts of its length, longer or shorter."""
+        middle_s = self.seconds * (0.5 + by)
+        half_s = max(self.seconds * scale, 10.0) / 2
+        return {
+            "start": shifted(self.start, middle_s - half_s).text,
+            "end": shifted(self.start, middle_s + half_s).text,
+        }
+
+
+@console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
+def spacecraft_page(
+    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
+) -> Response:
+    """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
+    state = context.app.spacecraft.state(name, query.run)
+    latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
+    stretch = shown_period(context, name, query, latest)
+    mission, trackers = context.app.context.known[name], context.app.context.trackers(name)
+    ranking = _worst(context, name, query, stretch)
+    notes = _annotations(context, name, stretch)
+    ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
+    return rendered(
+        "spacecraft.html.jinja",
+        context.layout(query.run),
+        name=name,
+        description=state.description,
+        retired=state.retired,
+        latest=latest,
+        tracking=state.tracking,
+        attitude=_attitude(context, latest),
+        stretch=stretch,
+        ranges=list(RANGES_S),
+        by=ranking.by,
+        trackers=trackers,
+        tracker=query.tracker,
+        not_split=ranking.not_split is True,
+        quantities=ranked,
+        charts=charts(query.tracker),
+        alarms=_alarms(context, name, query, stretch),
+        worst=ranking.items,
+        limits=context.app.limits.all(
+            name, query.tracker if query.tracker in limited_trackers(mission) else None
+        ),
+        formats=table_formats(),
+        query=query,
+        vertical=VERTICAL,
+        others=_others(context, query, stretch),
+        spacecraft=[each for each in context.spacecraft if each != name],
+        changes=_changes(context, name, state.history, query, stretch),
+        annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
+        more_annotations=notes.next_cursor is not None,
+        may_write="operate" in context.caller.scopes,
+        may_write_of_all=context.caller.spacecraft is None,
+        history=lambda **more: (
+            stretch
+            and history_address(name, query.run, query.tracker, stretch.start, stretch.end, **more)
+        ),
+    )
+
+
+def shown_period(
+    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary]
+) -> ShownPeriod | None:
+    """The period that the address names; None without any batch."""
+    if not latest:
+        return None
+    # The latest batch belongs to the stretch, whose end does not.
+    end = query.end or shifted(parse_utc(latest[0].time), 0.001)
+    if query.until == "now" and query.run == LIVE and not query.end:
+        end = max(end, utc_now(), key=lambda moment: moment.tai_ns)
+    if query.start or query.end:
+        start = query.start or shifted(end, -range_s(query.range or "day"))
+        return ShownPeriod(None, start, end)
+    chosen = query.range or _fitting_range(context, name, query.run, end)
+    return ShownPeriod(chosen, shifted(end, -range_s(chosen)), end)
+
+
+def _fitting_range(context: PageContext, name: str, run: str, end: Utc) -> Range:
+    """The range to show first: the shortest that holds the attitudes of a named run."""
+    if run == LIVE:
+        return "day"
+    first = context.app.spacecraft.attitudes(name, run=run, limit=1).items
+    if not first:
+        return "day"
+    length_s = (end.tai_ns - parse_utc(first[0].time).tai_ns) / 1e9
+    return next((each for each, width_s in RANGES_S.items() if width_s >= length_s), "year")
+
+
+def _worst(
+    context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
+) -> Ranking:
+    """The worst batches by a quantity: by default the first one with a value above zero."""
+    asked = (query.by,) if query.by else FIRST_LOOKED_AT
+    if query.tracker and not query.by:
+        asked = tuple(by for by in FIRST_LOOKED_AT if QUANTITIES[by].by_tracker)
+    if stretch is None:
+        return Ranking(by=asked[0], items=[])
+    found = []
+    for by in asked:
+        found.append(
+            context.app.spacecraft.ranking(
+                name,
+                by=by,
+                run=query.run,
+                start=stretch.start,
+                end=stretch.end,
+                limit=WORST,
+                tracker=query.tracker,
+            )
+        )
+        if found[-1].items and found[-1].items[0].value:
+            return found[-1]
+    return found[0]
+
+
+def _alarms(
+    context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
+) -> list[dict[str, Any]]:
+    """When alarms were out of their limits; with a tracker, its own and those of all trackers."""
+    if stretch is None:
+        return []
+    found = context.app.alarms.of_period(name, query.run, stretch.start, stretch.end)
+    return [
+        structs.asdict(each)
+        for each in found
+        if query.tracker is None or each.tracker in (None, query.tracker)
+    ]
+
+
+def _attitude(context: PageContext, latest: list[Summary]) -> Any:
+    """The attitude of the latest batch; None where it has none, even if an earlier one has."""
+    if not latest or latest[0].status is None:
+        return None
+    return context.app.results.get(latest[0].id).answer.attitude
+
+
+def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod | None) -> list[str]:
+    """The addresses of the histories of other spacecraft; raises for one that is not known."""
+    for other in query.others:
+        context.caller.require(other)
+        context.app.context.mission(other)
+    if stretch is None:
+        return []
+    return [
+        history_address(other, query.run, None, stretch.start, stretch.end)
+        for other in query.others
+    ]
+
+
+@dataclass(frozen=True)
+class Change:
+    """Settings that came into force within the shown period."""
+
+    since: str
+    text: str
+
+
+def _changes(
+    context: PageContext,
+    name: str,
+    history: Sequence[MissionThen],
+    query: SpacecraftQuery,
+    stretch: ShownPeriod | None,
+) -> list[Change]:
+    """The changes of settings within a period of live batches, whose times follow the clock."""
+    if stretch is None or query.run != LIVE:
+        return []
+    adopted = {each.adopted[:19]: each for each in context.app.adoptions.in_force(name).history}
+    found = []
+    for each in history[1:]:
+        if not stretch.start.tai_ns <= recorded_utc(each.since).tai_ns < stretch.end.tai_ns:
+            continue
+        adoption = adopted.get(each.since[:19])
+        what = "Settings changed with the mission file"
+        if adoption is not None:
+            version = adoption.version
+            what = "The mission file" if version is None else f"Calibration version {version}"
+            what += f" adopted by {adoption.who}"
+            what += f": {adoption.note}" if adoption.note else ""
+        found.append(Change(each.since, what))
+    return found
+
+
+def _annotations(context: PageContext, name: str, stretch: ShownPeriod | None) -> Page[Annotation]:
+    """The annotations that touch the shown period."""
+    if stretch is None:
+        return Page([], None)
+    return context.app.annotations.page(
+        spacecraft=name, start=stretch.start, end=stretch.end, limit=ANNOTATIONS
+    )
+
+
+POINTS = 240
+"""The most points of a curve: as many as a chart can show."""
+CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
+    ("stars", "Ambiguous and unmatched stars", ("ambiguous_share", "unmatched_share")),
+    (
+        "batches",
+        "Batches without an attitude, or with a suspect one",
+        ("no_attitude_share", "suspect_share"),
+    ),
+    (
+        "residual",
+        "Residual rms and predicted rms",
+        ("residual_rms_arcsec", "predicted_rms_arcsec"),
+    ),
+    ("magnitude", "Magnitude offset, observed minus catalog", ("magnitude_offset_mag",)),
+    ("scale", "Scale offset, observed over catalog", ("scale_offset_ppm",)),
+    ("alignment", "Angle between trackers, observed minus catalog", ("alignment_offset_arcsec",)),
+    ("a-priori", "Angle from the a priori attitude", ("a_priori_angle_deg",)),
+    ("rate", "Batches per hour", ("batches_per_hour",)),
+)
+"""Id, title and quantities of the charts; every other quantity gets one of its own."""
+UNITS = {"1": "", "arcsec": "″", "deg": "°", "mag": " mag", "ppm": " ppm"}
+
+
+TRACKER_CHARTS = {"batches": "Batches in which the tracker disagrees with the others"}
+"""Titles that differ for the quantities of one tracker."""
+
+
+def charts(tracker: str | None = None) -> list[dict[str, Any]]:
+    """The charts of every quantity that has a history, or that a tracker has."""
+    shown = {name for _, _, names in CHARTS for name in names}
+    others = [
+        (name.replace("_", "-"), QUANTITIES[name].label.capitalize(), (name,))
+        for name in trend_names()
+        if name not in shown
+    ]
+    if tracker is None:
+        return [_chart(*each) for each in (*CHARTS, *others)]
+    of_tracker = [
+        (id, TRACKER_CHARTS.get(id, title), [name for name in names if QUANTITIES[name].by_tracker])
+        for id, title, names in (*CHARTS, *others)
+    ]
+    return [_chart(*each) for each in of_tracker if each[-1]]
+
+
+def charts_by_quantity() -> dict[str, dict[str, Any]]:
+    """The chart of each quantity that has a history, by itself."""
+    return {
+        quantity["name"]: chart
+        | {"title": quantity["label"].capitalize(), "quantities": [quantity]}
+        for chart in charts()
+        for quantity in chart["quantities"]
+    }
+
+
+def _chart(id: str, title: str, names: Sequence[str]) -> dict[str, Any]:
+    first = QUANTITIES[names[0]]
+    return {
+        "id": id,
+        "title": title,
+        "percent": first.is_share,
+        "unit": " %" if first.is_share else UNITS.get(first.unit, f" {first.unit}"),
+        "quantities": [{"name": name, "label": QUANTITIES[name].label} for name in names],
+    }
+
+
+def history_address(
+    name: str, run: str, tracker: str | None, start: Utc, end: Utc, **more: object
+) -> str:
+    """The address of the history of a period, as its charts read it."""
+    asked: dict[str, object] = {} if run == LIVE else {"run": run}
+    if tracker:
+        asked["tracker"] = tracker
+    asked |= {"start": start.text, "end": end.text, "size": POINTS} | more
+    return f"/api/v1/spacecraft/{quote(name)}/history?{urlencode(asked)}"
