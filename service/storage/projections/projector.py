@@ -43,7 +43,7 @@ def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
         if each.is_first:
             of_owner.setdefault(each.owner, []).append(each)
     for (run, spacecraft), some in of_owner.items():
-        latest = max(some, key=lambda each: int(each.result["time_ns"])).result
+        latest = max(some, key=lambda each: (each.result["time_ns"], each.seq)).result
         newest: Row = {name: latest[name] for name in ("id", "batch", "time", "status", "reason")}
         newest["counts"] = {name: latest[name] for name in STARS}
         note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(some), "latest": newest}
