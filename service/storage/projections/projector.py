@@ -191,6 +191,13 @@ class Projector:
             self._projected >= self._writer.commits or not self._is_projecting
         ):
             return 0.0
+        try:
+            return self._waited()
+        except Busy:
+            # What is recorded cannot be read now, what is projected perhaps can.
+            return time.monotonic() - self._up_to_date_s
+
+    def _waited(self) -> float:
         commits = self._writer.commits
         newest, position = self._places()
         if position >= newest:
