@@ -79,7 +79,7 @@ def _of_unknown_lens(
         # The search of the whole sky is done.  What is found about it still stands or falls
         # by its own evidence.
         prior = {"a_priori": {"quaternion": _unit(found.quaternion)}}
-        known = FrameIn.model_validate_json(json.dumps(_told(known) | prior))
+        known = FrameIn.model_validate_json(json.dumps(_sent_fields(known) | prior))
     stars = _observed(result, chosen, camera)
     model = batch_of_stars(mission.name, known, digest, time, tracker, stars)
     done = perf_counter_ns()
@@ -92,9 +92,9 @@ def _of_unknown_lens(
     )
 
 
-def _told(known: FrameIn) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads(known.model_dump_json(exclude_defaults=True))
-    return told
+def _sent_fields(known: FrameIn) -> dict[str, Any]:
+    fields: dict[str, Any] = json.loads(known.model_dump_json(exclude_defaults=True))
+    return fields
 
 
 def _unit(quaternion: Vector) -> list[float]:

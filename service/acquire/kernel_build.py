@@ -80,21 +80,21 @@ class KernelBuild:
         """
         if not self.is_needed:
             return
-        told = []
+        receivers = []
         with self._lock:
             if self._cancelled:
                 raise Stopping("the service is stopping")
             for share in _shares(_processors()):
-                here, there = _CONTEXT.Pipe(duplex=False)
+                receiver, sender = _CONTEXT.Pipe(duplex=False)
                 child = _CONTEXT.Process(
-                    target=_compile, args=(dict(missions), share, there), daemon=True
+                    target=_compile, args=(dict(missions), share, sender), daemon=True
                 )
                 self._children.append(child)
                 child.start()
                 # The child alone holds this end: when it has ended there is nothing to wait for.
-                there.close()
-                told.append(here)
-        if all(_is_told(each) for each in told):
+                sender.close()
+                receivers.append(receiver)
+        if all(_has_reported(each) for each in receivers):
             self._zones_needed = False
             zones_built()
         for child in self._children:
@@ -188,7 +188,7 @@ def _shares(processors: int) -> list[_Share]:
     return [_Share(weighing, [], True), _Share(counting, others, False)]
 
 
-def _is_told(child: connection.Connection) -> bool:
+def _has_reported(child: connection.Connection) -> bool:
     """Wait until a child has compiled its kernels of zones; False if it ends before that."""
     with child:
         try:

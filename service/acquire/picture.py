@@ -355,7 +355,7 @@ def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
 def _turns_of_the_middle(fit: LensFit) -> Matrix:
     """How the attitude of the middle (3, p) turns, in radians, with every parameter of the fit."""
     turns = np.zeros((3, fit.parameters))
-    here = _of_the_middle(fit.lens, fit.attitude)
+    unmoved = _of_the_middle(fit.lens, fit.attitude)
     step = 1e-6
     for column in range(fit.parameters):
         lens, attitude = fit.lens, fit.attitude
@@ -365,7 +365,7 @@ def _turns_of_the_middle(fit: LensFit) -> Matrix:
             name = ("bend", "off_u", "off_v")[column - 4]
             lens = replace(lens, **{name: getattr(lens, name) + step})
         moved = _of_the_middle(lens, attitude)
-        turns[:, column] = attitude_error_arcsec(moved, here) / ARCSEC_PER_RADIAN / step
+        turns[:, column] = attitude_error_arcsec(moved, unmoved) / ARCSEC_PER_RADIAN / step
     return turns
 
 

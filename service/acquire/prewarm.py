@@ -81,8 +81,8 @@ def prewarm_kernels(
     first = next(iter(kinds), None)
     if identifiers is None:
         identifiers = {"lost_in_space", *(mission.identifier for mission in missions.values())}
-    for kind, given in kinds.items():
-        mission = _of_bright_stars(given, BRIGHT_MAG)
+    for kind, original in kinds.items():
+        mission = _of_bright_stars(original, BRIGHT_MAG)
         tracker = mission.trackers[0]
         attitude = prior_attitude(
             SunPointedPrior(None, None)
@@ -123,7 +123,7 @@ def prewarm_kernels(
             exact = {} if identifier.name == "starid" else {"zone_grid_deg": 0.0}
             options = {"identifier": identifier.name} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
-            brightest = _of_bright_stars(given, BRIGHTEST_MAG)
+            brightest = _of_bright_stars(original, BRIGHTEST_MAG)
             searched = mission if identifier.uses_prior else brightest
             if identifier.searches_zone:
                 # So few stars may not be enough, and the whole sky has kernels of its own.

@@ -286,8 +286,8 @@ def _of_attitudes(
     changes = []
     for tracker in mission.trackers:
         line = f"sigma_arcsec = {tracker.sigma_arcsec * ratio.value:.3g}"
-        told = f"{line:<32} # was {tracker.sigma_arcsec:g}"
-        changes.append(FileChange("trackers", tracker.name, told))
+        file_line = f"{line:<32} # was {tracker.sigma_arcsec:g}"
+        changes.append(FileChange("trackers", tracker.name, file_line))
     return Statement("correct", f"{start}: so are the stars' sigmas.", tuple(changes))
 
 

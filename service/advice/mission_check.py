@@ -145,9 +145,9 @@ def _zone(mission: Mission) -> Iterator[Finding]:
 
 
 def _tolerances(mission: Mission) -> Iterator[Finding]:
-    told = mission.tolerances
+    tolerances = mission.tolerances
     widest_deg = 2.0 * max(each.field_of_view_radius_deg for each in mission.trackers)
-    limit_deg = told.pair_separation_max_deg
+    limit_deg = tolerances.pair_separation_max_deg
     if limit_deg > 1.05 * widest_deg:
         yield Finding(
             "unusual",
@@ -163,8 +163,8 @@ def _tolerances(mission: Mission) -> Iterator[Finding]:
             "a field are not in the index",
         )
     checked = [
-        ("separation_deg", told.separation_deg, "sigma_arcsec", math.sqrt(2.0) / 3600.0),
-        ("magnitude_mag", told.magnitude_mag, "magnitude_sigma_mag", 1.0),
+        ("separation_deg", tolerances.separation_deg, "sigma_arcsec", math.sqrt(2.0) / 3600.0),
+        ("magnitude_mag", tolerances.magnitude_mag, "magnitude_sigma_mag", 1.0),
     ]
     for name, tolerance, sigma_name, factor in checked:
         if idle_reason(name, mission.identifier, mission.tests, mission.zone) is not None:

@@ -101,11 +101,11 @@ def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
     mean = max(1, int(tree.count_neighbors(tree, chord)) // max(1, stars))
     step = max(1, NEIGHBOURS_AT_ONCE // mean)
     for first in range(0, stars, step):
-        some: Any = cKDTree(direction[first : first + step])
-        found = some.sparse_distance_matrix(tree, chord, output_type="ndarray")
+        chunk: Any = cKDTree(direction[first : first + step])
+        found = chunk.sparse_distance_matrix(tree, chord, output_type="ndarray")
         ring = np.minimum((found["v"] / chord) ** 2 * RINGS, RINGS - 1).astype(np.int64)
-        place, places = found["i"] * RINGS + ring, some.n * RINGS
-        part = slice(first, first + some.n)
+        place, places = found["i"] * RINGS + ring, chunk.n * RINGS
+        part = slice(first, first + chunk.n)
         count[part] = np.bincount(place, minlength=places).reshape(-1, RINGS)
         for k in range(3):
             sums = np.bincount(place, direction[found["j"], k], minlength=places)

@@ -203,8 +203,8 @@ def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tup
 
 def _reduced(found: Fit, model: Model) -> Eliminated:
     """The normal equations where the fit stands."""
-    given = found.values, found.attitude, found.residual, found.counted
-    return _eliminated(found.parts, *given, model)
+    arguments = found.values, found.attitude, found.residual, found.counted
+    return _eliminated(found.parts, *arguments, model)
 
 
 def _eliminated(
@@ -217,8 +217,8 @@ def _eliminated(
 ) -> Eliminated:
     derivatives = [linearised(part, values, attitude) for part in parts]
     edges = np.array([0, len(attitude)])
-    given = residual, counted.astype(np.float64), len(values), edges
-    return eliminate(derivatives, *given, model.attitudes_known)
+    arguments = residual, counted.astype(np.float64), len(values), edges
+    return eliminate(derivatives, *arguments, model.attitudes_known)
 
 
 def _residuals(
@@ -362,8 +362,10 @@ def held_out(
     derivatives = [linearised(part, settled.values, settled.attitude) for part in settled.parts]
     used = settled.used.astype(np.float64)
     count = len(settled.unknowns)
-    given = settled.residual, used, count, edges, model.attitudes_known
-    by_block = [_from_zero(each, settled.values) for each in eliminate(derivatives, *given).blocks]
+    arguments = settled.residual, used, count, edges, model.attitudes_known
+    by_block = [
+        _from_zero(each, settled.values) for each in eliminate(derivatives, *arguments).blocks
+    ]
     freedom = degrees_of_freedom(stars, model, settled.used)
     squares = {
         degree: _predicted_squares(by_block, _free(settled, degree))

@@ -163,8 +163,8 @@ def _corrected(
         )
     except ValidationError as error:
         (first, *_) = error.errors()
-        told = f"would have {first['loc'][0]} {first['input']:g}, which no mission file may have"
-        raise BadInput(Fault("magnitudes", told)) from None
+        message = f"would have {first['loc'][0]} {first['input']:g}, which no mission file may have"
+        raise BadInput(Fault("magnitudes", message)) from None
 
 
 def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> MagnitudeCalibration:

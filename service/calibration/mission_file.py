@@ -210,8 +210,8 @@ def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str,
             scale = float(wanted["calibration"]["scale"])
             if not math.isclose(new.calibration.scale, scale, rel_tol=1e-12):
                 return False
-        told = {key: float(value) for key, value in wanted["magnitudes"].items()}
-        if told and new.magnitudes.model_dump() != told:
+        magnitudes = {key: float(value) for key, value in wanted["magnitudes"].items()}
+        if magnitudes and new.magnitudes.model_dump() != magnitudes:
             return False
     same = [
         new.model_copy(update={name: getattr(old, name) for name in (*AXES, *_TABLES)})
