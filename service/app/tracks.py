@@ -93,7 +93,7 @@ def _tracked(track: Track) -> TrackedObject:
     rate, sigma = track.rate_arcsec_per_s, track.sigma_rate_arcsec_per_s
     return TrackedObject(
         name=f"TRACK-{track.time[:19]}-{track.ra_deg:.2f}{track.dec_deg:+.2f}",
-        told=(
+        comments=(
             f"Rate {rate:.6g} arcsec/s with sigma {sigma:.2g}, at {track.time}",
             f"Sigma of the right ascension then {track.sigma_ra_arcsec:.3g} arcsec on the sky",
             f"Sigma of the declination then {track.sigma_dec_arcsec:.3g} arcsec",

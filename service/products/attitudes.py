@@ -236,7 +236,7 @@ class _Assembler:
         self._wanted = ("good", "suspect") if about.status == "all" else (about.status,)
         self._unwanted = 0
         self._held: AttitudeBlock | None = None
-        self._given = 0
+        self._emitted = 0
 
     def fed(self, page: AttitudeRows) -> AttitudeBlock:
         """The rows that are finished now that a page is known too; perhaps none."""
@@ -250,20 +250,20 @@ class _Assembler:
 
     def rest(self) -> AttitudeBlock | None:
         """The rows that still waited, or None where there were none."""
-        if self._held is None or len(self._held) == self._given:
+        if self._held is None or len(self._held) == self._emitted:
             return None
         return self._finished(self._held, waiting=0)
 
     def _finished(self, rows: AttitudeBlock, waiting: int) -> AttitudeBlock:
         rows = self._without_repeats(rows)
-        given = self._given
-        first = rows.stretch[0] if given else 0
+        emitted = self._emitted
+        first = rows.stretch[0] if emitted else 0
         rows = _with_stretches(rows, self._about.largest_gap_s, first)
-        end = max(given, len(rows) - waiting)
-        finished = _with_rates(rows).taken(slice(given, end))
+        end = max(emitted, len(rows) - waiting)
+        finished = _with_rates(rows).taken(slice(emitted, end))
         # The last one given stays, for the rate and the sign of the next.
-        self._given = min(end, 1)
-        self._held = rows.taken(slice(end - self._given, None))
+        self._emitted = min(end, 1)
+        self._held = rows.taken(slice(end - self._emitted, None))
         return finished
 
     def _without_repeats(self, rows: AttitudeBlock) -> AttitudeBlock:
@@ -273,7 +273,7 @@ class _Assembler:
             dropped[1:] = close
         else:
             dropped[:-1] = close
-        dropped[: self._given] = False
+        dropped[: self._emitted] = False
         return rows.taken(~dropped) if dropped.any() else rows
 
 

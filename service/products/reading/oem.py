@@ -127,37 +127,37 @@ class _Reader:
                 return
         raise self._source.bad(line, "COVARIANCE_STOP", "is missing: the file was cut short")
 
-    def _form(self, told: Metadata) -> _Form:
-        told.require(_REQUIRED)
-        told.one_of("CENTER_NAME", ("EARTH",))
-        told.one_of("REF_FRAME", INERTIAL)
-        time_system = told.time_system()
-        about = (told.values["OBJECT_NAME"], told.values["OBJECT_ID"])
+    def _form(self, metadata: Metadata) -> _Form:
+        metadata.require(_REQUIRED)
+        metadata.one_of("CENTER_NAME", ("EARTH",))
+        metadata.one_of("REF_FRAME", INERTIAL)
+        time_system = metadata.time_system()
+        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
         if self._object not in (None, about):
-            raise told.fault("OBJECT_ID", "must be the same in every segment")
+            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
         self._object = about
-        method, degree = self._interpolation(told)
+        method, degree = self._interpolation(metadata)
         return _Form(
-            line=told.line,
+            line=metadata.line,
             time_system=time_system,
-            span_ns=told.span(time_system),
-            useable_ns=told.useable(time_system),
+            span_ns=metadata.span(time_system),
+            useable_ns=metadata.useable(time_system),
             method=method,
             degree=degree,
         )
 
-    def _interpolation(self, told: Metadata) -> tuple[Interpolation, int | None]:
+    def _interpolation(self, metadata: Metadata) -> tuple[Interpolation, int | None]:
         """The method, and the degree where one is given."""
-        if "INTERPOLATION" not in told.values:
+        if "INTERPOLATION" not in metadata.values:
             return "HERMITE", None
-        name = told.one_of("INTERPOLATION", tuple(_METHODS))
+        name = metadata.one_of("INTERPOLATION", tuple(_METHODS))
         if name == "LINEAR":
             return "LAGRANGE", 1
-        told.require(("INTERPOLATION_DEGREE",))
-        text = told.values["INTERPOLATION_DEGREE"]
+        metadata.require(("INTERPOLATION_DEGREE",))
+        text = metadata.values["INTERPOLATION_DEGREE"]
         if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MOST_DEGREE):
             message = f"must be a whole number from 1 to {MOST_DEGREE}"
-            raise told.fault("INTERPOLATION_DEGREE", message)
+            raise metadata.fault("INTERPOLATION_DEGREE", message)
         return _METHODS[name], int(text)
 
     def _add(self, form: _Form, token: Token) -> None:
