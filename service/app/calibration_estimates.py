@@ -332,9 +332,9 @@ def _rms(values: Vector) -> float:
 def notes(run: CalibrationRun) -> list[str]:
     """What a mission file cannot hold of this calibration."""
     kinds = {each.kind for each in run.found.unknowns}
-    told = [VECTORS] if kinds & {"scale", "distortion"} else []
-    told += [TIME_TAGS] if "time_tag" in kinds else []
-    return told + ([COLORS] if _colors_differ(run) else [])
+    remarks = [VECTORS] if kinds & {"scale", "distortion"} else []
+    remarks += [TIME_TAGS] if "time_tag" in kinds else []
+    return remarks + ([COLORS] if _colors_differ(run) else [])
 
 
 def _colors_differ(run: CalibrationRun) -> bool:
@@ -397,12 +397,12 @@ def geometry_of(tracker: Tracker) -> TrackerGeometry:
 
 def geometry_digest(mission: Mission) -> str:
     """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
-    told = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
-    for each, tracker in zip(told, mission.trackers, strict=True):
+    geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
+    for each, tracker in zip(geometries, mission.trackers, strict=True):
         # Adoptions of versions without magnitudes hold the digest of the rest.
         if tracker.magnitudes == AS_MEASURED:
             del each["magnitudes"]
-    return "sha256:" + hashlib.sha256(msgspec.json.encode(told)).hexdigest()
+    return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
 
 
 def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
@@ -415,12 +415,12 @@ def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Miss
 
 
 def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
-    told = msgspec.to_builtins(geometry)
+    fields = msgspec.to_builtins(geometry)
     if geometry.magnitudes is None:
-        del told["magnitudes"]
+        del fields["magnitudes"]
     settings = {
         **tracker.model_dump(exclude={"camera"}),
-        **told,
+        **fields,
         "camera": tracker.camera,
     }
     return Tracker.model_validate(settings)
@@ -444,8 +444,8 @@ def _calibrated_tracker(tracker: Tracker, changes: dict[str, Lines]) -> TrackerG
         name: tuple(value) for name, value in _values(changes["tracker"]).items()
     }
     if changes["calibration"]:
-        told = _values(changes["calibration"])
-        own["calibration"] = FocalPlaneSettings.model_validate(told)
+        values = _values(changes["calibration"])
+        own["calibration"] = FocalPlaneSettings.model_validate(values)
     return geometry_of(tracker.model_copy(update=own))
 
 

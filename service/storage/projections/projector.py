@@ -42,13 +42,13 @@ def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
     for each in new:
         if each.is_first:
             of_owner.setdefault(each.owner, []).append(each)
-    for (run, spacecraft), some in of_owner.items():
-        latest = max(some, key=lambda each: (each.result["time_ns"], each.seq)).result
+    for (run, spacecraft), group in of_owner.items():
+        latest = max(group, key=lambda each: (each.result["time_ns"], each.seq)).result
         newest: Row = {name: latest[name] for name in ("id", "batch", "time", "status", "reason")}
         newest["counts"] = {name: latest[name] for name in STARS}
-        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(some), "latest": newest}
+        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(group), "latest": newest}
         events.add_event(connection, "batches", note, run=run, spacecraft=spacecraft)
-        _note_states(connection, spacecraft, run, some)
+        _note_states(connection, spacecraft, run, group)
 
 
 def _note_states(
@@ -427,9 +427,9 @@ def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
     with store.reading_record() as connection:
         hours = sorted(rollups.hours_of_all(connection))
     for first in range(0, len(hours), HOURS_AT_ONCE):
-        some = hours[first : first + HOURS_AT_ONCE]
-        store.writer.change(partial(rollups.renew, hours=some)).result()
-        step(first + len(some), len(hours))
+        chunk = hours[first : first + HOURS_AT_ONCE]
+        store.writer.change(partial(rollups.renew, hours=chunk)).result()
+        step(first + len(chunk), len(hours))
     return len(hours)
 
 

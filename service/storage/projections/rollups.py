@@ -283,10 +283,10 @@ def rates(
         query = query.where(table.c.bucket <= last)
     rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
     if len(rows) > MAX_RATES:
-        given = "nothing" if start is None else start.text
+        value = "nothing" if start is None else start.text
         shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
         wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
-        raise BadInput(Fault("start", wrong, given))
+        raise BadInput(Fault("start", wrong, value))
     return [
         {
             "start": bucket_start(number, trend.width_s).text,

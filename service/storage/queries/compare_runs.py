@@ -329,8 +329,8 @@ def _named(
     c = table.c
     found: list[str] = []
     for first in range(0, len(names), _AT_ONCE):
-        some = names[first : first + _AT_ONCE]
-        query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(some))
+        chunk = names[first : first + _AT_ONCE]
+        query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(chunk))
         found += connection.scalars(query)
     return found
 
@@ -355,8 +355,8 @@ def _add_archived(
 def _places(connection: Connection, ids: Sequence[str]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for first in range(0, len(ids), _AT_ONCE):
-        for path, some in places(connection, ids[first : first + _AT_ONCE]).items():
-            found.setdefault(path, []).extend(some)
+        for path, added in places(connection, ids[first : first + _AT_ONCE]).items():
+            found.setdefault(path, []).extend(added)
     return found
 
 

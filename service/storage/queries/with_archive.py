@@ -79,8 +79,8 @@ def first_rows(
     The query has no order and, of the filter, all conditions.
     """
     if beyond is not None:
-        here, there = tuple_(*PLACE), tuple_(*beyond)
-        query = query.where(here < there if newest_first else here > there)
+        place, bound = tuple_(*PLACE), tuple_(*beyond)
+        query = query.where(place < bound if newest_first else place > bound)
     order = [column.desc() if newest_first else column for column in PLACE]
     query = query.order_by(*order).limit(limit)
     found = [Found(row, False) for row in connection.execute(query)]
@@ -88,7 +88,7 @@ def first_rows(
     last_ns = found[limit - 1].place[0] if len(found) >= limit else None
     waiting = _Waiting(parts_of(connection, use, selected, newest_first, beyond, last_ns), sign)
     opened = 0
-    while waiting.some:
+    while waiting.any_left:
         begins = waiting.begins
         if len(found) >= limit and sign * found[limit - 1].place[0] < begins:
             break
@@ -191,8 +191,8 @@ def all_rows(
 
 def count(connection: Connection, archive: Archive, selected: ResultFilter, most: int) -> int:
     """How many current results are selected; no more than `most` are counted."""
-    some = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
-    query = select(func.count()).select_from(some)
+    bounded = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
+    query = select(func.count()).select_from(bounded)
     found = int(connection.scalar(query) or 0)
     for part in parts_of(connection, ArchiveUse(archive), selected):
         if found >= most:
@@ -229,7 +229,7 @@ class _Waiting:
         self.add(parts)
 
     @property
-    def some(self) -> bool:
+    def any_left(self) -> bool:
         return bool(self._heap)
 
     @property

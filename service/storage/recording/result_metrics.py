@@ -51,10 +51,10 @@ def rolled_up(results: Sequence[Row]) -> Row:
     )
     shares = [[value for value in map(of, results) if value is not None] for of in _SHARES_OF]
     values = [[value for value in map(of, results) if value is not None] for of in _VALUES_OF]
-    sums = chain.from_iterable((len(there), sum(there, 0.0)) for there in values)
+    sums = chain.from_iterable((len(present), sum(present, 0.0)) for present in values)
     extremes = shares + values
-    least = [min(there, default=None) for there in extremes]
-    most = [max(there, default=None) for there in extremes]
+    least = [min(present, default=None) for present in extremes]
+    most = [max(present, default=None) for present in extremes]
     # In the order of the columns: to put their names together takes longer than all of this.
     return dict(zip(ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
 

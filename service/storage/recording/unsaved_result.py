@@ -183,8 +183,8 @@ def _unsaved_result(
 
 def _frame_of(frame: FrameRecord) -> FrameSummary:
     """The summary of the frame in the answer."""
-    told = frame.summary()
-    return FrameSummary(**(told | {"timings_us": FrameTimings(**told["timings_us"])}))
+    summary = frame.summary()
+    return FrameSummary(**(summary | {"timings_us": FrameTimings(**summary["timings_us"])}))
 
 
 def _frame_row(frame: FrameRecord, batch_id: str) -> Row:

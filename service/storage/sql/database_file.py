@@ -32,7 +32,7 @@ class DatabaseFile:
         self.path = path
         self._log_path = f"{path}-wal"
         self.identity: FileIdentity | None = None
-        self._told = False
+        self._is_loss_logged = False
 
     def create(self) -> int:
         """Open the file; one that is missing is made so that its owner alone can read it.
@@ -50,8 +50,8 @@ class DatabaseFile:
     @property
     def is_read_only(self) -> bool:
         """Whether this process cannot write to the file, or make SQLite's log beside it."""
-        there = self.path.exists()
-        return there and not (
+        exists = self.path.exists()
+        return exists and not (
             os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)
         )
 
@@ -78,10 +78,10 @@ class DatabaseFile:
     def require(self) -> None:
         """Raise `Busy` unless the path still leads to the file that was opened."""
         if self.identity is None or _identity(self.path) == self.identity:
-            self._told = False
+            self._is_loss_logged = False
             return
-        if not self._told:
-            self._told = True
+        if not self._is_loss_logged:
+            self._is_loss_logged = True
             log.error("%s was moved, replaced or deleted while it is being served", self.path)
         raise Busy(
             "the database file was moved, replaced or deleted while the service runs; nothing is "

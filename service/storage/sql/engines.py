@@ -183,11 +183,11 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
         options += ["-c tcp_keepalives_count=2", f"-c tcp_user_timeout={1000 * timeouts.lost_s}"]
     own = url.query.get("options", ())
     options += [own] if isinstance(own, str) else own
-    given: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "connect_timeout": CONNECT_S,
         "tcp_user_timeout": 1000 * TCP_USER_TIMEOUT_S,
     }
-    arguments = {name: value for name, value in given.items() if name not in url.query}
+    arguments = {name: value for name, value in defaults.items() if name not in url.query}
     arguments["options"] = " ".join(options)
     engine = create_engine(url, pool_pre_ping=True, connect_args=arguments, **pool)
 

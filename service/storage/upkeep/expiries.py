@@ -80,20 +80,20 @@ class ExpiryDates:
         """Log a warning about each thing that ends soon, or has ended."""
         found, now = self.dates(), self._now()
         soon = shifted(now, SOON_DAYS * DAY_S).text
-        said = []
+        warnings = []
         if found.leap_seconds <= soon:
-            said.append(
+            warnings.append(
                 f"the table of leap seconds is certain until {found.leap_seconds} only: "
                 "install a newer pyerfa"
             )
-        said += [
+        warnings += [
             f"the token {each.name} expires at {each.expires}: create another and revoke this one"
             for each in found.tokens
             if each.ends_soon(now)
         ]
-        for each in said:
+        for each in warnings:
             log.warning(each)
-        return said
+        return warnings
 
 
 def _tokens(connection: Connection, moment: str) -> tuple[TokenTerm, ...]:

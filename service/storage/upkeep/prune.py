@@ -86,10 +86,10 @@ def prune(
     if dry_run:
         return pruned
     for hour, spacecraft, name in keys:
-        some = _of_an_hour(spacecraft, name, hour, before)
+        deletion = _of_an_hour(spacecraft, name, hour, before)
         deleted = MOST_BATCHES
         while deleted == MOST_BATCHES:
-            deleted = store.writer.change(some).result()
+            deleted = store.writer.change(deletion).result()
             pruned.batches += deleted
             step(pruned)
     while deleted := store.writer.change(partial(delete_blocks, chosen=old_blocks)).result():
@@ -123,8 +123,8 @@ def delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -
 
 def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
     """Delete some of the blocks that are chosen; how many."""
-    some = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
-    ids = list(connection.scalars(some))
+    chunk = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
+    ids = list(connection.scalars(chunk))
     connection.execute(delete(gyro_blocks).where(gyro_blocks.c.id.in_(ids)))
     return len(ids)
 

@@ -106,8 +106,8 @@ def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
     for row in rows["tracker_values"].to_pylist():
         of.setdefault((of_batch[row["batch_id"]], row["tracker"]), []).append(row)
     found: dict[int, dict[str, Row]] = {}
-    for (hour, tracker), some in of.items():
-        found.setdefault(hour, {})[tracker] = rolled_up(some)
+    for (hour, tracker), group in of.items():
+        found.setdefault(hour, {})[tracker] = rolled_up(group)
     return found
 
 
@@ -139,8 +139,8 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     if connection.scalar(recorded.limit(1)) is not None:
         names = made.identities["batch"].to_pylist()
         for first in range(0, len(names), _AT_ONCE):
-            some = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
-            if known := look_up(connection, some).identities:
+            wanted = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
+            if known := look_up(connection, wanted).identities:
                 raise _taken(made, next(iter(known))[2])
     number = note_part(connection, spacecraft, made.part, path, made.identities)
     # Whoever counts an hour anew locks its rollup and then reads the shares.
@@ -150,9 +150,9 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
         content = whole_content(folder, path, made.part.sha256)
         for some_results in _as_recorded(from_partition(read_partition(content))):
             alarms.apply(connection, some_results)
-    told = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
-    told |= {"latest": made.latest}
-    events.add_event(connection, "batches", told, run=run, spacecraft=spacecraft)
+    fields = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
+    fields |= {"latest": made.latest}
+    events.add_event(connection, "batches", fields, run=run, spacecraft=spacecraft)
 
 
 def _taken(made: RunPart, what: str) -> BadConfiguration:

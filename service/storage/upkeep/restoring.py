@@ -115,8 +115,8 @@ def restore(
 def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
     """Insert the rows of a part; False: they are there."""
     ids = rows["batches"]["id"].to_pylist()
-    some = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
-    if connection.scalar(some) is not None:
+    query = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
+    if connection.scalar(query) is not None:
         return False
     part_id = connection.scalar(
         select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
