@@ -117,13 +117,13 @@ def run_demo(
         sys.stdout.flush()
         if once:
             return 0
-        told = sys.stderr if as_json else sys.stdout
-        print(f"\nServing on {url} until Ctrl-C.", file=told, flush=True)
+        stream = sys.stderr if as_json else sys.stdout
+        print(f"\nServing on {url} until Ctrl-C.", file=stream, flush=True)
         with suppress(KeyboardInterrupt):
             # A terminal's Ctrl-C reaches the server too, which may stop first.
             if server.wait() not in STOPPED_EXIT_CODES:
                 raise Busy(f"the server stopped by itself; see {folder / 'server.log'}")
-        print("stopped", file=told)
+        print("stopped", file=stream)
         return 0
 
 

@@ -299,5 +299,5 @@ def _refusal(problem: answers.Problem) -> bytes:
         {"field": each.field, "message": each.message, "value": each.value}
         for each in problem.errors or ()
     ]
-    told = {"type": problem.type, "status": problem.status, "detail": problem.detail}
-    return json.dumps(told | {"errors": errors}).encode()
+    body = {"type": problem.type, "status": problem.status, "detail": problem.detail}
+    return json.dumps(body | {"errors": errors}).encode()
