@@ -254,8 +254,8 @@ def image_of(
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
     power = spectrum.power * (spectrum.wavelength_m if photons else 1.0)
     for wavelength, share in zip(spectrum.wavelength_m, power / power.sum(), strict=True):
-        here = pupil(float(wavelength)) if callable(pupil) else pupil
-        total += share * image_at(here, float(wavelength), angle, angle)
+        transparency = pupil(float(wavelength)) if callable(pupil) else pupil
+        total += share * image_at(transparency, float(wavelength), angle, angle)
     return PointImage(total, step_rad)
 
 

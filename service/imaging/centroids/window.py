@@ -201,7 +201,7 @@ class Region:
             (bool((~self.usable & ~saturated).any()), Flag.MASKED),
             (self.window.cut and reach < wanted_half, Flag.EDGE),
         )
-        return tuple(flag for said, flag in named if said)
+        return tuple(flag for is_set, flag in named if is_set)
 
 
 def square_about(window: Window, column: int, row: int, half: int) -> Region | None:

@@ -68,8 +68,8 @@ class StarImages:
 
     def places_and_light(self) -> Array:
         """U, v and counts of the stars (3, n)."""
-        told = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
-        return np.array(told, dtype=np.float64).reshape(-1, 3).T
+        rows = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3).T
 
     def behind(self, window: Window, number: int | None) -> Window:
         """The window with the light of all stars but one as part of its background."""

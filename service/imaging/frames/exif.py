@@ -111,10 +111,10 @@ def exposure_of(image: Any) -> tuple[str | None, float | None]:
         exif = exif_of(image).get_ifd(_EXIF)  # type: ignore[attr-defined]
     except Exception:
         return None, None
-    return told_exposure(*(exif.get(tag) for tag in (_TAKEN, _OFFSET, _FRACTION, _EXPOSURE)))
+    return exif_exposure(*(exif.get(tag) for tag in (_TAKEN, _OFFSET, _FRACTION, _EXPOSURE)))
 
 
-def told_exposure(
+def exif_exposure(
     taken: object, offset: object, fraction: object, exposure: Any
 ) -> tuple[str | None, float | None]:
     """UTC of mid exposure and exposure in seconds from the values of four tags of EXIF."""
