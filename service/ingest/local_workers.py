@@ -170,12 +170,12 @@ class LocalWorkers(Generic[Input, Output]):
         context.set_forkserver_preload([worker_process.__name__])
         # Python 3.11.0 would have the server listen where every local user can connect.
         util.abstract_sockets_supported = False  # type: ignore[misc]
-        there, stop = context.Pipe(duplex=False)
+        receiver, stop = context.Pipe(duplex=False)
         executor = ProcessPoolExecutor(
             self.count,
             context,
             begin,
-            (self._config, there, context.Barrier(self.count), logs.configured()),
+            (self._config, receiver, context.Barrier(self.count), logs.configured()),
         )
         processes = self._processes = _Processes(executor, stop)
         ready: list[Future[int]] = []
@@ -292,7 +292,7 @@ class LocalWorkers(Generic[Input, Output]):
                 return
         if error is None:
             try:
-                found = [each for some in future.result() for each in pickle.loads(some)]
+                found = [each for pack in future.result() for each in pickle.loads(pack)]
             except Exception as unreadable:  # whatever the classes of the results raise
                 error = unreadable
             else:

@@ -293,10 +293,10 @@ class IngestQueue:
                 _set_futures([(pending, outcome)])
             else:
                 by_loop.setdefault(pending.future.get_loop(), []).append((pending, outcome))
-        for loop, some in by_loop.items():
+        for loop, group in by_loop.items():
             # The loop may be closed: then no client waits for these answers.
             with suppress(RuntimeError):
-                loop.call_soon_threadsafe(_set_futures, some)
+                loop.call_soon_threadsafe(_set_futures, group)
 
 
 def _set_futures(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:

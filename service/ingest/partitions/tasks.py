@@ -118,10 +118,10 @@ def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResu
     refused: list[RefusedBatch] = []
     stored = [row for row in _stored(task) if row["batch"] not in task.left_out]
     for start in range(0, len(stored), AT_ONCE):
-        some = stored[start : start + AT_ONCE]
-        submissions = [submission_again(each["input"], each["options"], task.run) for each in some]
+        chunk = stored[start : start + AT_ONCE]
+        submissions = [submission_again(each["input"], each["options"], task.run) for each in chunk]
         several = solver.acquired([each.batch for each in submissions])
-        for row, submission, acquired in zip(some, submissions, several, strict=True):
+        for row, submission, acquired in zip(chunk, submissions, several, strict=True):
             if isinstance(acquired, AcquisitionError):
                 refused.append(RefusedBatch(row["batch"], str(acquired)))
             elif isinstance(acquired, Exception):
@@ -187,7 +187,7 @@ def _rows_of(found: Sequence[UnsavedResult]) -> Rows:
         "results": _table(results, [each.result_row(each.answer) for each in in_order]),
     }
     for name, (table, _, _) in CHILDREN.items():
-        rows[table.name] = _table(table, [row for some in children[name] for row in some])
+        rows[table.name] = _table(table, [row for group in children[name] for row in group])
     return rows
 
 
