@@ -238,9 +238,9 @@ def json_of_block(block: GyroBlock) -> bytes:
     times = (
         {"times_s": block.times_s.tolist()} if block.step_s is None else {"step_s": block.step_s}
     )
-    told = {"block": block.block, "start": block.start.text, "run": block.run}
+    fields = {"block": block.block, "start": block.start.text, "run": block.run}
     rates = {"rates_rad_per_s": block.rates_rad_per_s.tolist()}
-    return msgspec.json.encode(told | times | rates)
+    return msgspec.json.encode(fields | times | rates)
 
 
 def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None) -> GyroBlock:

@@ -118,9 +118,9 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
     for each in found.stretches:
         result = filter_attitude(each.model, each.gyro, each.attitudes, each.directions)
         smoothed = smooth(result, each.model)
-        told = _graded(each, result, smoothed, start, end)
-        if told is not None:
-            stretches.append(told)
+        graded = _graded(each, result, smoothed, start, end)
+        if graded is not None:
+            stretches.append(graded)
         met = result.innovations
         inside = (met.tai_ns >= start) & (met.tai_ns < end)
         for name, code in OUTCOMES.items():

@@ -110,17 +110,20 @@ def usable_attitudes(
     return kept, int(np.count_nonzero(~sound))
 
 
-def attitudes_where(given: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
+def attitudes_where(attitudes: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
     """Some of the attitudes."""
     return AttitudeMeasurements(
-        given.tai_ns[places], given.quaternion[places], given.covariance_rad2[places]
+        attitudes.tai_ns[places], attitudes.quaternion[places], attitudes.covariance_rad2[places]
     )
 
 
-def directions_where(given: DirectionMeasurements, places: Any) -> DirectionMeasurements:
+def directions_where(directions: DirectionMeasurements, places: Any) -> DirectionMeasurements:
     """Some of the directions."""
     return DirectionMeasurements(
-        given.tai_ns[places], given.body[places], given.inertial[places], given.sigma_rad[places]
+        directions.tai_ns[places],
+        directions.body[places],
+        directions.inertial[places],
+        directions.sigma_rad[places],
     )
 
 

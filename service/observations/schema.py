@@ -116,8 +116,8 @@ class StarIn(Wire):
     def _one_direction(self) -> Self:
         angles = (self.h_deg is not None, self.v_deg is not None)
         for kind in ("counts", "times"):
-            given = [getattr(self, f"{axis}_{kind}") is not None for axis in ("h", "v")]
-            if any(given) and not all(given):
+            present = [getattr(self, f"{axis}_{kind}") is not None for axis in ("h", "v")]
+            if any(present) and not all(present):
                 raise ValueError(f"needs both h_{kind} and v_{kind}, or neither")
         if self.h_times is not None:
             if self.vector is not None or any(angles) or self.h_counts is not None:

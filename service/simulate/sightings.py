@@ -199,8 +199,8 @@ class BatchScene:
             exact = direction if kind == "position_error" else seen.direction
             rates = seen.tracker.body_from_tracker.T @ np.radians(self.rates_deg_per_s)
             for k, magnitude_mag in enumerate(seen.magnitude.tolist()):
-                given = readings(seen.tracker, exact[k], rates, magnitude_mag, self.rng)
-                where[k] = where[k] if given is None else given
+                reading = readings(seen.tracker, exact[k], rates, magnitude_mag, self.rng)
+                where[k] = where[k] if reading is None else reading
         return [
             {**place, "magnitude": magnitude, "time_offset_s": offset_s}
             for place, magnitude, offset_s in zip(

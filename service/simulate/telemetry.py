@@ -221,7 +221,7 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
     """
     count = 0
 
-    def told() -> Iterator[DrawnBatch]:
+    def truth_written() -> Iterator[DrawnBatch]:
         nonlocal count
         for each in drawn:
             truth.write(_line(each.truth))
@@ -233,10 +233,13 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
         out = stack.enter_context(_appearing(telemetry))
         if telemetry_format(telemetry) == "csv":
             write_batches_csv(
-                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in told()), out
+                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in truth_written()),
+                out,
             )
         else:
-            out.writelines(_line(line) for each in told() for line in (each.batch, *each.gyro))
+            out.writelines(
+                _line(line) for each in truth_written() for line in (each.batch, *each.gyro)
+            )
     return count
 
 
