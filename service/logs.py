@@ -141,12 +141,12 @@ class CountingHandler(logging.StreamHandler[TextIO]):
     def _write_count(self, known: "_Counted") -> None:
         last = known.last
         message = f"repeated {known.count} times within {self._period_s:g} s: {last.getMessage()}"
-        told = logging.LogRecord(
+        count_record = logging.LogRecord(
             last.name, last.levelno, last.pathname, last.lineno, message, None, None
         )
         # Of many requests, not of the one that this thread happens to work on.
-        vars(told).update(repeated=known.count, about=None)
-        super().emit(told)
+        vars(count_record).update(repeated=known.count, about=None)
+        super().emit(count_record)
 
     def write_counts(self) -> None:
         """Write what is counted by now, and count anew."""
@@ -201,7 +201,7 @@ class _Lines(logging.Formatter):
         """The fields of a line, in order; those that have no value are left out."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         about: RequestContext | None = getattr(record, "about", request.get())
-        told: dict[str, object | None] = {
+        values: dict[str, object | None] = {
             "time": f"{seconds}.{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
             "process": self._process,
@@ -215,7 +215,7 @@ class _Lines(logging.Formatter):
         }
         return {
             name: _harmless(value) if isinstance(value, str) else value
-            for name, value in told.items()
+            for name, value in values.items()
             if value is not None
         }
 

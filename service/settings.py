@@ -134,13 +134,13 @@ class Settings:
         somewhere else.
         """
         known = {PREFIX + field.name.upper(): field.name for field in fields(cls)}
-        given = {
+        values = {
             name: text for name, text in environment.items() if name.startswith(PREFIX) and text
         }
-        for name in given:
+        for name in values:
             if name not in known:
                 raise BadConfiguration(f"{name}: no such setting; there are {', '.join(known)}")
-        return cls(**{known[name]: _read(known[name], text) for name, text in given.items()})
+        return cls(**{known[name]: _read(known[name], text) for name, text in values.items()})
 
 
 _READERS: dict[str, Callable[[str], Any]] = {

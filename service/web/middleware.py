@@ -241,8 +241,8 @@ async def _answered(route: APIRoute, request: Request) -> Response:
 def _request_id(scope: Scope) -> str:
     """The id that a client or a proxy gave a request, where it is a plain word; else a new one."""
     # Not by `secrets`: its system call gives up the interpreter's lock, and an id may be guessed.
-    given = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
-    return given.decode() if _SANE_ID.fullmatch(given) else f"{getrandbits(64):016x}"
+    sent = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
+    return sent.decode() if _SANE_ID.fullmatch(sent) else f"{getrandbits(64):016x}"
 
 
 def _run(scope: Scope) -> str | None:

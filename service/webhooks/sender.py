@@ -360,8 +360,8 @@ class WebhookSender:
 
     # ---- the records -------------------------------------------------------------------------
 
-    async def _read(self, ask: Callable[..., T], *given: Any) -> T:
-        return await self._loop.run_in_executor(self._readers, ask, *given)
+    async def _read(self, ask: Callable[..., T], *arguments: Any) -> T:
+        return await self._loop.run_in_executor(self._readers, ask, *arguments)
 
     async def _change(self, change: Callable[[Connection], T]) -> T:
         return await asyncio.wrap_future(self._store.writer.change(change))

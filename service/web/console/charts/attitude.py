@@ -212,7 +212,7 @@ def band_path(
             k = int(part[0])
             text.append(f"M{x[k] - 1} {upper[k]}h2V{lower[k]}h-2z")
             continue
-        there = line_path(x[part], upper[part])
+        forward = line_path(x[part], upper[part])
         back = line_path(x[part][::-1], lower[part][::-1])
-        text.append(f"{there}L{back[1:]}z")
+        text.append(f"{forward}L{back[1:]}z")
     return "".join(text)

@@ -108,7 +108,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         measured=record.input.get("measurement"),
         charts=[sky_chart(each, field.through, view) for each in field.trackers],
         view=view,
-        here=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
+        link_to=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
         field=field,
         fields=fields,
         options=options.model_dump(exclude_none=True, exclude_unset=True),
