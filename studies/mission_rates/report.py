@@ -37,7 +37,7 @@ def heading(plan: Plan) -> list[str]:
     if plan.direction_deg is not None:
         ra_deg, dec_deg = plan.direction_deg
         where = f"{plan.within_deg:g} deg about RA {ra_deg:g}, Dec {dec_deg:g} deg"
-    said = {
+    statements = {
         "phi_deg": f"phi {errors.phi_deg:g} deg",
         "theta_deg": f"theta {errors.theta_deg:g} deg",
         "psi_deg": f"psi {errors.psi_deg:g} deg",
@@ -48,7 +48,7 @@ def heading(plan: Plan) -> list[str]:
         ),
         "magnitude_error_mag": f"magnitude {errors.magnitude_error_mag:g} mag",
     }
-    unswept = [text for name, text in said.items() if name not in first.values]
+    unswept = [text for name, text in statements.items() if name not in first.values]
     switched = [f"{name} {'on' if is_on else 'off'}" for name, is_on in plan.tests.items()]
     lines = [
         (

@@ -162,8 +162,8 @@ def printed_slope(found: Projections) -> float:
     index, count = the_ptp_paper().table_2[0]
     rows = the_ptp_paper().table_1
     density = (rows[-1][0] - rows[0][0]) / (rows[-1][1] - rows[0][1])
-    there = rows[-1][1] + (count - rows[-1][0]) / density
-    return (there - float(found.triangles.projection.value[0])) / (index - 1)
+    projection = rows[-1][1] + (count - rows[-1][0]) / density
+    return (projection - float(found.triangles.projection.value[0])) / (index - 1)
 
 
 def note_on_table_2(found: Projections) -> str:
@@ -250,8 +250,8 @@ def draw_figure_6(figure: Any, found: Projections) -> None:
     """The sides of triangles with the axis of their projections, and how many lie where."""
     index = found.triangles
     left = figure.add_subplot(1, 2, 1, projection="3d")
-    some = index.side[::SHOWN_EVERY]
-    left.scatter(*some.T, s=2, color=COLORS[0], alpha=0.4, linewidths=0)
+    sides = index.side[::SHOWN_EVERY]
+    left.scatter(*sides.T, s=2, color=COLORS[0], alpha=0.4, linewidths=0)
     ends = np.array([index.projection.value[0], index.projection.value[-1]])
     line = index.mean + ends[:, None] * index.axis
     left.plot(*line.T, color=COLORS[1], lw=2)

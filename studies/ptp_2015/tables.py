@@ -142,19 +142,19 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
     printed = {row.algorithm: row for row in the_ptp_paper().table_6}
     rows = []
     for tally in tallies:
-        told = printed.get(tally.algorithm)
+        of_paper = printed.get(tally.algorithm)
         rows.append(
             (
                 tally.algorithm,
                 "lost and added" if tally.case.adds else "lost alone",
-                f"{told.rate_pct:.2f}" if told else "",
+                f"{of_paper.rate_pct:.2f}" if of_paper else "",
                 str(tally.strict),
                 str(tally.loose),
                 str(tally.checked),
                 str(tally.wrong),
-                f"{told.time_ms:.2f}" if told else "",
+                f"{of_paper.time_ms:.2f}" if of_paper else "",
                 tally.times,
-                f"{told.memory_mb:g}" if told else "",
+                f"{of_paper.memory_mb:g}" if of_paper else "",
                 f"{size[tally.algorithm].nbytes / MB:.2f}",
             )
         )
@@ -225,14 +225,14 @@ def line_table(tallies: Sequence[Tally], axis: str, unit: str, printed: Ends) ->
     for tally in sorted(tallies, key=lambda t: getattr(t.case, axis)):
         value = getattr(tally.case, axis)
         ends = printed.get(tally.algorithm)
-        told = ""
+        of_paper = ""
         if ends and value in (values[0], values[-1]):
-            told = f"{ends[0] if value == values[0] else ends[1]:.1f}"
+            of_paper = f"{ends[0] if value == values[0] else ends[1]:.1f}"
         rows.append(
             (
                 f"{value:g} {unit}",
                 tally.algorithm,
-                told,
+                of_paper,
                 str(tally.strict),
                 str(tally.loose),
                 str(tally.checked),

@@ -36,8 +36,8 @@ def peak_offset(samples: Array) -> float:
     """The place of the greatest sample of a circle, from the first, by a parabola through three."""
     at = int(np.argmax(samples))
     n = len(samples)
-    before, here, after = samples[at - 1], samples[at], samples[(at + 1) % n]
-    bend = float(before - 2.0 * here + after)
+    before, peak, after = samples[at - 1], samples[at], samples[(at + 1) % n]
+    bend = float(before - 2.0 * peak + after)
     fine = 0.5 * float(before - after) / bend if bend < 0.0 else 0.0
     whole = at if at <= n // 2 else at - n
     return whole + fine

@@ -63,8 +63,8 @@ def least_spread(rows: Array, variance: float, count: int) -> float:
     prior = np.diag(1.0 / np.square(PRIOR))
     found = math.inf
     for chosen in combinations(range(len(rows)), count):
-        some = rows[list(chosen)]
-        covariance = np.linalg.inv(prior + some.T @ some / variance)
+        subset = rows[list(chosen)]
+        covariance = np.linalg.inv(prior + subset.T @ subset / variance)
         found = min(found, float(covariance[0, 0] + covariance[1, 1]))
     return found
 
