@@ -21,7 +21,7 @@ from service.vectors import Matrix, Vector, rotate_about
 ROUNDS = 15
 OUTLIER_SIGMAS = 4.0
 OBSERVABLE = 0.5
-"""Of its prior's sigma: what is known less well than this was not seen in the pictures."""
+"""The share of its prior's sigma below which a parameter counts as seen in the pictures."""
 LEAST_FLOOR_PX = 0.01
 
 

@@ -29,7 +29,7 @@ from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 ROUGH_SHARE = 0.05
-"""Of the half diagonal: what a place may be off by where no lens could be fitted."""
+"""The share of the half diagonal by which a place may be off where no lens could be fitted."""
 LEAST_SIGMA_PX = 0.05
 
 
@@ -125,7 +125,7 @@ def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
 
 
 def _scale_of(found: PictureAttitude, directions: Vector, sigma_rad: Vector) -> float:
-    """By how much the sigmas of stars must grow for the attitude to be as unsure as its lens."""
+    """The factor by which star sigmas must grow for the attitude to be as unsure as its lens."""
     outer = np.einsum("ni,nj->nij", directions, directions)
     information = ((np.eye(3) - outer) / sigma_rad[:, None, None] ** 2).sum(axis=0)
     alone = np.diag(np.linalg.inv(information))

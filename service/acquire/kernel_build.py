@@ -36,7 +36,7 @@ RETRY_S = 10
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""By which the service is stopped; they may reach its whole process group."""
+"""The signals that stop the service; they may reach its whole process group."""
 
 
 class _Share(NamedTuple):
@@ -56,7 +56,7 @@ class KernelBuild:
         self._children: list[SpawnProcess] = []
         self._cancelled = False
         self.is_needed = not _is_complete()
-        """Until a build has succeeded: an answer must not depend on what is compiled."""
+        """True until a build has succeeded: an answer must not depend on what is compiled."""
         self._zones_needed = self.is_needed
 
     def require_zones_built(self) -> None:
@@ -134,7 +134,7 @@ def _is_complete() -> bool:
 
 
 def end_with_parent(stop: connection.Connection | None = None) -> None:
-    """In a child process: ignore the signals that stop the parent, and exit when it has ended.
+    """Ignore, in a child process, the signals that stop the parent, and exit when it has ended.
 
     Or when the other end of `stop` is closed.
     """
@@ -145,7 +145,7 @@ def end_with_parent(stop: connection.Connection | None = None) -> None:
 
 
 def exit_after_parent(stop: connection.Connection | None = None) -> None:
-    """In a child process: exit when the parent has ended, or the other end of `stop` is closed."""
+    """Exit, in a child process, when the parent has ended or the other end of `stop` is closed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     ends: list[int | connection.Connection] = [parent.sentinel]
@@ -213,11 +213,11 @@ def _compile(
 # The size of machine code grows evenly with the time that its compiling takes.
 
 KERNEL_BYTES = 6_090_000
-"""Of the machine code of all kernels, about; other processors have a tenth more or less."""
+"""The size of the machine code of all kernels, about; other processors differ by a tenth."""
 MOST_SHARE = 0.99
-"""Until it is over, since the size is not known to the last byte."""
+"""The largest share shown until it is over, since the size is not known to the last byte."""
 LEAST_SHARE = 0.02
-"""Before this the time that is left cannot be told."""
+"""The share before which the remaining time cannot be estimated."""
 STEPS = {
     "geometry": "zones and pairs",
     "sky": "zones and pairs",

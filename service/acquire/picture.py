@@ -47,7 +47,7 @@ GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
 MOST_SIGMA_SHARE = 1.0 / 400.0
-"""Of the longer side: an attitude that is less certain is no answer.
+"""The share of the longer side above which an attitude's sigma is too large for an answer.
 
 Those of nine real pictures are .0005 of the side at most, of drawn ones with seven stars or more
 .001.  Residuals scale the sigmas: where stars lie anywhere within gates of pixels, by chance or
@@ -64,7 +64,7 @@ class PictureStar:
     id: str
     name: str | None
     row: int
-    """Of the bright stars that the picture was held against."""
+    """The rows of the bright stars that the picture was compared with."""
     magnitude_v_mag: float
     u_px: float
     v_px: float

@@ -23,7 +23,7 @@ from service.tracks.linking import compile_linking
 from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
-"""Where there are many bright stars: right ascension and declination, in degrees."""
+"""A field with many bright stars: right ascension and declination, in degrees."""
 BRIGHT_MAG = 4.0
 """So few stars are enough for every kernel, and are soon built from."""
 BRIGHTEST_MAG = 3.0

@@ -124,7 +124,7 @@ class ZoneResult(Struct, frozen=True, eq=False):
 
     @property
     def good(self) -> bool:
-        """Whether there is an attitude that its own residuals do not speak against."""
+        """True if there is an attitude that its own residuals do not speak against."""
         return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
 
 
@@ -164,7 +164,7 @@ class ZoneSearch:
         self.errors: dict[int, Exception] = {}
         self._asked: dict[int, _Asked] = {}
         self._by_itself: dict[int, Identification] = {}
-        """By tracker: of identifiers that take one sighting at a time."""
+        """By tracker, the results of identifiers that take one sighting at a time."""
         self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
         """(row, tracker) that are identified in one call, by (place of the tracker in its batch,
         identifier, rules, zone)."""

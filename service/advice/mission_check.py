@@ -32,7 +32,7 @@ FEW_STARS = 3
 FEW_SHARE = 0.05
 MANY_STARS = 100
 MANY_PAIRS = 300_000
-"""Of one zone: 5 MB, and as many pairs to look through for each batch."""
+"""Pairs of one zone: 5 MB, and as many pairs to look through for each batch."""
 SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5

@@ -1,4 +1,4 @@
-"""Whether a tolerance is too tight or too wide for what the tracker really measures.
+"""Finds tolerances that are too tight or too wide for what the tracker really measures.
 
 A tolerance is held against the differences of pairs that are known to be the
 same stars.  It is too tight where it certainly loses more than one true pair in

@@ -16,7 +16,7 @@ ROWS, COLUMNS = 18, 72
 
 FIRST_STEP_DEG, LAST_STEP_DEG = 2.5, 0.02
 STAR_STARTS, PAIR_STARTS = 16, 8
-"""From how many axes of the grid the extremes of stars and of pairs are sought."""
+"""Numbers of axes of the grid from which the extremes of stars and of pairs are sought."""
 AXES_AT_ONCE = 72
 
 

@@ -32,7 +32,7 @@ from service.sky.geometry.star_voxels import REACH_RAD
 from service.vectors import Vector, to_ra_dec
 
 RINGS = 4
-"""Of equal area, about a star."""
+"""The number of rings of equal area about a star."""
 ANGLES, STEPS, BEARINGS = 240, 8, 48
 """Steps across a zone, of a ring outwards and of half a turn about a star."""
 NEIGHBOURS_AT_ONCE = 4_000_000
@@ -41,7 +41,7 @@ VOXEL_BITS_PER_STAR = 128
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Of each star of a run catalog, ring by ring as far as HMAX, how many others lie there.
+    """The number of other stars about each star of a run catalog, ring by ring as far as HMAX.
 
     `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of their unit vectors.
     """

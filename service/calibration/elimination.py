@@ -202,10 +202,10 @@ def _add_blocks(into: Matrix, part: Linearised, weight: Weights) -> None:
 Marks = npt.NDArray[np.bool_]
 
 LEAST_SHARE = 1e-9
-"""Of an unknown's information, what attitudes and other unknowns must leave of it."""
+"""The share of an unknown's information that attitudes and other unknowns must leave of it."""
 
 ORDER: tuple[Kind, ...] = ("alignment", "scale", "distortion", "temperature", "time_tag")
-"""Of unknowns that the stars do not tell apart, the later kind is the one not observable."""
+"""The order of kinds: of unknowns that the stars do not tell apart, the later is not observable."""
 
 REASONS: dict[Kind, str] = {
     "alignment": "too few batches in which this tracker and another both have identified stars",

@@ -38,7 +38,7 @@ ROUNDS, LINEARISATIONS = 30, 6
 LEAST_FREEDOM = 20
 """Residuals beyond what determines the unknowns: these give their scale to about a sixth."""
 FAR_RAD = 2e-3
-"""After larger steps than this the derivatives are computed anew."""
+"""The step above which the derivatives are computed anew."""
 LEAVE_OUT_FROM = 2
 """The round from which on stars far off are left out: before, the fit itself may be off."""
 RECOUNTED = 0.005
@@ -408,7 +408,7 @@ def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
 
 
 def _no_worse(excess: Vector) -> bool:
-    """Whether squares over blocks exceed others by no more than a standard error of the sum."""
+    """True if squares over blocks exceed others by no more than a standard error of the sum."""
     n = len(excess)
     error = float(np.std(excess, ddof=1)) * math.sqrt(n) if n > 1 else 0.0
     return float(excess.sum()) <= error

@@ -199,7 +199,7 @@ def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> No
 
 
 def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str, Lines]]) -> bool:
-    """Whether the edited mission has every change, and is the same but for these."""
+    """True if the edited mission has every change, and is the same but for these."""
     for old, new in zip(before.trackers, edited.trackers, strict=True):
         wanted = expected[old.name]
         for key, value in wanted["tracker"].items():

@@ -66,7 +66,7 @@ class MeasuredInnovations(TimedColumns):
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:
-        """Whether the filter took the measurement (m,): it was accepted, or began with it."""
+        """The measurements (m,) that the filter took: it was accepted, or began with it."""
         return _used(self.outcome)
 
     @property

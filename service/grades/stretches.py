@@ -58,7 +58,7 @@ class Cut:
 
 Mask = npt.NDArray[np.bool_]
 LEAST_RATIO = 1e-10
-"""Of the smallest variance to the largest: a covariance of less is no better than singular."""
+"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,7 +216,7 @@ def _without_gyro(
 # samples that the gyro can have measured.
 
 GAP_IN_STEPS = 1.5
-"""Of the median step: a longer one is a gap, where the mission says nothing else."""
+"""A step longer than this many median steps is a gap, unless the mission sets one."""
 NS = 1e-9
 
 

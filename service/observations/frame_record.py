@@ -25,7 +25,7 @@ class FrameRecord:
     noise_counts: float
     candidates: int
     sharp: Sequence[tuple[float, float]]
-    """Where (u, v) hot pixels and cosmic rays were passed by."""
+    """The places (u, v) of hot pixels and cosmic rays that were left out."""
     stars: Sequence[Mapping[str, Any]]
     timings_us: Mapping[str, int]
     preview: bytes

@@ -335,7 +335,7 @@ def _stars_of_different_trackers(
 
 LEAST_SIGMA_ARCSEC, LARGEST_SIGMA_ARCSEC = 1e-3, 36_000.0
 LEAST_RATIO = 1e-10
-"""Of the least variance to the largest: a covariance of less is no better than singular."""
+"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
 
 
 def _of_a_tracker(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:

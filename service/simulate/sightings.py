@@ -72,9 +72,9 @@ class RealSky:
     first: Rows
     """Where each star's components begin; one entry more than there are stars."""
     light: Vector
-    """Of each component, in the mission's instrument."""
+    """The light of each component, in the mission's instrument."""
     magnitude_mag: Vector
-    """Of each star, all its components together."""
+    """The magnitude of each star, all its components together."""
 
     def directions(self, star: Rows, time: Utc, position_km: Vector) -> Vector:
         """Unit vectors (n, 3), ICRS, from a spacecraft at a geocentric position to some stars.
@@ -226,7 +226,7 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
 
 IMAGE_SIGMA_SAMPLES = 1.2
 LIGHT_OVER_NOISE = 300.0
-"""Of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
+"""The light of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
 LIGHT_AT_MAG, FAINTEST_MAG = 5.0, 7.5
 FULL_SHARE = 0.8
 MOST_STEPS_OFF = 2.0

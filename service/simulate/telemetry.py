@@ -209,7 +209,7 @@ def _truth(
 
 
 def truth_path(telemetry: Path) -> Path:
-    """Where the truth of a telemetry file stands: OUT.truth.ndjson beside OUT.ndjson."""
+    """The truth of a telemetry file: OUT.truth.ndjson beside OUT.ndjson."""
     return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
 
 

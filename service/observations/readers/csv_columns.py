@@ -46,9 +46,9 @@ VECTORS = {
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
 READINGS = ("h_counts", "v_counts", "h_times", "v_times")
-"""Of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
+"""Columns of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
 LINES = ("column_counts", "row_counts")
-"""Of a tracker with a raster, in a row by themselves: it has no stars."""
+"""Columns of a tracker with a raster, in a row by themselves: it has no stars."""
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")

@@ -55,7 +55,7 @@ class JoinedRows:
     may_lack: ClassVar[str]
     """What may be missing where a row beside these cannot be read."""
     refuses_faulty_rows: ClassVar[bool]
-    """Whether a row with a fault refuses the rows of its key alone, or those beside it."""
+    """True if a faulty row refuses the rows of its key alone; False: those beside it, too."""
 
     def __init__(self, number: int, key: tuple[str, ...]) -> None:
         self.number, self.key = number, key

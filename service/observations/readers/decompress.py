@@ -14,7 +14,7 @@ from service.errors import BadBatch, Fault
 Coding = Literal["identity", "gzip", "zstd"]
 
 MAX_UNPACKED_BYTES = 64 << 30
-"""Beyond what any archive of telemetry holds: a small body that unpacks to more is no telemetry."""
+"""More than any archive of telemetry holds: a body that unpacks to more is no telemetry."""
 MAX_WINDOW_BYTES = 128 << 20
 
 
