@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 LEAST_SIGMA_ARCSEC = 1e-3
 BLENDED_SHARE = 0.15
-"""Of the image's sigma: what the light of an unseen companion may move a blended star.
+"""The share of the image's sigma by which an unseen companion may move a blended star.
 
 One with the share r of the light moves it by 0.86 r sigma at most, where it stands
 1.4 sigma away; nearer ones are merged in run catalogs too."""

@@ -33,7 +33,7 @@ StatusWanted = Literal["good", "suspect", "all"]
 ProductGrade = Literal["raw", "filtered", "smoothed"]
 OWN, DERIVED, NONE, ESTIMATED = "own", "derived", "none", "estimated"
 SAME_MOMENT_NS = 1_000
-"""Of attitudes that are closer than this the last one counts: clocks of kernels have 1 us."""
+"""The last of attitudes closer than this counts: clocks of kernels have 1 us."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class SeriesInfo:
         return f"{words} of {self.spacecraft} in run {self.run}{period}"
 
     def provenance(self) -> dict[str, str]:
-        """Where the attitudes come from, as texts by name."""
+        """The origin of the attitudes, as texts by name."""
         return {
             "spacecraft": self.spacecraft,
             "object_id": self.object_id or self.spacecraft,
@@ -145,12 +145,12 @@ class AttitudeRows:
     method: Texts
     quaternion: Vector
     covariance_arcsec2: Vector
-    """Of shape (n, 6): 11, 12, 13, 22, 23, 33."""
+    """Covariances (n, 6): 11, 12, 13, 22, 23, 33."""
     rate_deg_per_s: Vector
     residual_rms_arcsec: Vector
     predicted_rms_arcsec: Vector
     stars: Integers
-    """Of shape (n, 4): observed, unique, ambiguous, unmatched."""
+    """Counts of stars (n, 4): observed, unique, ambiguous, unmatched."""
     model: Texts
     revision: Integers
     bias_deg_per_h: Vector

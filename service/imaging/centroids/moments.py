@@ -195,7 +195,7 @@ BLEND_SHARE = 0.01
 
 
 def is_blended(found: Fit, psf: Psf) -> bool:
-    """Whether pixels hold light beside the star that its shape does not explain.
+    """True if pixels hold light beside the star that its shape does not explain.
 
     What is left after the star is taken off, at its best place, is searched for a
     second one of the same shape about every pixel.

@@ -49,7 +49,7 @@ class CentroidRecord:
 
     @property
     def usable(self) -> bool:
-        """Whether there is a place."""
+        """True if there is a place."""
         return self.refused is None
 
 

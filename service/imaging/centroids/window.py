@@ -86,13 +86,13 @@ class Window:
 
     @cached_property
     def usable(self) -> Mask:
-        """Where a pixel holds a believable number below saturation."""
+        """The pixels that hold a believable number below saturation."""
         finite = np.isfinite(self.counts) & (self.counts < self.detector.saturation_counts)
         return finite if self.good is None else finite & self.good
 
     @cached_property
     def saturated(self) -> Mask:
-        """Where a pixel is full."""
+        """The pixels that are full."""
         return np.asarray(self.counts >= self.detector.saturation_counts)
 
     @cached_property
@@ -161,7 +161,7 @@ class Region:
 
     @cached_property
     def inside(self) -> tuple[slice, slice]:
-        """Where the rectangle stands in the window's arrays."""
+        """The rectangle's slices of the window's arrays."""
         return (
             slice(self.row - self.above, self.row + self.below + 1),
             slice(self.column - self.left, self.column + self.right + 1),
@@ -189,7 +189,7 @@ class Region:
 
     @cached_property
     def usable(self) -> Mask:
-        """Where the pixels may be believed."""
+        """The pixels that may be believed."""
         return self.window.usable[self.inside]
 
     def flags(self, wanted_half: int) -> tuple[Flag, ...]:

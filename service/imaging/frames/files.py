@@ -147,7 +147,7 @@ _MAX_TAGS = 256
 
 
 def is_raw(file: IO[bytes], start: bytes) -> bool:
-    """Whether a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
+    """True if a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
     if start.startswith(MAGICS) or start[4:12] == _CR3:
         return True
     if not start.startswith((b"II*\0", b"MM\0*")):

@@ -196,7 +196,7 @@ AVERAGES, STARTS, ENDS = (
     ("DATE-END", "MJD-END"),
 )
 TIMES_OF_DAY = ("TIME-OBS", "UT")
-"""Of a date without one."""
+"""The keywords of the time of day of a date without one."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
 """Moments that are farther apart contradict each other."""

@@ -39,7 +39,7 @@ _NUMBERS = {
 }
 """The types that are read, by version, with the numbers of a state: the quaternion comes first."""
 _NAMES = ("EPOCH", "Q1", "Q2", "Q3", "QC")
-"""Of the elements of an XML state."""
+"""The names of the elements of an XML state."""
 _HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")
 _REQUIRED = (
     "OBJECT_NAME",
@@ -173,7 +173,7 @@ class _Reader:
         return metadata.one_of(name, _V1_ONLY[name]) if self._version == 1 else ""
 
     def _from_body(self, metadata: Metadata) -> bool:
-        """Whether REF_FRAME_A is the body; the other frame must be inertial."""
+        """True if REF_FRAME_A is the body; the other frame must be inertial."""
         frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
         is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
         for name, frame in frames.items():

@@ -30,9 +30,9 @@ class Segment:
 
     place: str
     time_ns: Integers
-    """In ascending order; `Utc.tai_ns`."""
+    """Times in ascending order; `Utc.tai_ns`."""
     quaternion: Vector
-    """Of shape (n, 4), of norm 1."""
+    """Quaternions (n, 4) of norm 1."""
     first_ns: int
     last_ns: int
 
@@ -96,7 +96,7 @@ class Span(Protocol):
 
     @property
     def place(self) -> str:
-        """Where it stands in its file."""
+        """The place of an attitude in its file."""
 
     @property
     def first_ns(self) -> int:
@@ -151,9 +151,9 @@ class StateSegment:
 
     place: str
     time_ns: Integers
-    """In ascending order; `Utc.tai_ns`."""
+    """Times in ascending order; `Utc.tai_ns`."""
     state: Vector
-    """Of shape (n, 6): km and km/s."""
+    """States (n, 6) in km and km/s."""
     first_ns: int
     last_ns: int
     method: Interpolation

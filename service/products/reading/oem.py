@@ -56,10 +56,10 @@ _METHODS: dict[str, Interpolation] = {
 MOST_DEGREE = 19
 """Polynomials of higher degree follow the rounding of the states."""
 DEFAULT_DEGREE = 7
-"""Of Hermite's interpolation, where the file names none."""
+"""The degree of Hermite's interpolation, where the file names none."""
 EARTH_GM_KM3_PER_S2 = 398600.4418
 LONGEST_STEP_OF_PERIOD = 1 / 12
-"""Between states of a file that names no interpolation: a longer step would cost kilometres."""
+"""The longest step between states if no interpolation is named: a longer one costs kilometres."""
 SHORT_NS = 10**9
 """The states must reach START_TIME and STOP_TIME this near, else the file was cut short."""
 MAX_KM, MAX_KM_PER_S = 1e9, 100.0
