@@ -33,11 +33,11 @@ from service.ingest import worker_process
 from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-"""Before processes are started in place of some that died: twice as long each time."""
+"""The pause before processes replace some that died: twice as long each time."""
 IDLE_S = 600.0
-"""After so long without a chunk the processes end, and give their memory back."""
+"""The time without a chunk after which the processes end, and give their memory back."""
 MOST_STARTS = 3
-"""Of processes for one chunk, where they die before they have it."""
+"""The most starts of processes for one chunk, where they die before they have it."""
 SERVER_RETRY_S = 0.1
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
@@ -74,7 +74,7 @@ class _Processes(Generic[Input, Output]):
     stop: Connection
     tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
     pids: set[int] = field(default_factory=set)
-    """Those that are ready to work; all are, as soon as one is."""
+    """The processes that are ready to work; all are, as soon as one is."""
     is_ending: bool = False
     _closing: threading.Lock = field(default_factory=threading.Lock)
 

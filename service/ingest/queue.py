@@ -108,7 +108,7 @@ class IngestQueue:
         self._writer, self._pool = writer, pool
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
-        """Those that are being computed or recorded, each with its repeats."""
+        """The batches that are being computed or recorded, each with its repeats."""
         self._sequences: Sequences[PendingBatch] = Sequences()
         self._unanswered: dict[PendingBatch, None] = {}
         self._written: list[tuple[PendingBatch, WriteOutcome]] = []
@@ -186,7 +186,7 @@ class IngestQueue:
         return [job for job in to_write if job.change is not None or job.unsaved_results]
 
     def _is_for_now(self, job: QueuedJob) -> bool:
-        """Whether a batch is to be computed now; otherwise later, or one like it is already."""
+        """True if a batch is to be computed now; False if later, or if one like it is already."""
         pending: PendingBatch = job.pending
         with self._lock:
             repeats = self._in_flight.get(pending.identity)
@@ -313,15 +313,15 @@ T = TypeVar("T")
 
 
 class Sequences(Generic[T]):
-    """Those of one key that wait while another of it is at work.  The caller holds a lock."""
+    """The batches of one key that wait while another of it is at work.  The caller holds a lock."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, list[tuple[int, int, T]]] = {}
-        """Of each key that has one at work: the time of a batch, a number, the batch."""
+        """By key that has one at work: the time of a waiting batch, a number, the batch."""
         self._numbers = count()
 
     def enter(self, key: Hashable, time_ns: int, item: T) -> bool:
-        """Whether it may begin; if not, `leave` gives it when its turn has come."""
+        """True if it may begin; if not, `leave` gives it when its turn has come."""
         waiting = self._waiting.get(key)
         if waiting is None:
             self._waiting[key] = []

@@ -41,7 +41,7 @@ SAMPLES_BEFORE_S = 60.0
 
 
 def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
-    """Whether the attitude of a batch is to be predicted from the record."""
+    """True if the attitude of a batch is to be predicted from the record."""
     if batch.tracking is not None:
         return not batch.tracking.resolved
     is_default = mission is not None and mission.tracking is not None and mission.tracking.default

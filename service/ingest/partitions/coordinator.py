@@ -141,7 +141,7 @@ def reprocess_partitions(
 # goes on, and every batch comes once.
 
 MOST_BATCHES = 10_000
-"""Of a task made of the record, as of a part of the archive."""
+"""The most batches of a task made of the record, as of a part of the archive."""
 _AT_ONCE = 1_000
 
 
@@ -155,7 +155,7 @@ class Unit:
     part: PlacedPart | None
     batches: int
     before: int = 0
-    """Of the record's: how many the run has."""
+    """How many of the record's batches the run has."""
 
     @property
     def partitions(self) -> int:

@@ -34,7 +34,7 @@ from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole
 
 RETRIES = 3
-"""Of a task that raises; one whose worker dies goes to another worker by itself."""
+"""Retries of a task that raises; one whose worker dies goes to another worker by itself."""
 CONNECT_S = 20
 FEWEST_PENDING, PENDING_A_WORKER = 4, 2
 SCHEMES = ("tls://", "tcp://")

@@ -48,7 +48,7 @@ COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options",
 AT_ONCE = 1_000
 """Batches that go through the core together."""
 _DIGITS = 24
-"""Of a digest in the name of a file."""
+"""The digits of a digest in the name of a file."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ class PartitionResult:
     """What came of a task: its part, and the batches that the settings cannot take."""
 
     made: RunPart | None
-    """None: every batch was refused."""
+    """The part that was made; None: every batch was refused."""
     refused: Sequence[RefusedBatch]
 
     @property

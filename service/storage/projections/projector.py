@@ -96,15 +96,15 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
 """Each adds new results, in the order of the record, to tables that it alone fills."""
 MOST_AT_ONCE = 500
 LONGEST_S = 0.05
-"""Of one transaction; the next one takes fewer results where this one took longer."""
+"""The duration of one transaction; the next one takes fewer results where this one took longer."""
 EVERY_S = 0.1
-"""Between the beginnings of two transactions, unless a reader waits."""
+"""The time between the beginnings of two transactions, unless a reader waits."""
 LOOK_S = 1.0
-"""Between two looks for what other processes recorded, and for where another one projects."""
+"""The time between two looks for what other processes recorded, and for another projector."""
 SHARED_LOOK_S = 0.1
 """The same on PostgreSQL in the process that projects: other services record all the time."""
 POLL_S = 0.02
-"""Between two looks of a reader for where another process projects."""
+"""The time between two looks of a reader for where another process projects."""
 GAP_S = 0.01
 """The pause before a gap in the record is looked at again."""
 WAIT_S = 1.0
@@ -112,7 +112,7 @@ WAIT_S = 1.0
 MOST_BEHIND = 20_000
 """Results; bulk loads, replays and reprocessing wait while there are more."""
 HOURS_AT_ONCE = 24
-"""Of trends that are counted anew, in one transaction."""
+"""The hours of trends that are counted anew in one transaction."""
 CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
 

@@ -273,7 +273,7 @@ _AT_ONCE = 1_000
 
 
 def is_archived_in_part(connection: Connection, selected: ResultFilter, other: str) -> bool:
-    """Whether the archive has batches of the period in one of the runs."""
+    """True if the archive has batches of the period in one of the runs."""
     return any(
         parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
         for run in (selected.run, other)

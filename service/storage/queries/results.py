@@ -261,7 +261,7 @@ class ResultPlace:
 
 
 def place_of(connection: Connection, id: str) -> ResultPlace:
-    """Where a result is."""
+    """The spacecraft, run and time of a result."""
     row = connection.execute(select(results).where(results.c.id == id)).one()
     standing = select(results.c.id).where(results.c.batch_id == row.batch_id, results.c.current)
     return ResultPlace(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))

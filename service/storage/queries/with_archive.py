@@ -35,7 +35,7 @@ class Found:
 
     @property
     def place(self) -> Place:
-        """Where it stands in the order of time."""
+        """Its place in the order of time."""
         return self.row.time_ns, self.row.batch_id
 
     @property
@@ -234,7 +234,7 @@ class _Waiting:
 
     @property
     def begins(self) -> int:
-        """Where the first begins, in the order of the list: no row of any comes before it."""
+        """The begin of the first, in the order of the list: no row of any comes before it."""
         return self._heap[0][0]
 
     def add(self, more: Iterable[PlacedPart | Block]) -> None:
@@ -275,7 +275,7 @@ def parts_of(
 def _reaches(
     each: PlacedPart | Block, selected: ResultFilter, newest_first: bool, beyond: Place | None
 ) -> bool:
-    """Whether it may have rows of the filter beyond a place."""
+    """True if it may have rows of the filter beyond a place."""
     if selected.start is not None and each.last_ns < selected.start.tai_ns:
         return False
     if selected.end is not None and each.first_ns >= selected.end.tai_ns:

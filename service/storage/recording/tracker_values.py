@@ -151,7 +151,7 @@ def _rms(squares: float, count: int) -> float | None:
 
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
-    """Whether batches of a spacecraft's run are still to be split."""
+    """True if batches of a spacecraft's run are still to be split."""
     query = select(tracker_splits.c.run).where(
         tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
     )

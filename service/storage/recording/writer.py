@@ -61,7 +61,7 @@ class WriterState:
     queued: int
     oldest_s: float
     succeeded: bool
-    """Whether the last write did."""
+    """True if the last write did."""
     failed: int
     """Batches and changes that could not be written since the start."""
 

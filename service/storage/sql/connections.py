@@ -147,7 +147,7 @@ class PersistentConnection:
         self._keep(connection)
 
     def _is_idle(self, connection: Connection) -> bool:
-        """Whether a server says that its session is outside of any transaction, after an error.
+        """True if a server says that its session is outside of any transaction, after an error.
 
         The session may hold a lock, which would be lost with it.
         """

@@ -49,7 +49,7 @@ class DatabaseFile:
 
     @property
     def is_read_only(self) -> bool:
-        """Whether this process cannot write to the file, or make SQLite's log beside it."""
+        """True if this process cannot write to the file, or make SQLite's log beside it."""
         exists = self.path.exists()
         return exists and not (
             os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)

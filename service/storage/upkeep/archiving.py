@@ -65,7 +65,7 @@ from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
 Integers = npt.NDArray[np.int64]
 
 MOST_BATCHES = 10_000
-"""Of a part: what is held in memory, and deleted in one transaction."""
+"""The most batches of a part: it is held in memory, and deleted in one transaction."""
 
 MAX_ATTEMPTS = 5
 

@@ -270,7 +270,7 @@ def _entry(line: str) -> str:
 
 
 def _makes_schema(line: str, schema: str) -> bool:
-    """Whether a line of a backup's contents makes a schema that the database has already."""
+    """True if a line of a backup's contents makes a schema that the database has already."""
     return _entry(line).startswith((f"SCHEMA - {schema} ", f"COMMENT - SCHEMA {schema} "))
 
 

@@ -15,7 +15,7 @@ from service.times import LAST_YEAR, Utc, parse_utc, recorded_utc, shifted, utc_
 log = logging.getLogger(__name__)
 
 SOON_DAYS = 30
-"""From here on the service warns when it starts; the alert rules begin at the same time."""
+"""Days before an end from which the service warns when it starts; alert rules begin then, too."""
 DAY_S = 86_400.0
 _FIRST_YEAR = 2017
 

@@ -51,7 +51,7 @@ class ForgetFilter:
 
     @property
     def is_whole(self) -> bool:
-        """Whether no batch and no block is named."""
+        """True if no batch and no block is named."""
         return not (self.batches or self.gyro_blocks)
 
     def of(self, table: Table, names: Collection[str] = (), name: str = "") -> list[Any]:

@@ -28,12 +28,12 @@ from service.times import HOUR_S, Utc, bucket_start
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
 MOST_BATCHES = 10_000
-"""Of one transaction: others that write the same hour, and on SQLite all others, wait for it."""
+"""The most batches that one transaction deletes: other writers of the hour, on SQLite all, wait."""
 _AT_ONCE = 1_000
 _BLOCKS_AT_ONCE = 100
-"""Of up to 240 kB each."""
+"""Blocks that one transaction deletes, of up to 240 kB each."""
 _DAYS_AT_ONCE = 10
-"""Of about 12 MB each."""
+"""Days that one transaction deletes, of about 12 MB each."""
 
 
 @dataclass

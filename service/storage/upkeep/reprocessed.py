@@ -85,7 +85,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """As `projections.projector` has it."""
+    """The latest batch, chosen as `projections.projector` does."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
@@ -203,7 +203,7 @@ def _is_known(store: Store, path: str) -> bool:
 
 
 def _has_some(store: Store, ids: Sequence[str]) -> bool:
-    """Whether some batches are recorded, others of them perhaps pruned, or are archived."""
+    """True if some batches are recorded, others of them perhaps pruned, or are archived."""
     with store.reading() as connection:
         return any(
             connection.scalar(

@@ -56,7 +56,7 @@ class PartFilter:
     end: Utc | None = None
 
     def takes(self, manifest: Manifest, part: Part) -> bool:
-        """Whether a part is selected."""
+        """True if a part is selected."""
         return (
             self.spacecraft in (None, manifest.spacecraft)
             and self.run in (None, part.run)
@@ -209,7 +209,7 @@ def _unnamed(day: Path, named: Container[str]) -> Iterator[str]:
 
 
 def _is_own(input: str, fingerprint: str) -> bool:
-    """Whether a fingerprint is that of an input; of one that cannot be read it is not."""
+    """True if a fingerprint is that of an input; of one that cannot be read it is not."""
     try:
         return fingerprint_of(input) == fingerprint
     except BadInput:

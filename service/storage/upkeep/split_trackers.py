@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 
 AT_ONCE = 50
 PAUSE_S = 0.25
-"""Between two steps of the service, each of which takes the writer some milliseconds."""
+"""The pause between two steps of the service, each of which takes the writer some milliseconds."""
 RETRY_S = 30.0
 LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
@@ -266,7 +266,7 @@ class OlderDigests:
     store: Store
 
     def waiting(self) -> bool:
-        """Whether any is missing."""
+        """True if any is missing."""
         with self.store.reading_record() as connection:
             return any(
                 connection.execute(select(column).where(digest.is_(None)).limit(1)).first()
