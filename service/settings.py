@@ -182,7 +182,7 @@ def networks(text: str) -> tuple[Network, ...]:
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """Whether a name or an address is this machine's own, whoever answers for names."""
+    """True if a name or an address is this machine's own, whoever answers for names."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

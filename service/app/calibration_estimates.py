@@ -62,7 +62,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 CALIBRATION_SAMPLE = 2_000
 LARGEST_CHOSEN_DEGREE = 5
 LONGEST_WAIT_S = 120.0
-"""For a thread of the solver, while others keep them all at work."""
+"""The wait for a thread of the solver, while others keep them all at work."""
 
 Step = Callable[[int, int], object]
 """Told after each batch: how many are done, and of how many."""
@@ -121,7 +121,7 @@ class CalibrationRun:
     first: str | None
     last: str | None
     magnitudes: tuple[MagnitudeCalibration, ...] = ()
-    """Of each tracker that was calibrated; empty where they were not asked for."""
+    """The magnitudes of each calibrated tracker; empty where they were not asked for."""
 
     @property
     def calibrated_magnitudes(self) -> dict[str, Magnitudes]:
@@ -131,7 +131,7 @@ class CalibrationRun:
 
     @property
     def covariance(self) -> Matrix:
-        """Of all unknowns, those of magnitudes last: these share nothing with the others."""
+        """The covariance of all unknowns, magnitudes last: these share nothing with the others."""
         blocks = [self.found.covariance, *(each.covariance for each in self.magnitudes)]
         size = sum(len(each) for each in blocks)
         whole, first = np.zeros((size, size)), 0
@@ -306,7 +306,7 @@ def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
 
 
 def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
-    """Of each tracker the rms of the residuals of used stars, before and after."""
+    """The rms of each tracker's residuals of used stars, before and after."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     rows = []
     for index, tracker in enumerate(found.stars.trackers):
@@ -338,7 +338,7 @@ def notes(run: CalibrationRun) -> list[str]:
 
 
 def _colors_differ(run: CalibrationRun) -> bool:
-    """Whether the calibrated trackers do not have one colour term within the noise of a star."""
+    """True if the calibrated trackers do not have one colour term within the noise of a star."""
     settings = run.calibrated_magnitudes
     colors = [settings[each.name].color_mag for each in run.mission.trackers]
     least = min(each.magnitude_sigma_mag for each in run.mission.trackers)

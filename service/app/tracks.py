@@ -26,7 +26,7 @@ from service.tracks.gathering import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000
-"""Of a period whose tracks are asked for: they are read in a few seconds."""
+"""The most batches of a period whose tracks are asked for: they are read in a few seconds."""
 EACH_SIDE = 20
 """Batches before and after one whose tracks are asked for."""
 

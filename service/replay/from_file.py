@@ -120,7 +120,7 @@ class FileEphemeris(FromFile):
 # batch explains its answer.
 
 CARRIED_WITHIN_S = 3600.0
-"""After more than an hour a batch keeps its own a priori knowledge."""
+"""The age of the last attitude above which a batch keeps its own a priori knowledge."""
 
 
 @dataclass(frozen=True)

@@ -76,7 +76,7 @@ ROUTERS: tuple[APIRouter, ...] = (
 )
 
 COMPRESS_LEVEL = 4
-"""Of gzip: a third of the time of its default, for 7 % more bytes of a list."""
+"""The level of gzip: a third of the time of its default, for 7 % more bytes of a list."""
 
 COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, OUTPUT_FORMATS["parquet"].media_type)
 """Media types that are compressed by themselves, or are streams of events."""

@@ -47,7 +47,7 @@ class Admission:
         trusted: Iterable[Network] = (),
         reserved: int = RESERVED_FOR_LOOPBACK,
     ) -> None:
-        """At most `most` connections, and `per_address` of a client that is not `trusted`.
+        """Allow at most `most` connections, and `per_address` of a client that is not `trusted`.
 
         The last `reserved` connections are for loopback addresses.
         """

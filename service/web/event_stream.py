@@ -27,10 +27,10 @@ HELD = 2_000
 READ_AT_ONCE = 500
 POLL_S = 1.0
 GATHER_S = 0.05
-"""After a commit: under load many are read at once."""
+"""The wait after a commit: under load many are read at once."""
 HEARTBEAT_S = 15.0
 LONGEST_S = 900.0
-"""Of one stream; who listens comes again by itself, and is asked anew who it is."""
+"""The duration of one stream; the listener then connects again, and is authenticated anew."""
 MAX_LISTENERS = 100
 MAX_OF_ONE_TOKEN = 10
 """Streams at a time: some pages in some browsers, and no more that would keep out others."""

@@ -131,7 +131,7 @@ class AroundRequests:
                 self._log(scope, inner, status, seconds)
 
     async def _is_open(self, path: str) -> bool:
-        """Whether access is open; of probes, while the database does not answer, whether it was."""
+        """True if access is open; for probes without a database, the last known answer."""
         try:
             return await is_open(self.access)
         except Busy:
@@ -359,7 +359,7 @@ class ConditionalAnswers:
 
 
 def _is_whole(message: Message) -> bool:
-    """Whether a message begins an answer that comes in one piece; streams tell no length."""
+    """True if a message begins an answer that comes in one piece; streams tell no length."""
     return (
         message["type"] == "http.response.start"
         and message["status"] == 200
@@ -381,7 +381,7 @@ def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, 
 
 
 def _names(asked: Headers, tag: str) -> bool:
-    """Whether `If-None-Match` names a tag; weak and strong ones of one name are the same."""
+    """True if `If-None-Match` names a tag; weak and strong ones of one name are the same."""
     opaque = tag.removeprefix("W/")
     named = [each.strip() for line in asked.getlist("if-none-match") for each in line.split(",")]
     return any(each == "*" or each.removeprefix("W/") == opaque for each in named)

@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 TEST_KIND = "test"
 TOTAL_S = 10.0
-"""From the look-up of the name to the end of the answer."""
+"""The time from the look-up of the name to the end of the answer."""
 GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
 
 
@@ -56,12 +56,12 @@ class Outcome:
 
     @property
     def delivered(self) -> bool:
-        """Whether the receiver has the event."""
+        """True if the receiver has the event."""
         return self.fault is None
 
 
 def wants(webhook: Registered, event: Event) -> bool:
-    """Whether an event passes the filters of a webhook."""
+    """True if an event passes the filters of a webhook."""
     if webhook.kinds is not None and event.kind not in webhook.kinds:
         return False
     if not event.concerns(webhook.run, webhook.spacecraft):

@@ -17,7 +17,7 @@ from service.web.console.charts.attitude import HEIGHT, PAD, WIDTH, band_path, l
 
 Mask = npt.NDArray[np.bool_]
 FINE_HEIGHT = 10 * HEIGHT
-"""Of panels whose values are read to a thousandth of their range."""
+"""The height of panels whose values are read to a thousandth of their range."""
 DAY_S = 86_400
 TIME_STEPS_S = (
     *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
@@ -107,7 +107,7 @@ class TimeAxis:
 
 @dataclass(frozen=True)
 class Scale:
-    """From values to heights; logarithmic or linear, between `low` and `high`."""
+    """A scale from values to heights; logarithmic or linear, between `low` and `high`."""
 
     low: float
     high: float

@@ -61,7 +61,7 @@ class VoteRow:
 
     @property
     def changed(self) -> bool:
-        """Whether a what-if identifies it differently."""
+        """True if a what-if identifies it differently."""
         return self.before is not None and (
             (self.found.outcome, self.found.star) != (self.before.outcome, self.before.star)
         )

@@ -34,7 +34,7 @@ class Drawn:
     innovations: list[GradeChart]
     strips: list[Strip]
     ticks: list[tuple[float, str]]
-    """Of the time: percent from the left, and their text."""
+    """The ticks of the time axis: percent from the left, and their text."""
 
 
 @console_page(
