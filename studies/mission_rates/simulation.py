@@ -34,7 +34,7 @@ from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
-"""In the place of no error at all, by which the bound could not be divided."""
+"""The sigma in place of no error at all, by which the bound could not be divided."""
 OUTCOMES = {
     "unique_right": CORRECT,
     "ambiguous": AMBIGUOUS,

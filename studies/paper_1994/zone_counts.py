@@ -32,7 +32,7 @@ class ZoneQuantity:
 
     @property
     def passed(self) -> bool:
-        """Whether the difference is within its bound."""
+        """True if the difference is within its bound."""
         return abs(self.off) <= self.within
 
 

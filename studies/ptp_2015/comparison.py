@@ -186,7 +186,7 @@ def stars_in_fields(scenes: int, seed: int) -> npt.NDArray[np.int64]:
 
 
 def all_projections() -> Projections:
-    """Of the guide triangles of the sky to the limit: Table 2, Figures 6 and 7."""
+    """The projections of the sky's guide triangles to the limit: Table 2, Figures 6 and 7."""
     return projections_of(_sky(0.0).run_catalog)
 
 

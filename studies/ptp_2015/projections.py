@@ -17,7 +17,7 @@ from studies.ptp_2015.rivals.proposed import proposed_by_votes
 
 SHOWN_EVERY = 25
 SIGMA_AT_1_PX = 2.87
-"""Of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
+"""The sigma of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
 COLORS = ("#0b5394", "#b45309")
 
 
@@ -58,7 +58,7 @@ class Projections:
 
 
 def projections_of(stars: RunCatalog) -> Projections:
-    """Those of a list of stars."""
+    """The projections of a list of stars."""
     four = build_triangles(stars.direction)
     return Projections(four, _once(four), _once(build_triangles(stars.direction, slaves=3)))
 

@@ -36,7 +36,7 @@ OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
     "figure-6": projections.figure_6,
     "figure-7": projections.figure_7,
 }
-"""Of all triangles of the sky: no field is drawn for these."""
+"""Tables of all triangles of the sky: no field is drawn for these."""
 
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
@@ -62,7 +62,7 @@ class Measurements:
     databases: Sequence[Database] = field(default_factory=tuple)
     false_fields: Sequence[Mapping[str, str | int]] = ()
     projections: Projections | None = None
-    """Of the sky's triangles, for Table 2 and Figures 6 and 7."""
+    """The projections of the sky's triangles, for Table 2 and Figures 6 and 7."""
 
     @property
     def drawn(self) -> PlottedSeries:

@@ -48,7 +48,7 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether everything is within its bounds."""
+        """True if everything is within its bounds."""
         return all(claim.holds for claim in self.claims)
 
 

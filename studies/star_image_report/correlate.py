@@ -18,7 +18,7 @@ from service.imaging.centroids.window import Array
 
 @dataclass(frozen=True)
 class Location:
-    """Where an image stands against its reference.
+    """The place of an image against its reference.
 
     `peak` is the normalised correlation there, 1 for equal shapes; `peak_ratio` that peak
     over the next one; the sigmas are the Cramér-Rao bound for the noise that was told.
@@ -120,7 +120,7 @@ def _shifted(image: Array, u_px: float, v_px: float) -> Array:
 
 
 def locate(image: Array, reference: Array, noise_sigma: float = 0.0) -> Location:
-    """Where the reference stands in an image of the same shape, to a small part of a pixel.
+    """The place of the reference in an image of the same shape, to a small part of a pixel.
 
     The greatest normalised correlation over all whole displacements, then the zero of
     its derivatives.  `noise_sigma` is that of a pixel of the image.

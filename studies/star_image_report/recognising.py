@@ -133,7 +133,7 @@ def _fields(rng: np.random.Generator, number: int, stars: int) -> list[Array]:
 
 
 def _discrimination(study: Study) -> dict[int, list[tuple[int, float, float]]]:
-    """By number of stars: size of the store, share unique within 3 sigma, share nearest right."""
+    """By number of stars, rows of store size, share unique within 3 sigma, share nearest right."""
     rng = study.rng(111)
     sigma = SIGMA_ARCSEC / ARCSEC_PER_RADIAN
     sizes = STORES[:4] if study.quick else STORES

@@ -28,7 +28,7 @@ class Mesh:
 
     @property
     def opening_m(self) -> float:
-        """Between two wires: s = d - wire."""
+        """The opening between two wires: s = d - wire."""
         return self.pitch_m - self.wire_m
 
     @property
@@ -127,7 +127,7 @@ def tail(
 def first_tail_null_rad(
     pupil: Pupil, wavelength_m: float, diameter_m: float, low_rad: float, high_rad: float
 ) -> float:
-    """Where the tail is darkest between two angles, to a small part of a fringe."""
+    """The angle between two angles where the tail is darkest, to a small part of a fringe."""
     p = np.linspace(low_rad, high_rad, 241)
     light = tail(pupil, wavelength_m, p, wavelength_m / diameter_m)
     at = int(np.clip(np.argmin(light), 1, len(p) - 2))
@@ -153,5 +153,5 @@ def shares_of_light(
 
 
 def order_angle_rad(order: int, wavelength_m: float, mesh: Mesh) -> float:
-    """Where the principal maxima of the mesh stand: m lambda / d."""
+    """The angle of a principal maximum of the mesh: m lambda / d."""
     return order * wavelength_m / mesh.pitch_m

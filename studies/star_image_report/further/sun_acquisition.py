@@ -29,7 +29,7 @@ class ThreeDetectors:
     acquire_arcmin: float = 48.0
     samples: int = 41
     threshold: float = 0.5
-    """Of the sun's light in the middle, from which on the sun counts as there."""
+    """The share of the sun's light in the middle from which on the sun counts as acquired."""
 
     @cached_property
     def nominal(self) -> tuple[float, float]:
@@ -73,7 +73,7 @@ class ThreeDetectors:
         return light / self.nominal[1]
 
     def steered(self, p_arcmin: float, q_arcmin: float) -> tuple[float, float, int] | None:
-        """Where the loop leaves a sun at (p, q), and how many places the search looked at.
+        """The place where the loop leaves a sun at (p, q), and the number of places searched.
 
         A square spiral until the middle detector sees the sun, then steps along both signals.
         """
@@ -118,7 +118,7 @@ def _spiral(step_arcmin: float, reach_arcmin: float) -> list[tuple[float, float]
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """Of 5.3."""
+    """The claims of 5.3."""
     rng = study.rng(53)
     three = ThreeDetectors()
     slope = three.slope_per_arcmin()
@@ -160,7 +160,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def pictures() -> dict[str, Picture]:
-    """Of 5.3."""
+    """The figures of 5.3."""
     return {
         "imaging-three-detectors": Picture(
             "Three photodiodes: the two signals as the sun moves along p. They end where the "
