@@ -60,7 +60,7 @@ class Pupil:
 
     @property
     def open_area_m2(self) -> float:
-        """What it lets through of a uniform light: the integral of |P|²."""
+        """The part of a uniform light that it lets through: the integral of |P|²."""
         return float(np.sum(np.abs(self.transmission) ** 2)) * self.cell_m**2
 
     @property

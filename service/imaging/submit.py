@@ -176,7 +176,7 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
 
 
 def choices_of(frame: Frame) -> list[str]:
-    """What was chosen of a file, and how its pixels were turned, where they were."""
+    """The options chosen for a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
 

@@ -143,7 +143,7 @@ def identity_in(text: bytes, run: str) -> Identity | None:
 
 
 Decided = UnsavedResult | GyroBlock | TrackedLine | Answered | AcquisitionError
-"""What becomes of a line before it is recorded."""
+"""The state of a line before it is recorded."""
 
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""

@@ -38,7 +38,7 @@ DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
 
 Found = Answered | Exception | Callable[[Connection], Answered] | None
-"""What a look-up gives: the answer, the error, a change that gives the answer, or nothing."""
+"""The outcome of a look-up: answer, error, a change that gives the answer, or nothing."""
 
 log = logging.getLogger(__name__)
 

@@ -213,7 +213,7 @@ class SolverPool:
         self._changed = threading.Condition()
         self._closing = False
         self.builder = ThreadPoolExecutor(BUILDS_AT_ONCE, "sky")
-        """What builds what tasks need while they wait."""
+        """The pool that builds tables that tasks need while they wait."""
         self._threads = [
             threading.Thread(target=self._run, name=f"solver-{number}", daemon=True)
             for number in range(count)

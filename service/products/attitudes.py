@@ -47,7 +47,7 @@ class SeriesTracker:
 
 @dataclass(frozen=True)
 class SeriesInfo:
-    """What a series of attitudes is of: the spacecraft, the filters, and its identifiers.
+    """The subject of a series of attitudes: the spacecraft, the filters, and its identifiers.
 
     Attitudes of the grade `raw` are those of batches; see `service.grades` for the others.
     `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
@@ -96,7 +96,7 @@ class SeriesInfo:
             raise BadBatch(faults)
 
     def described(self) -> str:
-        """What the series is of, for a message."""
+        """The subject of the series, for a message."""
         words = "attitudes" if self.status == "all" else f"{self.status} attitudes"
         if self.grade != "raw":
             words = words.replace("attitudes", f"{self.grade} attitudes")
@@ -278,7 +278,7 @@ class _Assembler:
 
 
 def _among(texts: Texts, wanted: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Which texts are among some; `numpy.isin` needs texts of fixed width."""
+    """Marks of the texts that are among some; `numpy.isin` needs texts of fixed width."""
     return np.asarray(np.logical_or.reduce([texts == each for each in wanted]))
 
 

@@ -1,4 +1,4 @@
-"""What a point of light looks like on pixels: a Gaussian, or any image, as of an Airy disc."""
+"""The image of a point of light on pixels: a Gaussian, or any image, as of an Airy disc."""
 
 import math
 from collections.abc import Sequence

@@ -21,7 +21,7 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Detector:
-    """What turns light into counts: gain, the noise of reading (and of dark current), full well."""
+    """The properties of a detector: gain, the noise of reading (and of dark current), full well."""
 
     gain_e_per_count: float = 1.0
     read_noise_e: float = 0.0
@@ -193,7 +193,7 @@ class Region:
         return self.window.usable[self.inside]
 
     def flags(self, wanted_half: int) -> tuple[Flag, ...]:
-        """What the pixels themselves say: full, masked, cut by the edge of the frame."""
+        """The flags of the pixels themselves: full, masked, cut by the edge of the frame."""
         saturated = self.window.saturated[self.inside]
         reach = min(self.left, self.right, self.above, self.below)
         named = (

@@ -44,7 +44,7 @@ class Behind:
 def stars_behind(
     light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: Vector
 ) -> Behind:
-    """What lies behind candidates (k,) that are sharper than a star, each with its own noise.
+    """The stars behind candidates (k,) that are sharper than a star, each with its own noise.
 
     About each, pixel by pixel, what stands out from its four neighbours more than the
     middle of a star's image can is taken off, the brightest first, until nothing does.

@@ -56,7 +56,7 @@ class Detections:
     images: StarImages | None
     """The images of the brighter candidates, of a camera whose images of stars reach far."""
     image_of: npt.NDArray[np.intp]
-    """Which of the images is a candidate's (n,); -1 where none is."""
+    """The index of each candidate's image (n,); -1 where none is."""
 
     @property
     def count(self) -> int:
@@ -164,7 +164,7 @@ def _footprint(
 def _options(
     noise: float | CountArray, mask: npt.NDArray[np.bool_] | None, camera: Camera
 ) -> dict[str, Any]:
-    """What SEP is asked for: the threshold is in the noise behind the filter.
+    """Options of SEP: the threshold is in the noise behind the filter.
 
     SEP itself means the noise before it, unless it is given that of each pixel, with which it
     takes three times as long.

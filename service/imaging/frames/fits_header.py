@@ -324,7 +324,7 @@ class _DateCards:
         return f"the header has none of {looked}"
 
     def _role_of_date_obs(self) -> str:
-        """What DATE-OBS is: the start, unless its comment says otherwise (9.5)."""
+        """The role of DATE-OBS: the start, unless its comment says otherwise (9.5)."""
         comment = self.header.comments.get("DATE-OBS", "").lower()
         if re.search(r"\b(start|begin|beginning)\b", comment):
             return "start"

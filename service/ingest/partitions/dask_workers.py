@@ -158,7 +158,7 @@ _solvers: dict[bytes, Solver] = {}
 
 
 def versions() -> dict[str, str]:
-    """What the bytes of a part depend on, beside its batches and the processor."""
+    """The versions on which the bytes of a part depend, beside its batches and the processor."""
     return {
         "attitude-acquisition": __version__,
         "numba": numba.__version__,

@@ -44,7 +44,7 @@ from service.storage.upkeep.reprocessed import RunPart, run_part
 from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")
-"""What a task reads of its source."""
+"""The columns that a task reads of its source."""
 AT_ONCE = 1_000
 """Batches that go through the core together."""
 _DIGITS = 24
@@ -83,7 +83,7 @@ class PartitionTask:
 
     @property
     def digest(self) -> str:
-        """What the results are made from: the source without what is left out."""
+        """The digest of the results' origin: the source without what is left out."""
         if not self.left_out:
             return self.source.digest
         names = "\0".join((self.source.digest, *sorted(self.left_out)))
@@ -100,7 +100,7 @@ class PartitionTask:
 
 @dataclass(frozen=True)
 class PartitionResult:
-    """What came of a task: its part, and the batches that the settings cannot take."""
+    """The result of a task: its part, and the batches that the settings cannot take."""
 
     made: RunPart | None
     """The part that was made; None: every batch was refused."""

@@ -33,7 +33,7 @@ _UNPACKING = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
     *(EOFError, OSError, RuntimeError, UnicodeDecodeError),
 )
-"""What a damaged zip file raises: a name that is no UTF-8 is among it."""
+"""The errors that a damaged zip file raises: a name that is no UTF-8 is among its causes."""
 _KERNELS = (".tsc", ".tls")
 """Clocks and leap seconds, the kernels that reading takes."""
 

@@ -60,7 +60,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class KnownAttitudes:
-    """What a file says of one object: segments in order of time that do not overlap."""
+    """The attitudes of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[Segment]
@@ -92,7 +92,7 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
 
 
 class Span(Protocol):
-    """What is valid from one time to another, `Utc.tai_ns`; `place` names it in messages."""
+    """A span that is valid from one time to another, `Utc.tai_ns`; `place` names it in messages."""
 
     @property
     def place(self) -> str:
@@ -130,7 +130,7 @@ Interpolation = Literal["HERMITE", "LAGRANGE"]
 
 
 class Ephemeris(Protocol):
-    """What a file says of the motion of one object."""
+    """The motion of one object, as a file describes it."""
 
     @property
     def object_name(self) -> str:
@@ -195,7 +195,7 @@ class StateSegment:
 
 @dataclass(frozen=True)
 class KnownStates:
-    """What a file says of one object: segments in order of time that do not overlap."""
+    """The states of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[StateSegment]

@@ -68,7 +68,7 @@ _NAMES = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 @dataclass
 class _Form:
-    """What the metadata of a segment say of its states, and the states read so far."""
+    """The form of a segment's states by its metadata, and the states read so far."""
 
     line: int
     time_system: str

@@ -44,7 +44,7 @@ COMPRESSION_LEVEL = 1
 ROWS_TOGETHER = 2_048
 """The rows of a row group, the least that is read of a text column."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
-"""What file systems without hard links say."""
+"""The errors of file systems without hard links."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
@@ -216,7 +216,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path, digest: str) -> Settings:
-    """What a digest stands for."""
+    """The settings for which a digest stands."""
     return _decoded(settings_file(folder, digest), Settings)
 
 

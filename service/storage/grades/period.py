@@ -275,7 +275,7 @@ _COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
 
 
 def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
-    """What each measured attitude of a period adds to the share, in order of time."""
+    """The share of each measured attitude of a period, in order of time."""
     found: list[Sample] = []
     for part in latest_innovations(connection, selected):
         counted = np.isin(part.outcome, _COUNTED)

@@ -161,7 +161,7 @@ class LimitEvaluator:
 
     @staticmethod
     def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:
-        """What each of the results adds to the value of a subject; None: nothing."""
+        """The contribution of each result to the value of a subject; None: nothing."""
         sample_of = sampler(subject)
         for each in new:
             trackers = each.trackers and _by_tracker(each)

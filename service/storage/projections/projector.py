@@ -124,7 +124,7 @@ _NEWEST_AND_POSITION = (
 
 @dataclass(frozen=True)
 class _Step:
-    """What a transaction of the projector came to."""
+    """The outcome of a transaction of the projector."""
 
     position: int
     is_all: bool

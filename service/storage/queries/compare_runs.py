@@ -374,7 +374,7 @@ def run_rates(
     start: Utc | None,
     end: Utc | None,
 ) -> RatesOfRuns | None:
-    """What became of all stars of each run, in total and over time.
+    """The rates of all stars of each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
     where there are none.

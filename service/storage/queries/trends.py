@@ -79,7 +79,7 @@ WIDTHS_S = (
 
 @dataclass(frozen=True)
 class HistoryRequest:
-    """Which history: the quantities, how they are thinned out, and to how many points."""
+    """The wanted history: the quantities, how they are thinned out, and to how many points."""
 
     quantities: Sequence[QuantityName]
     strategy: Strategy

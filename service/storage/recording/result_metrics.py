@@ -126,4 +126,4 @@ SUMMED = _summed(results)
 SUMMED_OF_TRACKERS = _summed(tracker_values)
 """The same over `tracker_values`."""
 OF_TRACKERS = results.join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
-"""What a query over `tracker_values` reads, so that it can choose current results."""
+"""The source of a query over `tracker_values`, so that it can choose current results."""

@@ -90,7 +90,7 @@ class DatabaseFile:
         )
 
     def log_identity(self) -> FileIdentity | None:
-        """Which file is SQLite's write-ahead log: it stays the same while a connection is open."""
+        """The identity of SQLite's write-ahead log: it is constant while a connection is open."""
         return _identity(self._log_path)
 
     def require_log(self, opened: FileIdentity | None) -> None:

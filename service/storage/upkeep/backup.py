@@ -160,7 +160,7 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
 SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
 """How the files begin."""
 BESIDE = ("-wal", "-shm", "-journal")
-"""What SQLite keeps beside a file: of another database it would be taken for this one's."""
+"""The files that SQLite keeps beside a file: another database's would be taken for this one's."""
 
 
 def restore(database: str, source: Path, step: Step = lambda left, total: None) -> str:
@@ -265,7 +265,7 @@ def _restore_postgresql(source: Path, url: URL) -> str:
 
 
 def _entry(line: str) -> str:
-    """What a line of a backup's contents is about: of `5; 2615 2200 SCHEMA - public me` the end."""
+    """The subject of a line in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
     return " ".join(line.partition(";")[2].split(" ")[3:])
 
 

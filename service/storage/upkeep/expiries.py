@@ -1,4 +1,4 @@
-"""What ends on a known day while the service runs: its table of leap seconds, and tokens."""
+"""Dates on which something ends while the service runs: its table of leap seconds, and tokens."""
 
 import logging
 from collections.abc import Callable
@@ -72,7 +72,7 @@ class ExpiryDates:
         self._now = now
 
     def dates(self) -> Expiries:
-        """What ends when."""
+        """The dates on which something ends."""
         with self._reading() as connection:
             return Expiries(leap_seconds_end().text, _tokens(connection, self._now().text))
 

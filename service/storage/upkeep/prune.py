@@ -130,7 +130,7 @@ def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]])
 
 
 def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[Connection], int]:
-    """What deletes the oldest batches of an hour, and returns how many."""
+    """A change that deletes the oldest batches of an hour, and returns how many."""
     start = bucket_start(hour, HOUR_S).tai_ns
     end = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
 

@@ -65,11 +65,11 @@ class RunPart:
     shares: Mapping[int, Mapping[str, Row]]
     """The rollups by hour, of each tracker and of the `WHOLE`."""
     latest: Row
-    """What an event tells of the latest batch."""
+    """The latest batch, as an event tells it."""
 
 
 def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
-    """What there is to know of a part with these rows, whose file has this content."""
+    """The description of a part with these rows, whose file has this content."""
     found = rows["batches"]
     first = found.slice(0, 1).to_pylist()[0]
     part = msgspec.structs.replace(described(name, first["run"], rows, content), source=source)
