@@ -42,7 +42,7 @@ class RequestContext:
 
 
 request: ContextVar[RequestContext | None] = ContextVar("request", default=None)
-"""What the lines written meanwhile belong to, also in threads that handlers run in."""
+"""The request to which lines written meanwhile belong, also in threads that handlers run in."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ _configured: LogSettings | None = None
 
 
 def configured() -> LogSettings | None:
-    """What this process was configured with; None where it leaves logging as it was."""
+    """The configuration of this process; None where it leaves logging as it was."""
     return _configured
 
 
@@ -176,7 +176,7 @@ class _Counted:
 
 
 def _kind(record: logging.LogRecord) -> object:
-    """What makes two records the same; numbers in an error's text do not tell them apart."""
+    """The key by which two records are the same; numbers in an error's text do not count."""
     arguments = record.args if isinstance(record.args, tuple) else ()
     errors = tuple(
         (type(each).__name__, _NUMBER.sub("#", str(each)[:_MAX_LINE]))
@@ -191,7 +191,7 @@ def _kind(record: logging.LogRecord) -> object:
 
 
 class _Lines(logging.Formatter):
-    """What is common to both formats."""
+    """The common part of both formats."""
 
     def __init__(self, process: str) -> None:
         super().__init__()

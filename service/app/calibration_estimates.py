@@ -300,7 +300,7 @@ def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
 
 
 def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
-    """What the stars do not show."""
+    """The unknowns that the stars do not show."""
     of_magnitudes = (each.not_observable for each in run.magnitudes)
     return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
@@ -330,7 +330,7 @@ def _rms(values: Vector) -> float:
 
 
 def notes(run: CalibrationRun) -> list[str]:
-    """What a mission file cannot hold of this calibration."""
+    """Remarks on the parts of this calibration that a mission file cannot hold."""
     kinds = {each.kind for each in run.found.unknowns}
     remarks = [VECTORS] if kinds & {"scale", "distortion"} else []
     remarks += [TIME_TAGS] if "time_tag" in kinds else []
@@ -456,7 +456,7 @@ def _values(lines: Lines) -> dict[str, Any]:
 def mission_file_lines(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
 ) -> str:
-    """What a calibration changes of a mission file, as TOML."""
+    """The lines of a mission file that a calibration changes, as TOML."""
     parts = []
     for each in mission.trackers:
         changes = tracker_lines(each, found)

@@ -292,7 +292,7 @@ def found_columns(run: CalibrationRun) -> Row:
 # own alignments or focal planes have changed since, the file holds.
 
 EVENT_FIELDS = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", "mission")
-"""What the event of a change says of it; the rest is long."""
+"""The fields of a change's event; the others are long."""
 
 
 def adopted_missions(

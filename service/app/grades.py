@@ -54,7 +54,7 @@ LOOK_EVERY_S = 600.0
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What a job makes."""
+    """The product of a job."""
 
     spacecraft: str
     run: str

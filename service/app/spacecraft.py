@@ -218,7 +218,7 @@ def _quantities(
 def _named(
     connection: Connection, mission: Mission, run: str, tracker: str | None
 ) -> dict[str, Any]:
-    """What an answer about a tracker says of it."""
+    """The fields of a tracker in an answer about it."""
     if tracker is None:
         return {"tracker": UNSET, "not_split": UNSET}
     waits = len(mission.trackers) > 1 and is_waiting(connection, mission.name, run)

@@ -1,4 +1,4 @@
-"""What is added to the batches of a replay: attitudes carried along, or data of a file."""
+"""Additions to the batches of a replay: attitudes carried along, or data of a file."""
 
 import json
 from abc import ABC, abstractmethod

@@ -1,4 +1,4 @@
-"""Which connections are kept: a bound for all, a share for each client address.
+"""Limits of the connections that are kept: a bound for all, a share for each client address.
 
 A connection is idle while no request of it is being answered.  Where a bound is
 reached, the connection that has been idle for the longest time is closed, so that

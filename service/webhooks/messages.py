@@ -1,4 +1,4 @@
-"""Which events a webhook wants, the messages that they become, and what comes of sending them."""
+"""The events that a webhook wants, the messages that they become, and the outcome of sending."""
 
 import base64
 import hashlib
@@ -44,7 +44,7 @@ class _Message(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an attempt: a status, or the fault that kept the answer away.
+    """The outcome of an attempt: a status, or the fault that kept the answer away.
 
     `retry_after_s` is what the receiver asked for, in seconds.
     """
@@ -166,7 +166,7 @@ class _Failing:
 
 
 class DeliveryLog:
-    """What became of the attempts to deliver, since the start."""
+    """The outcomes of the attempts to deliver, since the start."""
 
     def __init__(self) -> None:
         self.counts: Counter[tuple[str, str, Result]] = Counter()

@@ -384,7 +384,7 @@ def prune(parsed: Namespace) -> int:
 
 
 def _beside(gyro_blocks: int, graded_days: int) -> str:
-    """What to say of gyro blocks and graded days beside batches, if there are any."""
+    """The words on gyro blocks and graded days beside batches, if there are any."""
     counts = [f"{gyro_blocks} gyro blocks"] if gyro_blocks else []
     counts += [f"{graded_days} days of filtered attitudes"] if graded_days else []
     return "".join(f" and {each}" for each in counts)
@@ -484,7 +484,7 @@ def _is_confirmed(run: str) -> bool:
 
 
 def _note(parsed: Namespace) -> Any:
-    """What adds the entry of the audit list."""
+    """A function that adds the entry of the audit list."""
     asked = {
         "spacecraft": parsed.spacecraft,
         "batches": parsed.batch,

@@ -26,7 +26,7 @@ TABLES = {
     "gyro": "Write the recorded gyro samples of a spacecraft, one row per sample.",
     "stars": "Write the stars of a spacecraft's batches with their outcomes, one row per star.",
 }
-"""What the command of each table does; see `app.products.table`."""
+"""The summary of the command of each table; see `app.products.table`."""
 
 
 def add(commands: Any) -> None:

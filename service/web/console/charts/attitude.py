@@ -100,7 +100,7 @@ def _sigma_rad(covariance_arcsec2: Vector) -> Vector:
 
 
 def _is_near(time_ns: npt.NDArray[np.int64], follows: Flags) -> Flags:
-    """Which moments are no farther from the one before than is usual among neighbours."""
+    """Marks of the moments as near to the one before as is usual among neighbours."""
     step = np.diff(time_ns, prepend=time_ns[0])
     usual = float(np.median(step[follows])) if follows.any() else 0.0
     return np.asarray(step <= GAP * usual)

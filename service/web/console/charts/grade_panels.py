@@ -189,7 +189,7 @@ def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> 
 
 
 def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
-    """Which moments (n,) belong together with the one before.
+    """Marks of the moments (n,) that belong together with the one before.
 
     They do unless they are farther apart than three parts of the period and three times what
     is usual, or `same` (n,) says that they are not of the same stretch.
@@ -235,7 +235,7 @@ class Strip:
 
 
 def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
-    """Which model the filter had, and what both grades are worth."""
+    """Strips of the filter's model, and of the quality of both grades."""
     drawn = [
         Strip(
             "model",

@@ -43,7 +43,7 @@ VIEWS = ("all", "field")
 """The content of the chart: all candidates of the answer, or the field of view alone."""
 
 SCALE = 3.0
-"""What the bars of the trackers' residuals reach to at least, in predicted residuals."""
+"""The least range of the bars of the trackers' residuals, in predicted residuals."""
 
 ResultId = Annotated[str, Path()]
 
@@ -123,7 +123,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
 
 
 def _adoption(before: Answer, after: Answer) -> list[str]:
-    """What adopting a what-if will change, in sentences."""
+    """The changes that adopting a what-if will make, in sentences."""
     words = ("unique", "ambiguous", "unmatched")
     changes = [
         f"{word} stars {getattr(before.counts, word)} to {getattr(after.counts, word)}"

@@ -27,7 +27,7 @@ JOBS = 8
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the page draws of a period."""
+    """The drawings of a period."""
 
     found: GradesOfPeriod
     charts: list[GradeChart]
