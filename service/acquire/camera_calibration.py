@@ -200,7 +200,7 @@ def _fit(lens: Lens, views: Sequence[_View], parameters: int) -> tuple[Lens, Mat
 
 
 def _remarks(covariance: Matrix, zero: Vector) -> list[str]:
-    """What the pictures did not show."""
+    """Remarks on what the pictures did not show."""
     remarks = []
     if math.sqrt(covariance[1, 1]) > OBSERVABLE * BEND_PRIOR:
         remarks.append(

@@ -40,7 +40,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class _Share(NamedTuple):
-    """What one child compiles, in this order; see `prewarm_kernels`."""
+    """The kernels that one child compiles, in this order; see `prewarm_kernels`."""
 
     zones: list[str]
     """Identifiers that search zones."""
@@ -171,7 +171,7 @@ def _processors() -> int:
 
 
 def _shares(processors: int) -> list[_Share]:
-    """What each child compiles.
+    """The kernels that each child compiles.
 
     Weighing hypotheses is one kernel that takes as long as most others together, and the
     whole sky needs it, too: by then the first child has saved it.

@@ -158,7 +158,7 @@ class PictureAttitude:
 
 @dataclass(frozen=True)
 class PictureResult:
-    """What became of a picture: candidates, attitude or None, and remarks in words."""
+    """The result of a picture: candidates, attitude or None, and remarks in words."""
 
     frame: Frame
     points: PointSources

@@ -180,7 +180,7 @@ def _reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
 def _search(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, timer: StepTimer, budget: WorkBudget
 ) -> Search:
-    """What holds for the searches for a batch's stars."""
+    """The conditions of the searches for a batch's stars."""
     time, a_priori = batch.time, batch.a_priori
     return Search(
         batch=batch,

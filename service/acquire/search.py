@@ -38,7 +38,7 @@ CONTRADICTED_CHI_SQUARE = 30.0
 
 
 class SearchResult(Struct, frozen=True, eq=False, gc=False):
-    """What was found for some stars of a batch: the path, the result in zones, or why none.
+    """The result for some stars of a batch: the path, the result in zones, or why none.
 
     `explained` (n,) of every tracker marks the stars of the likeliest hypothesis.
     """

@@ -78,7 +78,7 @@ class StepTimer:
 
 
 class Search(Struct, frozen=True, eq=False):
-    """What holds for every search for the stars of one batch, all of them or a part."""
+    """The conditions of every search for the stars of one batch, all of them or a part."""
 
     batch: ObservationBatch
     mission: Mission
@@ -270,7 +270,7 @@ class ZoneSearch:
     def _sighting(
         self, t: int, asked: _Asked, index: int, zone: Zone, budget: WorkBudget
     ) -> Sighting:
-        """What an identifier is given that takes one sighting at a time."""
+        """The input of an identifier that takes one sighting at a time."""
         seen, search, guide = self.seen, asked.search, None
         first, last = seen.offsets[t : t + 2]
         if search.identifier.needs_guide:

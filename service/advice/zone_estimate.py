@@ -93,7 +93,7 @@ class ZoneEstimate:
 
 
 def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
-    """What each of unit vectors (n, 3) has about it as far as an angle."""
+    """The neighbours of each of unit vectors (n, 3) within an angle."""
     tree: Any = cKDTree(direction)
     chord = 2.0 * math.sin(math.radians(min(limit_deg, 180.0)) / 2.0)
     stars = len(direction)

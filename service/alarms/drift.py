@@ -57,7 +57,7 @@ def mean_stars(
     star: Sequence[Integers],
     catalog_direction: Vector,
 ) -> list[MeanStars]:
-    """What `scale_offset_ppm` and `alignment_offsets_arcsec` are computed from, tracker by tracker.
+    """The input of `scale_offset_ppm` and `alignment_offsets_arcsec`, tracker by tracker.
 
     `star` (n,) of every tracker are rows of `catalog_direction` (N, 3), -1 for stars that are not
     unique.

@@ -116,7 +116,7 @@ class Eliminated:
         return step, turns, _length(normal, step) if len(free) else of_attitudes
 
     def change(self, step: Vector, turns: Vector, stars: int) -> Vector:
-        """What such steps add to the residuals (2, n)."""
+        """The change of the residuals (2, n) by such steps."""
         found = np.empty((2, stars))
         for part in self.parts:
             by = part.flat
@@ -231,7 +231,7 @@ class NotObservable:
 
 
 def observable(normal: Normal, unknowns: Sequence[Unknown]) -> Marks:
-    """Which unknowns (p,) the normal equations determine.
+    """Marks of the unknowns (p,) that the normal equations determine.
 
     An unknown is dropped where the attitudes and the unknowns before it in `ORDER` leave
     nothing of its information, and then where its sigma is beyond what is plausible.

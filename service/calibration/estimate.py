@@ -49,7 +49,7 @@ SETTLED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What the stars of a stretch say of the trackers.
+    """The estimate of the trackers from the stars of a stretch.
 
     `value` (p,) and `covariance` (p, p) are of `unknowns`, in the unit of each.  `stars`
     (n) are those that were used, ordered by tracker and batch; `residual` (n, 2) is
@@ -303,7 +303,7 @@ def weights(residual: Vector, scale: float, leave_out: bool) -> Weights:
 
 
 def covariance_factor(residual: Vector, scale: float, freedom: int) -> float:
-    """What the inverse of the unweighted normal matrix is multiplied by (Huber 1981, 7.6).
+    """The factor of the inverse of the unweighted normal matrix (Huber 1981, 7.6).
 
     The mean square of the bounded residuals over the square of the mean slope of the
     bound; `residual` (2, n) are those of the stars that were not left out.

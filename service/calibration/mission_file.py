@@ -133,7 +133,7 @@ def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
 def _polynomials_deg(
     bent: Mapping[Unknown, float], radius_deg: float
 ) -> tuple[dict[tuple[int, int], float], ...]:
-    """What is added to h and to v, in degrees, by powers of the measured h and v in degrees."""
+    """Polynomials added to h and v, in degrees, by powers of the measured h and v in degrees."""
     size = max((each.degree for each in bent), default=0) + 1
     series = np.zeros((2, size, size))
     for each, value in bent.items():

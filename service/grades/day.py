@@ -39,7 +39,7 @@ STEP_NS = 10**9
 MOST_SAMPLES = 4_000_000
 """The most samples of a day with its surroundings: 30 Hz, all in memory at 1 kB each."""
 OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
-"""What may become of a measurement; see `filtering.state.Outcome`."""
+"""The outcomes of a measurement; see `filtering.state.Outcome`."""
 
 
 @dataclass(frozen=True, eq=False)

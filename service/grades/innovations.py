@@ -46,7 +46,7 @@ class TimedColumns:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredInnovations(TimedColumns):
-    """What became of m measured attitudes, in order of time; equal times are allowed.
+    """The innovations of m measured attitudes, in order of time; equal times are allowed.
 
     `tai_ns` (m,) and `outcome` (m,), a `filtering.state.Outcome`.  About the body axes in
     arcsec: `innovation_arcsec` (m, 3) with its covariance `predicted_arcsec2` (m, 6), the upper

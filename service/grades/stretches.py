@@ -1,4 +1,4 @@
-"""What the filter takes: recorded measurements and gyro samples, in unbroken stretches."""
+"""The input of the filter: recorded measurements and gyro samples, in unbroken stretches."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ _LONGEST_GAP_NS = int(LONGEST_GAP_S) * 10**9
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What the filter is given of an unbroken stretch; `gyro` is None at a constant rate."""
+    """The filter's input of an unbroken stretch; `gyro` is None at a constant rate."""
 
     model: GyroModel | ConstantRateModel
     gyro: GyroSamples | None
@@ -221,7 +221,7 @@ NS = 1e-9
 
 
 def believed(settings: GyroSettings, rates_rad_s: Vector) -> npt.NDArray[np.bool_]:
-    """Which of the rates (n, 3) about the gyro's axes are within the mission's largest, as (n,).
+    """Marks (n,) of rates (n, 3) about the gyro's axes that are within the mission's largest.
 
     Blocks beyond it are refused on arrival; the mission may have named another number since.
     """

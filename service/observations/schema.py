@@ -478,7 +478,7 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 
 def checked_from_model(model: BatchIn) -> Checked:
-    """What a model stands for that is already checked."""
+    """The checked value for which a model stands."""
     text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
     sent = text
     if isinstance(prior, FromLastIn) and (prior.prediction or prior.by_default):

@@ -46,7 +46,7 @@ FULL_SCALE = 65535
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """What decides the frames that are drawn; the same settings always give the same frames."""
+    """The settings of the frames that are drawn; the same settings always give the same frames."""
 
     frames: int
     seed: int = 1
@@ -98,7 +98,7 @@ class DrawnFrame:
 
 @dataclass(frozen=True)
 class _Chip:
-    """What stays the same from frame to frame: the pixels' response, and which are hot."""
+    """The constants from frame to frame: the pixels' response, and which are hot."""
 
     response: CountArray
     hot: CountArray

@@ -17,7 +17,7 @@ GAUSSIAN_MEDIAN = 0.6745
 
 @dataclass
 class Score:
-    """What came of the batches of one kind of stretch."""
+    """The result of the batches of one kind of stretch."""
 
     batches: int = 0
     refused: int = 0

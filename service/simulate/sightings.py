@@ -1,4 +1,4 @@
-"""What the trackers of a turning, moving spacecraft see of the sky, and what they measure.
+"""The sky as the trackers of a turning, moving spacecraft see it, and their measurements.
 
 Each star is where it appears from the moving spacecraft while the body turns
 with constant rates, measured at its own time: carried to the batch's epoch, it
@@ -100,7 +100,7 @@ class RealSky:
 
 @lru_cache(maxsize=4)
 def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) -> RealSky:
-    """What stands behind the stars of a run catalog that was made with these settings."""
+    """The sky behind the stars of a run catalog that was made with these settings."""
     alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
     then = moved(
         catalog.ra_deg,

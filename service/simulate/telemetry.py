@@ -124,7 +124,7 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
 def _motion(
     mission: Mission, rates: Vector, cadence_s: float, rng: np.random.Generator
 ) -> Iterable[Matrix | float]:
-    """What the rates make of each batch: the attitude, or the roll about a pole on the Sun."""
+    """The motion of each batch by its rates: the attitude, or the roll about a pole on the Sun."""
     if isinstance(mission.zone, Band):
         steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
         rolls_rad: list[float] = (

@@ -53,7 +53,7 @@ class JoinedRows:
     key_columns: ClassVar[tuple[str, ...]]
     """The columns that these rows have in common."""
     may_lack: ClassVar[str]
-    """What may be missing where a row beside these cannot be read."""
+    """The rows that may be missing where a row beside these cannot be read."""
     refuses_faulty_rows: ClassVar[bool]
     """True if a faulty row refuses the rows of its key alone; False: those beside it, too."""
 
