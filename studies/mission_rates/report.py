@@ -30,7 +30,7 @@ def report_text(plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | N
 
 
 def heading(plan: Plan) -> list[str]:
-    """What was simulated, in lines."""
+    """The description of the simulation, in lines."""
     first = plan.settings[0]
     mission, errors = first.mission, first.errors
     where = "the whole sky"
@@ -77,7 +77,7 @@ def _percent(share: Interval) -> str:
 
 
 def met(rates: Sequence[Rates], at_most_ambiguous: float) -> list[str]:
-    """Which settings keep ambiguous stars below a share, in lines."""
+    """The settings that keep ambiguous stars below a share, in lines."""
     wanted = f"At most {100 * at_most_ambiguous:g} % ambiguous"
     found = meeting(rates, at_most_ambiguous)
     if found:

@@ -45,7 +45,7 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """What is simulated: zones about axes drawn over the sky, or within an angle of a direction.
+    """The simulated cases: zones about axes drawn over the sky, or within an angle of a direction.
 
     `within_deg` is RCCAT; `tests` are those switched on or off.  Each zone has `views` fields
     of view with at most `most_stars` observed stars each.  All settings are of one tracker.
@@ -119,7 +119,7 @@ def _rates(setting: Setting, counts: Integers) -> Rates:
 
 
 def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
-    """What became of one zone's stars: counts (settings, 4) in the order of `tally`."""
+    """The outcome of one zone's stars: counts (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
         views = list(_views(plan, number, off_axis_deg, sky))

@@ -41,7 +41,7 @@ ALGORITHMS: Mapping[str, Build] = {
 OF_THE_PAPER = ("PTP", "P-vector", "planar triangle")
 COMPARED = (*OF_THE_PAPER, "Liebe's triangles", "pyramid")
 SIGMA_FLOOR_PX = 0.25
-"""What algorithms are told where there is no noise: a range of nothing would find nothing."""
+"""The sigma that algorithms assume where there is no noise: a range of nothing finds nothing."""
 SCENES_A_TASK = 50
 
 
@@ -55,7 +55,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class Database:
-    """What an algorithm keeps for the catalog to V 6, and what it took to make it."""
+    """The data that an algorithm keeps for the catalog to V 6, and the cost of making them."""
 
     algorithm: str
     entries: int

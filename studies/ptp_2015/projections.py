@@ -154,7 +154,7 @@ def table_2(found: Projections) -> str:
 
 
 def printed_slope(found: Projections) -> float:
-    """What one limit index is worth in P, if Tables 1 and 2 are of one database.
+    """The worth of one limit index in P, if Tables 1 and 2 are of one database.
 
     K of the first row of Table 2 is the row of a triangle whose P follows from the rows of
     Table 1, 90 rows before, by the density that they show themselves.
@@ -167,7 +167,7 @@ def printed_slope(found: Projections) -> float:
 
 
 def note_on_table_2(found: Projections) -> str:
-    """What the printed numbers imply of the database that they were made with."""
+    """A note on the database that the printed numbers imply."""
     slope = printed_slope(found)
     value = found.triangles.projection.value
     implied = (float(value[-1]) - float(value[0])) / slope + 1.0

@@ -53,7 +53,7 @@ RATES = (
 
 @dataclass(frozen=True)
 class Measurements:
-    """What was measured: tallies by table, the counts of Figure 10, the databases."""
+    """The measurements: tallies by table, the counts of Figure 10, the databases."""
 
     scenes: int
     seed: int
@@ -166,7 +166,7 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
 
 
 def database_table(databases: Iterable[Database]) -> str:
-    """What each algorithm keeps for the sky to V 6, and how long that takes to make."""
+    """The data that each algorithm keeps for the sky to V 6, and the time to make them."""
     printed = {row.algorithm: row.memory_mb for row in the_ptp_paper().table_6}
     rows = (
         (

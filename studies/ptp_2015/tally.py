@@ -1,4 +1,4 @@
-"""What became of the fields of one condition under one algorithm, and the rates of it."""
+"""The outcome of the fields of one condition under one algorithm, and the rates of it."""
 
 import math
 from dataclasses import dataclass

@@ -182,7 +182,7 @@ def _peak_ratio(surface: Array, row: int, column: int) -> float:
 
 
 def _bounds(pattern: Array, scale: float, noise_sigma: float) -> tuple[float, float]:
-    """What no unbiased method does better than, in white noise, for this many times the pattern."""
+    """The bounds of any unbiased method, in white noise, for this many times the pattern."""
     transform = np.fft.fft2(pattern)
     fu = 2j * math.pi * np.fft.fftfreq(pattern.shape[1])[None, :]
     fv = 2j * math.pi * np.fft.fftfreq(pattern.shape[0])[:, None]

@@ -395,7 +395,7 @@ def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> Prof
 
 
 def truncated(displacement: float, half_length: float, end_light: float, light: float) -> float:
-    """What a scan from -V to V finds: d [1 - 2 V <Phi(V)> / E], with <Phi(V)> the mean of its ends.
+    """The result of a scan from -V to V: d [1 - 2 V <Phi(V)> / E]; <Phi(V)> the mean of its ends.
 
     `light` is E, the integral along the line.
     """
@@ -405,5 +405,5 @@ def truncated(displacement: float, half_length: float, end_light: float, light: 
 def with_background(
     displacement: float, light_sum: float, samples: int, background: float
 ) -> float:
-    """What a scan finds when a level is left in: d E / (E + (2N + 1) b0)."""
+    """The result of a scan when a level is left in: d E / (E + (2N + 1) b0)."""
     return displacement * light_sum / (light_sum + samples * background)
