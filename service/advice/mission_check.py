@@ -129,9 +129,9 @@ def _zone(mission: Mission) -> Iterator[Finding]:
             "at its edge are not in the zone",
         )
     for place, tracker in enumerate(mission.trackers):
-        told_deg = tracker.coelevation_deg or zone.coelevation_deg
+        file_deg = tracker.coelevation_deg or zone.coelevation_deg
         true_deg = separation_deg(tracker.boresight_body, mission.axis_body)
-        off = abs(told_deg - true_deg)
+        off = abs(file_deg - true_deg)
         if off <= COELEVATION_DEG:
             continue
         never = off > zone.half_width_deg + tracker.field_of_view_radius_deg
@@ -139,7 +139,7 @@ def _zone(mission: Mission) -> Iterator[Finding]:
             "wrong" if never else "unusual",
             f"trackers.{place}.coelevation_deg" if tracker.coelevation_deg else "zone",
             f"{tracker.name} looks {true_deg:.2f} deg from the pole by its axes, and at the "
-            f"coelevation of {told_deg:g} deg by the file"
+            f"coelevation of {file_deg:g} deg by the file"
             + (": its stars are never in the band" if never else ""),
         )
 
@@ -215,12 +215,12 @@ def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
             "stars leave light that it does not explain, and errors of places exceed their sigmas "
             "by amounts that are not known",
         )
-    corner_deg, told_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
-    if not math.isclose(corner_deg, told_deg, rel_tol=CORNER_SHARE):
+    corner_deg, file_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
+    if not math.isclose(corner_deg, file_deg, rel_tol=CORNER_SHARE):
         yield Finding(
             "unusual",
             f"{key}.field_of_view_radius_deg",
-            f"{told_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
+            f"{file_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
             "boresight",
         )
 
