@@ -139,7 +139,7 @@ class Quantity:
                 return lambda row: None
 
     def sample_of(self, result: Mapping[str, Any]) -> Sample | None:
-        """The share of one result in the value that limits are evaluated for; None: nothing."""
+        """The sample of one result for the value that limits are evaluated for; None: nothing."""
         match self.source:
             case StarShare(part):
                 whole = result["observed"]

@@ -275,7 +275,7 @@ _COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
 
 
 def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
-    """The share of each measured attitude of a period, in order of time."""
+    """The samples that measured attitudes of a period add to the share, in order of time."""
     found: list[Sample] = []
     for part in latest_innovations(connection, selected):
         counted = np.isin(part.outcome, _COUNTED)

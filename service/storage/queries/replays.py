@@ -24,7 +24,7 @@ MAX_LISTED = 100
 CANCELLED: ReplayStateName = "cancelled"
 UNFINISHED: tuple[ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
-"""The counts of packets that an earlier version counted."""
+"""The gyro counts of packets that an earlier version counted."""
 _NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
 
 
