@@ -38,7 +38,7 @@ from service.times import HOUR_S
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 START = "1999-03-01T00:00:00.000Z"
-"""Of every pass: a day on which all three were at work."""
+"""The start of every pass: a day on which all three were at work."""
 WIDTH_S = 20 * HOUR_S
 """How long a pass lasts: within the day that the console shows first."""
 GYRO = GyroWanted(step_s=10.0)
@@ -48,7 +48,7 @@ START_S = 300.0
 COMPILING_S = 1800.0
 """The longest that the compiling may take: minutes, more where other work has the processors."""
 COMPILES_AFTER_S = 5.0
-"""From then on it is said what a start waits for."""
+"""The time after which a message says what a start waits for."""
 PROGRESS_EVERY_S = 10.0
 """How often progress is printed without a terminal."""
 STOP_S = 15.0
@@ -117,13 +117,13 @@ def run_demo(
         sys.stdout.flush()
         if once:
             return 0
-        told = sys.stderr if as_json else sys.stdout
-        print(f"\nServing on {url} until Ctrl-C.", file=told, flush=True)
+        stream = sys.stderr if as_json else sys.stdout
+        print(f"\nServing on {url} until Ctrl-C.", file=stream, flush=True)
         with suppress(KeyboardInterrupt):
             # A terminal's Ctrl-C reaches the server too, which may stop first.
             if server.wait() not in STOPPED_EXIT_CODES:
                 raise Busy(f"the server stopped by itself; see {folder / 'server.log'}")
-        print("stopped", file=told)
+        print("stopped", file=stream)
         return 0
 
 
@@ -208,7 +208,7 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
 
 
 def _answers(results: Path) -> Iterator[dict[str, Any]]:
-    """Those to the batches; to a gyro block the answer is its record."""
+    """The answers to the batches, without the records that answer gyro blocks."""
     return (each for each in read_objects(results) if "block" not in each)
 
 
@@ -295,7 +295,7 @@ class _Waiting:
 
     @staticmethod
     def _compiles() -> bool:
-        """Whether the server, which has this process's cache, is still compiling its kernels."""
+        """True if the server, which has this process's cache, is still compiling its kernels."""
         return KernelBuild().is_needed
 
     def __enter__(self) -> Self:

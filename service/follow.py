@@ -34,7 +34,7 @@ from service.errors import BadConfiguration
 from service.gyro import is_gyro_line
 
 ACK_WAIT_S = 30.0
-"""After so long without a sign from its follower a message is delivered to another one."""
+"""A message without a sign from its follower for so long is delivered to another one."""
 BEAT_S = 10.0
 FETCH_S = 1.0
 PAUSE_S = 1.0
@@ -299,5 +299,5 @@ def _refusal(problem: answers.Problem) -> bytes:
         {"field": each.field, "message": each.message, "value": each.value}
         for each in problem.errors or ()
     ]
-    told = {"type": problem.type, "status": problem.status, "detail": problem.detail}
-    return json.dumps(told | {"errors": errors}).encode()
+    body = {"type": problem.type, "status": problem.status, "detail": problem.detail}
+    return json.dumps(body | {"errors": errors}).encode()

@@ -113,7 +113,7 @@ def first_shared_ns(times_ns: Nanoseconds, others_ns: Nanoseconds) -> int | None
 # whole, and takes two bytes for most.
 
 LEVEL = 1
-"""Of zlib; level 6 takes four times as long for about 2 % less."""
+"""The level of zlib; level 6 takes four times as long for about 2 % less."""
 
 
 def pack(values: Vector) -> bytes:
@@ -144,7 +144,7 @@ MAX_SAMPLES = 10_000
 MIN_STEP_S = 1e-6
 """`SAME_TIME_NS`: samples of one block have different times."""
 MAX_SPAN_S = 86_400.0
-"""From the first sample of a block to its last."""
+"""The longest time from the first sample of a block to its last."""
 
 Offset = Annotated[Number, Field(ge=0, le=MAX_SPAN_S)]
 Rates = tuple[Number, Number, Number]
@@ -223,7 +223,7 @@ _NAMED = msgspec.json.Decoder(_Named)
 
 
 def is_gyro_line(line: bytes) -> bool:
-    """Whether a line of a telemetry file is a gyro block, and no batch."""
+    """True if a line of a telemetry file is a gyro block, and no batch."""
     # Most lines are batches, which are not decoded for this.
     if b'"rates_rad_per_s"' not in line:
         return False
@@ -238,9 +238,9 @@ def json_of_block(block: GyroBlock) -> bytes:
     times = (
         {"times_s": block.times_s.tolist()} if block.step_s is None else {"step_s": block.step_s}
     )
-    told = {"block": block.block, "start": block.start.text, "run": block.run}
+    fields = {"block": block.block, "start": block.start.text, "run": block.run}
     rates = {"rates_rad_per_s": block.rates_rad_per_s.tolist()}
-    return msgspec.json.encode(told | times | rates)
+    return msgspec.json.encode(fields | times | rates)
 
 
 def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None) -> GyroBlock:

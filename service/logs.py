@@ -42,7 +42,7 @@ class RequestContext:
 
 
 request: ContextVar[RequestContext | None] = ContextVar("request", default=None)
-"""What the lines written meanwhile belong to, also in threads that handlers run in."""
+"""The request to which lines written meanwhile belong, also in threads that handlers run in."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ _configured: LogSettings | None = None
 
 
 def configured() -> LogSettings | None:
-    """What this process was configured with; None where it leaves logging as it was."""
+    """The configuration of this process; None where it leaves logging as it was."""
     return _configured
 
 
@@ -141,12 +141,12 @@ class CountingHandler(logging.StreamHandler[TextIO]):
     def _write_count(self, known: "_Counted") -> None:
         last = known.last
         message = f"repeated {known.count} times within {self._period_s:g} s: {last.getMessage()}"
-        told = logging.LogRecord(
+        count_record = logging.LogRecord(
             last.name, last.levelno, last.pathname, last.lineno, message, None, None
         )
         # Of many requests, not of the one that this thread happens to work on.
-        vars(told).update(repeated=known.count, about=None)
-        super().emit(told)
+        vars(count_record).update(repeated=known.count, about=None)
+        super().emit(count_record)
 
     def write_counts(self) -> None:
         """Write what is counted by now, and count anew."""
@@ -176,7 +176,7 @@ class _Counted:
 
 
 def _kind(record: logging.LogRecord) -> object:
-    """What makes two records the same; numbers in an error's text do not tell them apart."""
+    """The key by which two records are the same; numbers in an error's text do not count."""
     arguments = record.args if isinstance(record.args, tuple) else ()
     errors = tuple(
         (type(each).__name__, _NUMBER.sub("#", str(each)[:_MAX_LINE]))
@@ -191,7 +191,7 @@ def _kind(record: logging.LogRecord) -> object:
 
 
 class _Lines(logging.Formatter):
-    """What is common to both formats."""
+    """The common part of both formats."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
@@ -201,7 +201,7 @@ class _Lines(logging.Formatter):
         """The fields of a line, in order; those that have no value are left out."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         about: RequestContext | None = getattr(record, "about", request.get())
-        told: dict[str, object | None] = {
+        values: dict[str, object | None] = {
             "time": f"{seconds}.{int(record.msecs):03d}Z",
             "level": record.levelname.lower(),
             "process": self._process,
@@ -215,7 +215,7 @@ class _Lines(logging.Formatter):
         }
         return {
             name: _harmless(value) if isinstance(value, str) else value
-            for name, value in told.items()
+            for name, value in values.items()
             if value is not None
         }
 

@@ -134,13 +134,13 @@ class Settings:
         somewhere else.
         """
         known = {PREFIX + field.name.upper(): field.name for field in fields(cls)}
-        given = {
+        values = {
             name: text for name, text in environment.items() if name.startswith(PREFIX) and text
         }
-        for name in given:
+        for name in values:
             if name not in known:
                 raise BadConfiguration(f"{name}: no such setting; there are {', '.join(known)}")
-        return cls(**{known[name]: _read(known[name], text) for name, text in given.items()})
+        return cls(**{known[name]: _read(known[name], text) for name, text in values.items()})
 
 
 _READERS: dict[str, Callable[[str], Any]] = {
@@ -182,7 +182,7 @@ def networks(text: str) -> tuple[Network, ...]:
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """Whether a name or an address is this machine's own, whoever answers for names."""
+    """True if a name or an address is this machine's own, whoever answers for names."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:

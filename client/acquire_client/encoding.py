@@ -1,4 +1,4 @@
-"""What the client sends: addresses, queries and bodies."""
+"""The encoding of what the client sends: addresses, queries and bodies."""
 
 import json
 from collections.abc import Iterator, Mapping

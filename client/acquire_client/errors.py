@@ -113,7 +113,7 @@ class Problem(ClientError):
 
     @property
     def detail(self) -> str:
-        """What is wrong, in a sentence."""
+        """The fault, in a sentence."""
         return self.document.detail
 
     @property

@@ -12,7 +12,7 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0
 
 
 class Repeat(Enum):
-    """Which requests may be sent again."""
+    """The requests that may be sent again."""
 
     ALWAYS = "a second one changes nothing"
     IF_REFUSED = "unless the service may have received it"

@@ -76,7 +76,7 @@ def _package(name: str) -> Any:
 
 
 def _is_free(kind: inspect.Type) -> bool:
-    """Whether a field holds settings of any shape."""
+    """True if a field holds settings of any shape."""
     return isinstance(kind, inspect.DictType) and isinstance(kind.value_type, inspect.AnyType)
 
 

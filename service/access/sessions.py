@@ -63,7 +63,7 @@ class Access:
 
     @property
     def is_open(self) -> bool:
-        """Whether no token is required: on loopback, until the first one is made."""
+        """True if no token is required: on loopback, until the first one is made."""
         if self._closed or not self._loopback:
             return False
         clock_s = time.monotonic()
@@ -90,7 +90,7 @@ class Access:
             raise Busy("the database does not answer", 5)
 
     def has_tokens(self) -> bool:
-        """Whether a token was ever made."""
+        """True if a token was ever made."""
         with self._reading() as connection:
             return tokens.any_token(connection)
 
@@ -116,7 +116,7 @@ class Access:
 
     @property
     def was_open(self) -> bool:
-        """Whether access was open when that was last asked."""
+        """True if access was open when that was last asked."""
         return self._loopback and not self._closed and self._open_until_s > 0.0
 
     def caller(self, token: str | None, session: str | None) -> Caller:

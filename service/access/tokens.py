@@ -47,7 +47,7 @@ class Caller:
     rate_per_s: float | None = None
 
     def may_see(self, spacecraft: str) -> bool:
-        """Whether the caller may see a spacecraft."""
+        """True if the caller may see a spacecraft."""
         return self.spacecraft is None or spacecraft in self.spacecraft
 
     def require(self, spacecraft: str) -> None:
@@ -164,7 +164,7 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
 
 
 def any_token(connection: Connection) -> bool:
-    """Whether a token was ever made: from then on every request needs one."""
+    """True if a token was ever made: from then on every request needs one."""
     return connection.execute(select(access_tokens.c.id).limit(1)).first() is not None
 
 

@@ -21,7 +21,7 @@ from service.vectors import Matrix, Vector, rotate_about
 ROUNDS = 15
 OUTLIER_SIGMAS = 4.0
 OBSERVABLE = 0.5
-"""Of its prior's sigma: what is known less well than this was not seen in the pictures."""
+"""The share of its prior's sigma below which a parameter counts as seen in the pictures."""
 LEAST_FLOOR_PX = 0.01
 
 
@@ -73,13 +73,13 @@ class _View:
     attitude: Matrix
     u_px: Vector
     v_px: Vector
-    told_px: Vector
+    predicted_px: Vector
     star: Vector
 
     @property
     def sigma_px(self) -> Vector:
         """The predicted errors of places, none better than what a lens's model may be."""
-        return np.maximum(self.told_px, LEAST_SIGMA_PX)
+        return np.maximum(self.predicted_px, LEAST_SIGMA_PX)
 
 
 def calibrate_camera(
@@ -107,12 +107,12 @@ def calibrate_camera(
     lens, covariance = _fit(lens, views, len(PARAMETERS))
     after = np.concatenate([_residuals(lens, view) for view in views])
     sigma = np.concatenate([view.sigma_px for view in views])
-    told = np.concatenate([view.told_px for view in views])
+    predicted_px = np.concatenate([view.predicted_px for view in views])
     freedom = max(after.size - 3 * len(views) - len(PARAMETERS), 1)
     scale2 = float(((after / sigma[:, None]) ** 2).sum()) / freedom
     covariance = covariance * scale2
-    told_px2 = float(np.mean(told**2))
-    variance = float((after**2).sum()) / freedom - told_px2
+    predicted_px2 = float(np.mean(predicted_px**2))
+    variance = float((after**2).sum()) / freedom - predicted_px2
     found = [each.attitude for each in results if each.attitude is not None]
     exposures = [each.frame.exposure_s for each in results if each.frame.exposure_s is not None]
     zero = np.array([each.zero_point_mag for each in found])
@@ -124,7 +124,7 @@ def calibrate_camera(
         place_px=np.concatenate([np.column_stack([v.u_px, v.v_px]) for v in views]),
         before_px=before,
         after_px=after,
-        centroid_sigma_px=math.sqrt(told_px2),
+        centroid_sigma_px=math.sqrt(predicted_px2),
         sigma_floor_px=max(math.sqrt(max(variance, 0.0)), LEAST_FLOOR_PX),
         psf_sigma_px=float(np.median([each.points.psf_sigma_px for each in results])),
         noise_counts=float(np.median([each.points.noise_counts for each in results])),
@@ -155,7 +155,7 @@ def _told_sigma(result: PictureResult) -> Vector:
 
 def _keep(view: _View, good: Vector) -> None:
     view.u_px, view.v_px = view.u_px[good], view.v_px[good]
-    view.told_px, view.star = view.told_px[good], view.star[good]
+    view.predicted_px, view.star = view.predicted_px[good], view.star[good]
 
 
 def _residuals(lens: Lens, view: _View) -> Vector:
@@ -200,7 +200,7 @@ def _fit(lens: Lens, views: Sequence[_View], parameters: int) -> tuple[Lens, Mat
 
 
 def _remarks(covariance: Matrix, zero: Vector) -> list[str]:
-    """What the pictures did not show."""
+    """Remarks on what the pictures did not show."""
     remarks = []
     if math.sqrt(covariance[1, 1]) > OBSERVABLE * BEND_PRIOR:
         remarks.append(

@@ -29,7 +29,7 @@ from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 ROUGH_SHARE = 0.05
-"""Of the half diagonal: what a place may be off by where no lens could be fitted."""
+"""The share of the half diagonal by which a place may be off where no lens could be fitted."""
 LEAST_SIGMA_PX = 0.05
 
 
@@ -79,7 +79,7 @@ def _of_unknown_lens(
         # The search of the whole sky is done.  What is found about it still stands or falls
         # by its own evidence.
         prior = {"a_priori": {"quaternion": _unit(found.quaternion)}}
-        known = FrameIn.model_validate_json(json.dumps(_told(known) | prior))
+        known = FrameIn.model_validate_json(json.dumps(_sent_fields(known) | prior))
     stars = _observed(result, chosen, camera)
     model = batch_of_stars(mission.name, known, digest, time, tracker, stars)
     done = perf_counter_ns()
@@ -92,9 +92,9 @@ def _of_unknown_lens(
     )
 
 
-def _told(known: FrameIn) -> dict[str, Any]:
-    told: dict[str, Any] = json.loads(known.model_dump_json(exclude_defaults=True))
-    return told
+def _sent_fields(known: FrameIn) -> dict[str, Any]:
+    fields: dict[str, Any] = json.loads(known.model_dump_json(exclude_defaults=True))
+    return fields
 
 
 def _unit(quaternion: Vector) -> list[float]:
@@ -125,7 +125,7 @@ def _chosen(result: PictureResult, most: int, limit_mag: float) -> list[int]:
 
 
 def _scale_of(found: PictureAttitude, directions: Vector, sigma_rad: Vector) -> float:
-    """By how much the sigmas of stars must grow for the attitude to be as unsure as its lens."""
+    """The factor by which star sigmas must grow for the attitude to be as unsure as its lens."""
     outer = np.einsum("ni,nj->nij", directions, directions)
     information = ((np.eye(3) - outer) / sigma_rad[:, None, None] ** 2).sum(axis=0)
     alone = np.diag(np.linalg.inv(information))

@@ -36,11 +36,11 @@ RETRY_S = 10
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-"""By which the service is stopped; they may reach its whole process group."""
+"""The signals that stop the service; they may reach its whole process group."""
 
 
 class _Share(NamedTuple):
-    """What one child compiles, in this order; see `prewarm_kernels`."""
+    """The kernels that one child compiles, in this order; see `prewarm_kernels`."""
 
     zones: list[str]
     """Identifiers that search zones."""
@@ -56,7 +56,7 @@ class KernelBuild:
         self._children: list[SpawnProcess] = []
         self._cancelled = False
         self.is_needed = not _is_complete()
-        """Until a build has succeeded: an answer must not depend on what is compiled."""
+        """True until a build has succeeded: an answer must not depend on what is compiled."""
         self._zones_needed = self.is_needed
 
     def require_zones_built(self) -> None:
@@ -80,21 +80,21 @@ class KernelBuild:
         """
         if not self.is_needed:
             return
-        told = []
+        receivers = []
         with self._lock:
             if self._cancelled:
                 raise Stopping("the service is stopping")
             for share in _shares(_processors()):
-                here, there = _CONTEXT.Pipe(duplex=False)
+                receiver, sender = _CONTEXT.Pipe(duplex=False)
                 child = _CONTEXT.Process(
-                    target=_compile, args=(dict(missions), share, there), daemon=True
+                    target=_compile, args=(dict(missions), share, sender), daemon=True
                 )
                 self._children.append(child)
                 child.start()
                 # The child alone holds this end: when it has ended there is nothing to wait for.
-                there.close()
-                told.append(here)
-        if all(_is_told(each) for each in told):
+                sender.close()
+                receivers.append(receiver)
+        if all(_has_reported(each) for each in receivers):
             self._zones_needed = False
             zones_built()
         for child in self._children:
@@ -134,7 +134,7 @@ def _is_complete() -> bool:
 
 
 def end_with_parent(stop: connection.Connection | None = None) -> None:
-    """In a child process: ignore the signals that stop the parent, and exit when it has ended.
+    """Ignore, in a child process, the signals that stop the parent, and exit when it has ended.
 
     Or when the other end of `stop` is closed.
     """
@@ -145,7 +145,7 @@ def end_with_parent(stop: connection.Connection | None = None) -> None:
 
 
 def exit_after_parent(stop: connection.Connection | None = None) -> None:
-    """In a child process: exit when the parent has ended, or the other end of `stop` is closed."""
+    """Exit, in a child process, when the parent has ended or the other end of `stop` is closed."""
     parent = multiprocessing.parent_process()
     assert parent is not None
     ends: list[int | connection.Connection] = [parent.sentinel]
@@ -171,7 +171,7 @@ def _processors() -> int:
 
 
 def _shares(processors: int) -> list[_Share]:
-    """What each child compiles.
+    """The kernels that each child compiles.
 
     Weighing hypotheses is one kernel that takes as long as most others together, and the
     whole sky needs it, too: by then the first child has saved it.
@@ -188,7 +188,7 @@ def _shares(processors: int) -> list[_Share]:
     return [_Share(weighing, [], True), _Share(counting, others, False)]
 
 
-def _is_told(child: connection.Connection) -> bool:
+def _has_reported(child: connection.Connection) -> bool:
     """Wait until a child has compiled its kernels of zones; False if it ends before that."""
     with child:
         try:
@@ -213,11 +213,11 @@ def _compile(
 # The size of machine code grows evenly with the time that its compiling takes.
 
 KERNEL_BYTES = 6_090_000
-"""Of the machine code of all kernels, about; other processors have a tenth more or less."""
+"""The size of the machine code of all kernels, about; other processors differ by a tenth."""
 MOST_SHARE = 0.99
-"""Until it is over, since the size is not known to the last byte."""
+"""The largest share shown until it is over, since the size is not known to the last byte."""
 LEAST_SHARE = 0.02
-"""Before this the time that is left cannot be told."""
+"""The share before which the remaining time cannot be estimated."""
 STEPS = {
     "geometry": "zones and pairs",
     "sky": "zones and pairs",

@@ -47,7 +47,7 @@ GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
 MOST_SIGMA_SHARE = 1.0 / 400.0
-"""Of the longer side: an attitude that is less certain is no answer.
+"""The share of the longer side above which an attitude's sigma is too large for an answer.
 
 Those of nine real pictures are .0005 of the side at most, of drawn ones with seven stars or more
 .001.  Residuals scale the sigmas: where stars lie anywhere within gates of pixels, by chance or
@@ -64,7 +64,7 @@ class PictureStar:
     id: str
     name: str | None
     row: int
-    """Of the bright stars that the picture was held against."""
+    """The rows of the bright stars that the picture was compared with."""
     magnitude_v_mag: float
     u_px: float
     v_px: float
@@ -158,7 +158,7 @@ class PictureAttitude:
 
 @dataclass(frozen=True)
 class PictureResult:
-    """What became of a picture: candidates, attitude or None, and remarks in words."""
+    """The result of a picture: candidates, attitude or None, and remarks in words."""
 
     frame: Frame
     points: PointSources
@@ -355,7 +355,7 @@ def _of_the_middle(lens: Lens, attitude: Matrix) -> Matrix:
 def _turns_of_the_middle(fit: LensFit) -> Matrix:
     """How the attitude of the middle (3, p) turns, in radians, with every parameter of the fit."""
     turns = np.zeros((3, fit.parameters))
-    here = _of_the_middle(fit.lens, fit.attitude)
+    unmoved = _of_the_middle(fit.lens, fit.attitude)
     step = 1e-6
     for column in range(fit.parameters):
         lens, attitude = fit.lens, fit.attitude
@@ -365,7 +365,7 @@ def _turns_of_the_middle(fit: LensFit) -> Matrix:
             name = ("bend", "off_u", "off_v")[column - 4]
             lens = replace(lens, **{name: getattr(lens, name) + step})
         moved = _of_the_middle(lens, attitude)
-        turns[:, column] = attitude_error_arcsec(moved, here) / ARCSEC_PER_RADIAN / step
+        turns[:, column] = attitude_error_arcsec(moved, unmoved) / ARCSEC_PER_RADIAN / step
     return turns
 
 

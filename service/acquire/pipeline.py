@@ -172,21 +172,23 @@ def _reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
     And `BadBatch` where the attitude to search about is still to be predicted.
     """
     if batch.tracking is not None and not batch.tracking.resolved:
-        told = "last needs the record of a service, which predicts the attitude from it"
-        raise BadBatch(Fault("a_priori.from", told, shown_value("last")))
+        message = "last needs the record of a service, which predicts the attitude from it"
+        raise BadBatch(Fault("a_priori.from", message, shown_value("last")))
     return reduced(batch, mission)
 
 
 def _search(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, timer: StepTimer, budget: WorkBudget
 ) -> Search:
-    """What holds for the searches for a batch's stars."""
-    time, given = batch.time, batch.a_priori
+    """The conditions of the searches for a batch's stars."""
+    time, a_priori = batch.time, batch.a_priori
     return Search(
         batch=batch,
         mission=mission,
         choices=choices_of(batch, mission),
-        prior=None if given is None else prior_attitude(given, time, mission, batch.position_km),
+        prior=None
+        if a_priori is None
+        else prior_attitude(a_priori, time, mission, batch.position_km),
         velocity_c=aberration_velocity(batch),
         sun_au=sun_distance_au(time),
         run_catalog=sky.run_catalog(mission, time),

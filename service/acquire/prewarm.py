@@ -23,7 +23,7 @@ from service.tracks.linking import compile_linking
 from service.vectors import quaternion_from_matrix, rotate_about
 
 ORION = 84.0, -1.0
-"""Where there are many bright stars: right ascension and declination, in degrees."""
+"""A field with many bright stars: right ascension and declination, in degrees."""
 BRIGHT_MAG = 4.0
 """So few stars are enough for every kernel, and are soon built from."""
 BRIGHTEST_MAG = 3.0
@@ -81,8 +81,8 @@ def prewarm_kernels(
     first = next(iter(kinds), None)
     if identifiers is None:
         identifiers = {"lost_in_space", *(mission.identifier for mission in missions.values())}
-    for kind, given in kinds.items():
-        mission = _of_bright_stars(given, BRIGHT_MAG)
+    for kind, original in kinds.items():
+        mission = _of_bright_stars(original, BRIGHT_MAG)
         tracker = mission.trackers[0]
         attitude = prior_attitude(
             SunPointedPrior(None, None)
@@ -123,7 +123,7 @@ def prewarm_kernels(
             exact = {} if identifier.name == "starid" else {"zone_grid_deg": 0.0}
             options = {"identifier": identifier.name} | exact
             batch = submission_from_json(json.dumps(body | {"options": options})).batch
-            brightest = _of_bright_stars(given, BRIGHTEST_MAG)
+            brightest = _of_bright_stars(original, BRIGHTEST_MAG)
             searched = mission if identifier.uses_prior else brightest
             if identifier.searches_zone:
                 # So few stars may not be enough, and the whole sky has kernels of its own.

@@ -25,7 +25,7 @@ from service.sky.zones import SearchRegion
 from service.vectors import Vector, matrix_from_quaternion, quaternion_from_matrix, read_only
 
 TrackingState = Literal["acquiring", "tracking", "lost"]
-"""Of a batch: found in the whole sky, found about a prediction, or nothing good."""
+"""How a batch was found: in the whole sky, about a prediction, or with no good attitude."""
 _COUNTED = [
     (int(each), each.word) for each in (Outcome.UNIQUE, Outcome.AMBIGUOUS, Outcome.UNMATCHED)
 ]

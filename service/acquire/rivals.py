@@ -29,7 +29,7 @@ from service.vectors import attitude_error_arcsec, read_only
 FEWEST_NAMED = 2
 """One tracker must name so many stars of a second group: two vectors have an attitude."""
 DIFFERENT_CHI_SQUARE = 30.0
-"""Of chi-square with three degrees of freedom: two attitudes of noise alone pass it in 1e-6."""
+"""Chi-square with three degrees of freedom that two attitudes of noise alone pass in 1e-6."""
 
 
 def find_groups(
@@ -140,7 +140,7 @@ def _log_weight(
 
 
 def _differ(one: AttitudeSolution, other: AttitudeSolution) -> bool:
-    """Whether two attitudes of different stars differ by more than their noise explains."""
+    """True if two attitudes of different stars differ by more than their noise explains."""
     apart_arcsec = attitude_error_arcsec(other.matrix, one.matrix)
     covariance_arcsec2 = one.covariance_arcsec2 + other.covariance_arcsec2
     weighted = float(apart_arcsec @ np.linalg.solve(covariance_arcsec2, apart_arcsec))

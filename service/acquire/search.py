@@ -34,11 +34,11 @@ from service.vectors import (
 )
 
 CONTRADICTED_CHI_SQUARE = 30.0
-"""Of chi-square with three degrees of freedom: a right prediction passes it in 1e-6."""
+"""Chi-square with three degrees of freedom that a right prediction passes in 1e-6."""
 
 
 class SearchResult(Struct, frozen=True, eq=False, gc=False):
-    """What was found for some stars of a batch: the path, the result in zones, or why none.
+    """The result for some stars of a batch: the path, the result in zones, or why none.
 
     `explained` (n,) of every tracker marks the stars of the likeliest hypothesis.
     """
@@ -51,7 +51,7 @@ class SearchResult(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def good(self) -> bool:
-        """Whether there is an attitude that its own residuals do not speak against."""
+        """True if there is an attitude that its own residuals do not speak against."""
         return self.in_zones is not None and self.in_zones.good
 
     @property
@@ -217,7 +217,7 @@ def _solve(
 def _falls_back(
     search: Search, corrected: Sequence[CorrectedObservations], in_zones: ZoneResult
 ) -> bool:
-    """Whether the result about the a priori attitude is so poor that the sky is searched.
+    """True if the result about the a priori attitude is so poor that the sky is searched.
 
     A prediction may fail at any time: its batch is without other knowledge then.
     """
@@ -229,7 +229,7 @@ def _falls_back(
 
 
 def contradicts(in_zones: ZoneResult, prior: PriorAttitude) -> bool:
-    """Whether an attitude that was found about a prediction cannot be the predicted one."""
+    """True if an attitude that was found about a prediction cannot be the predicted one."""
     predicted, solved = prior.predicted, in_zones.solved
     if predicted is None or not isinstance(solved, AttitudeSolution):
         return False
@@ -254,7 +254,7 @@ CLUTTER = 0.1
 FAILED = 0.01
 """The probability that a prediction has failed, as at a flip that no mission declares."""
 GATE = 30.0
-"""Of chi-square with two degrees of freedom: catalog stars beyond it weigh nothing."""
+"""Chi-square with two degrees of freedom beyond which catalog stars weigh nothing."""
 
 
 def identify_lone_stars(

@@ -78,7 +78,7 @@ class StepTimer:
 
 
 class Search(Struct, frozen=True, eq=False):
-    """What holds for every search for the stars of one batch, all of them or a part."""
+    """The conditions of every search for the stars of one batch, all of them or a part."""
 
     batch: ObservationBatch
     mission: Mission
@@ -124,7 +124,7 @@ class ZoneResult(Struct, frozen=True, eq=False):
 
     @property
     def good(self) -> bool:
-        """Whether there is an attitude that its own residuals do not speak against."""
+        """True if there is an attitude that its own residuals do not speak against."""
         return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
 
 
@@ -164,7 +164,7 @@ class ZoneSearch:
         self.errors: dict[int, Exception] = {}
         self._asked: dict[int, _Asked] = {}
         self._by_itself: dict[int, Identification] = {}
-        """By tracker: of identifiers that take one sighting at a time."""
+        """By tracker, the results of identifiers that take one sighting at a time."""
         self._zones: dict[tuple[int, *tuple[Hashable, ...]], list[tuple[int, int]]] = {}
         """(row, tracker) that are identified in one call, by (place of the tracker in its batch,
         identifier, rules, zone)."""
@@ -270,7 +270,7 @@ class ZoneSearch:
     def _sighting(
         self, t: int, asked: _Asked, index: int, zone: Zone, budget: WorkBudget
     ) -> Sighting:
-        """What an identifier is given that takes one sighting at a time."""
+        """The input of an identifier that takes one sighting at a time."""
         seen, search, guide = self.seen, asked.search, None
         first, last = seen.offsets[t : t + 2]
         if search.identifier.needs_guide:

@@ -32,7 +32,7 @@ from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 
 EVIDENCE_SHARE = 0.4
-"""Of the time there is, the share in which evidence is collected; the rest is for trials."""
+"""The share of the time in which evidence is collected; the rest is for trials."""
 
 RunAgain = Callable[[ObservationBatch], Acquisition]
 

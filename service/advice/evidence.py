@@ -26,7 +26,7 @@ from service.vectors import Matrix, Vector, angle_between_deg, unit
 
 @dataclass(frozen=True)
 class StarEvidence:
-    """Of identified stars (n): which batch and tracker, observed and catalog magnitude.
+    """Identified stars (n): batch and tracker, observed and catalog magnitude.
 
     `pole_angle_deg` is the difference between the observed angle to the pole,
     through the a priori attitude, and the catalog's; NaN in caps.
@@ -41,7 +41,7 @@ class StarEvidence:
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """Of pairs (n) of identified stars of one tracker, no farther apart than the pair index goes.
+    """Pairs (n) of identified stars of one tracker, no farther apart than the pair index goes.
 
     `separation_deg` is observed minus catalog.  `pole_difference_deg` is that
     between the observed and the catalog difference of the angles to the pole

@@ -44,9 +44,9 @@ SEGMENTS = 20
 STUDENT = 2.093
 """The 97.5 % point of Student's t with 19 degrees of freedom."""
 LONGEST_STEPS = 3.0
-"""Of the median step: across a longer one nothing is said of the gyro's noise."""
+"""The longest step, in median steps, across which the gyro's noise is estimated."""
 SETTLING = 4.0
-"""Of 1 / K: so many measurements after a break only settle A and B."""
+"""The multiple of 1 / K measurements after a break that only settle A and B."""
 
 Full = npt.NDArray[np.float64]
 
@@ -150,7 +150,7 @@ def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
 
 
 def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
-    """Of each measurement the two equations, summed over the axes: left sides and right side."""
+    """The two equations of each measurement, summed over the axes: left sides and right side."""
     z = part.innovation_arcsec @ axes
     predicted, measured = (
         np.einsum("ji,njk,ki->ni", axes, _full(each), axes)
@@ -286,8 +286,8 @@ def _of_attitudes(
     changes = []
     for tracker in mission.trackers:
         line = f"sigma_arcsec = {tracker.sigma_arcsec * ratio.value:.3g}"
-        told = f"{line:<32} # was {tracker.sigma_arcsec:g}"
-        changes.append(FileChange("trackers", tracker.name, told))
+        file_line = f"{line:<32} # was {tracker.sigma_arcsec:g}"
+        changes.append(FileChange("trackers", tracker.name, file_line))
     return Statement("correct", f"{start}: so are the stars' sigmas.", tuple(changes))
 
 

@@ -36,7 +36,7 @@ class Interval:
         return Interval(self.value * factor, self.low * factor, self.high * factor)
 
     def holds(self, value: float) -> bool:
-        """Whether a value lies between the bounds."""
+        """True if a value lies between the bounds."""
         return self.low <= value <= self.high
 
 

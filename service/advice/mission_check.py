@@ -32,7 +32,7 @@ FEW_STARS = 3
 FEW_SHARE = 0.05
 MANY_STARS = 100
 MANY_PAIRS = 300_000
-"""Of one zone: 5 MB, and as many pairs to look through for each batch."""
+"""Pairs of one zone: 5 MB, and as many pairs to look through for each batch."""
 SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5
@@ -129,9 +129,9 @@ def _zone(mission: Mission) -> Iterator[Finding]:
             "at its edge are not in the zone",
         )
     for place, tracker in enumerate(mission.trackers):
-        told_deg = tracker.coelevation_deg or zone.coelevation_deg
+        file_deg = tracker.coelevation_deg or zone.coelevation_deg
         true_deg = separation_deg(tracker.boresight_body, mission.axis_body)
-        off = abs(told_deg - true_deg)
+        off = abs(file_deg - true_deg)
         if off <= COELEVATION_DEG:
             continue
         never = off > zone.half_width_deg + tracker.field_of_view_radius_deg
@@ -139,15 +139,15 @@ def _zone(mission: Mission) -> Iterator[Finding]:
             "wrong" if never else "unusual",
             f"trackers.{place}.coelevation_deg" if tracker.coelevation_deg else "zone",
             f"{tracker.name} looks {true_deg:.2f} deg from the pole by its axes, and at the "
-            f"coelevation of {told_deg:g} deg by the file"
+            f"coelevation of {file_deg:g} deg by the file"
             + (": its stars are never in the band" if never else ""),
         )
 
 
 def _tolerances(mission: Mission) -> Iterator[Finding]:
-    told = mission.tolerances
+    tolerances = mission.tolerances
     widest_deg = 2.0 * max(each.field_of_view_radius_deg for each in mission.trackers)
-    limit_deg = told.pair_separation_max_deg
+    limit_deg = tolerances.pair_separation_max_deg
     if limit_deg > 1.05 * widest_deg:
         yield Finding(
             "unusual",
@@ -163,8 +163,8 @@ def _tolerances(mission: Mission) -> Iterator[Finding]:
             "a field are not in the index",
         )
     checked = [
-        ("separation_deg", told.separation_deg, "sigma_arcsec", math.sqrt(2.0) / 3600.0),
-        ("magnitude_mag", told.magnitude_mag, "magnitude_sigma_mag", 1.0),
+        ("separation_deg", tolerances.separation_deg, "sigma_arcsec", math.sqrt(2.0) / 3600.0),
+        ("magnitude_mag", tolerances.magnitude_mag, "magnitude_sigma_mag", 1.0),
     ]
     for name, tolerance, sigma_name, factor in checked:
         if idle_reason(name, mission.identifier, mission.tests, mission.zone) is not None:
@@ -215,12 +215,12 @@ def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
             "stars leave light that it does not explain, and errors of places exceed their sigmas "
             "by amounts that are not known",
         )
-    corner_deg, told_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
-    if not math.isclose(corner_deg, told_deg, rel_tol=CORNER_SHARE):
+    corner_deg, file_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
+    if not math.isclose(corner_deg, file_deg, rel_tol=CORNER_SHARE):
         yield Finding(
             "unusual",
             f"{key}.field_of_view_radius_deg",
-            f"{told_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
+            f"{file_deg:g}, but the corner of the camera's frame is {corner_deg:.2f} deg from the "
             "boresight",
         )
 

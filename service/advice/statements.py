@@ -173,13 +173,14 @@ def noise_statement(finding: NoiseFinding) -> Statement:
     if finding.verdict == "fits":
         return Statement("keep", f"{start} is {found}: the mission's {now} fits.{worst}")
     ratio = finding.sigma_arcsec.value / finding.now_arcsec
-    told = "too small" if finding.verdict == "too_small" else "too large"
+    deviation = "too small" if finding.verdict == "too_small" else "too large"
     follows = (
         "attitudes are given as better than they are, and too many are called suspect"
         if finding.verdict == "too_small"
         else "attitudes are given as worse than they are, and misnamed stars pass unnoticed"
     )
-    text = f"{start} is {found}, {ratio:.2f} times the mission's {now}, which is {told}: {follows}."
+    text = f"{start} is {found}, {ratio:.2f} times the mission's {now}, "
+    text += f"which is {deviation}: {follows}."
     text += worst
     if finding.before_arcsec is not None and finding.since is not None:
         return Statement(
@@ -236,8 +237,8 @@ def magnitude_statement(finding: MagnitudeFinding, advice: Findings) -> Statemen
     if finding.verdict == "off" and not scale.holds(1.0):
         text += " No setting undoes a scale: look at the instrument's magnitude calibration."
     if finding.scatter_verdict in ("too_small", "too_large"):
-        told = finding.scatter_verdict.replace("_", " ")
-        text += f" The mission's sigma of {finding.now_sigma_mag:g} mag is {told}."
+        verdict = finding.scatter_verdict.replace("_", " ")
+        text += f" The mission's sigma of {finding.now_sigma_mag:g} mag is {verdict}."
         line_text = f"magnitude_sigma_mag = {finding.scatter_mag.value:.2g}"
         changes.append(
             FileChange(

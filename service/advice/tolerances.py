@@ -1,4 +1,4 @@
-"""Whether a tolerance is too tight or too wide for what the tracker really measures.
+"""Finds tolerances that are too tight or too wide for what the tracker really measures.
 
 A tolerance is held against the differences of pairs that are known to be the
 same stars.  It is too tight where it certainly loses more than one true pair in
@@ -48,7 +48,7 @@ class Tolerance:
     """The largest value that a mission may give it."""
     differences: Differences
     loses: str = "loses {share} of the true {what}"
-    """What a value that is too small does."""
+    """The consequence of a value that is too small."""
 
 
 TOLERANCES: tuple[Tolerance, ...] = (
@@ -124,7 +124,7 @@ TOLERANCES: tuple[Tolerance, ...] = (
 
 @dataclass(frozen=True)
 class ToleranceFinding:
-    """What the differences say of one tolerance.
+    """The finding of the differences on one tolerance.
 
     `needed` is the value that lets KEPT of the true pairs pass; `beyond` is the
     share that the present value loses.  Both are None without data.

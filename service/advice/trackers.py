@@ -25,9 +25,9 @@ CERTAIN_CHI2 = 16.266
 CLOSE = 0.2
 """A sigma that is right within a fifth needs no change."""
 CERTAIN = 0.999
-"""Of the intervals that tell whether noise changed: several stretches are looked at."""
+"""The confidence of the intervals that show a change of noise: several stretches are tested."""
 SCAN_SIGMAS = 4.5
-"""Of samples of 200 batches of constant noise, about one in five hundred has a stretch above it."""
+"""About one in five hundred samples of 200 batches of constant noise has a stretch above it."""
 
 SizeVerdict = Literal["too_small", "fits", "too_large", "no_verdict"]
 
@@ -201,7 +201,7 @@ def _squared_noise(fits: list[TrackerAttitude]) -> Vector:
 
 
 def _size_verdict(now: float, found: Interval) -> SizeVerdict:
-    """Whether a sigma is certainly, and by more than CLOSE, below or above what was found."""
+    """The verdict on a sigma: certainly, and by more than CLOSE, below or above what was found."""
     if found.low > now and found.value > (1.0 + CLOSE) * now:
         return "too_small"
     if found.high < now and found.value < (1.0 - CLOSE) * now:

@@ -16,7 +16,7 @@ ROWS, COLUMNS = 18, 72
 
 FIRST_STEP_DEG, LAST_STEP_DEG = 2.5, 0.02
 STAR_STARTS, PAIR_STARTS = 16, 8
-"""From how many axes of the grid the extremes of stars and of pairs are sought."""
+"""Numbers of axes of the grid from which the extremes of stars and of pairs are sought."""
 AXES_AT_ONCE = 72
 
 
@@ -31,7 +31,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class ZoneCensus:
-    """What zones of one shape hold, for every axis of `axes_deg`.
+    """The contents of zones of one shape, for every axis of `axes_deg`.
 
     `stars` and `pairs` (ROWS, COLUMNS) are NCAP and NTOT; declination falls along the
     rows, right ascension grows along the columns.  `of` says which shape that is.
@@ -120,7 +120,7 @@ def _axes_about(axis: Vector, step_deg: float) -> Vector:
 
 
 def _inside(cosine: Vector, least_deg: float, most_deg: float) -> npt.NDArray[np.bool_]:
-    """Which cosines are those of angles between two bounds."""
+    """Marks of the cosines of angles between two bounds."""
     near = math.cos(math.radians(least_deg)) if least_deg > 0.0 else 2.0
     far = math.cos(math.radians(most_deg)) if most_deg < 180.0 else -2.0
     return (cosine <= near) & (cosine >= far)

@@ -32,7 +32,7 @@ from service.sky.geometry.star_voxels import REACH_RAD
 from service.vectors import Vector, to_ra_dec
 
 RINGS = 4
-"""Of equal area, about a star."""
+"""The number of rings of equal area about a star."""
 ANGLES, STEPS, BEARINGS = 240, 8, 48
 """Steps across a zone, of a ring outwards and of half a turn about a star."""
 NEIGHBOURS_AT_ONCE = 4_000_000
@@ -41,7 +41,7 @@ VOXEL_BITS_PER_STAR = 128
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Of each star of a run catalog, ring by ring as far as HMAX, how many others lie there.
+    """The number of other stars about each star of a run catalog, ring by ring as far as HMAX.
 
     `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of their unit vectors.
     """
@@ -93,7 +93,7 @@ class ZoneEstimate:
 
 
 def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
-    """What each of unit vectors (n, 3) has about it as far as an angle."""
+    """The neighbours of each of unit vectors (n, 3) within an angle."""
     tree: Any = cKDTree(direction)
     chord = 2.0 * math.sin(math.radians(min(limit_deg, 180.0)) / 2.0)
     stars = len(direction)
@@ -101,11 +101,11 @@ def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
     mean = max(1, int(tree.count_neighbors(tree, chord)) // max(1, stars))
     step = max(1, NEIGHBOURS_AT_ONCE // mean)
     for first in range(0, stars, step):
-        some: Any = cKDTree(direction[first : first + step])
-        found = some.sparse_distance_matrix(tree, chord, output_type="ndarray")
+        chunk: Any = cKDTree(direction[first : first + step])
+        found = chunk.sparse_distance_matrix(tree, chord, output_type="ndarray")
         ring = np.minimum((found["v"] / chord) ** 2 * RINGS, RINGS - 1).astype(np.int64)
-        place, places = found["i"] * RINGS + ring, some.n * RINGS
-        part = slice(first, first + some.n)
+        place, places = found["i"] * RINGS + ring, chunk.n * RINGS
+        part = slice(first, first + chunk.n)
         count[part] = np.bincount(place, minlength=places).reshape(-1, RINGS)
         for k in range(3):
             sums = np.bincount(place, direction[found["j"], k], minlength=places)

@@ -19,7 +19,7 @@ from service.sky.ephemeris import apparent
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 LEAST_SPREAD = 0.25
-"""Of the radius of the field of view: stars closer to their mean, rms, say little of the scale."""
+"""Share of the field of view's radius: stars closer to their mean, rms, tell little of scale."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +57,7 @@ def mean_stars(
     star: Sequence[Integers],
     catalog_direction: Vector,
 ) -> list[MeanStars]:
-    """What `scale_offset_ppm` and `alignment_offsets_arcsec` are computed from, tracker by tracker.
+    """The input of `scale_offset_ppm` and `alignment_offsets_arcsec`, tracker by tracker.
 
     `star` (n,) of every tracker are rows of `catalog_direction` (N, 3), -1 for stars that are not
     unique.
@@ -85,7 +85,7 @@ def scale_offset_ppm(means: Sequence[MeanStars]) -> float | None:
 
 
 def alignment_offsets_arcsec(means: Sequence[MeanStars]) -> list[float | None]:
-    """Of each tracker, how much larger its angles to the others are than the catalog's, as a mean.
+    """How much larger each tracker's angles to the others are than the catalog's, as a mean.
 
     None where it has no star, or none of the others has.
     """

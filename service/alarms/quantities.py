@@ -91,7 +91,7 @@ class Cause:
     cause: str
     remedy: str
     calibrate: bool = False
-    """Whether a new calibration is the remedy."""
+    """True if a new calibration is the remedy."""
 
 
 @dataclass(frozen=True)
@@ -101,26 +101,26 @@ class Quantity:
     name: str
     unit: str
     label: str
-    """As pages show it."""
+    """The name that pages show."""
     source: StarShare | BatchShare | Measured | Ratio | Rate | Gap | SmoothedShare
     limits: Callable[[Mission], LimitSettings] | None = None
     """The limits of a mission until others are set; None: limits do not apply."""
     worse: Literal["high", "size"] = "high"
-    """Whether a greater value is worse, or one further from zero."""
+    """`high` if a greater value is worse, `size` if one further from zero is."""
     description: str = ""
-    """Of its value in `measures`, in the OpenAPI document."""
+    """The description of its value in `measures`, in the OpenAPI document."""
     rolled_up: bool = False
-    """Whether the rollups have columns of it.  Without, buckets have no extremes of a share of
+    """True if the rollups have columns of it.  Without, buckets have no extremes of a share of
     stars, and no values of a ratio; and batches are not ranked by it."""
     by_tracker: bool = False
-    """Whether each tracker of a spacecraft with several has a value of it.  A tracker is suspect
+    """True if each tracker of a spacecraft with several has a value of it.  A tracker is suspect
     where it is the one that disagrees with the others."""
     cause: Cause | None = None
-    """Of a value out of its limits; docs/operators.md has the table of all."""
+    """The cause of a value out of its limits; docs/operators.md has the table of all."""
 
     @property
     def is_share(self) -> bool:
-        """Whether it is a share, which pages show in percent."""
+        """True if it is a share, which pages show in percent."""
         return isinstance(self.source, StarShare | BatchShare)
 
     @property
@@ -139,7 +139,7 @@ class Quantity:
                 return lambda row: None
 
     def sample_of(self, result: Mapping[str, Any]) -> Sample | None:
-        """What one result adds to the value that limits are evaluated for; None: nothing."""
+        """The sample of one result for the value that limits are evaluated for; None: nothing."""
         match self.source:
             case StarShare(part):
                 whole = result["observed"]

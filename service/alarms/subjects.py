@@ -1,4 +1,4 @@
-"""What limits apply to: a quantity of a spacecraft, or of one of its trackers.
+"""The subjects of limits: a quantity of a spacecraft, or of one of its trackers.
 
 A subject is text, `residual_ratio` or `residual_ratio@STARTRACKER_2`: names of
 quantities and of trackers have no `@`.

@@ -19,7 +19,7 @@ Sample = tuple[int, float, float]
 """(time_ns, part, whole): a share of counts, or a value over one."""
 
 SLACK = 1e-9
-"""Of the largest part: far more than sums in another order differ by."""
+"""A share of the largest part: far more than sums in another order differ by."""
 
 
 BatchRef = tuple[str, str | None]
@@ -124,7 +124,7 @@ class SampleWindow:
         return worst
 
     def _was_out(self, severity: Severity, limits: LimitSettings) -> bool:
-        """Whether the values are out of a bound so far: of a wider one only if they passed it."""
+        """True if the values are out of a bound so far: of a wider one only if they passed it."""
         if severity not in self.since_ns:
             return False
         worst = self.worst.get(severity)

@@ -90,7 +90,7 @@ class Alarms:
             return alarms.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
 
     def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
-        """Whether no mission file has the spacecraft, or the tracker with limits of its own."""
+        """True if no mission file has the spacecraft, or the tracker with limits of its own."""
         mission = self._context.missions.get(spacecraft)
         return mission is None or bool(tracker and tracker not in limited_trackers(mission))
 

@@ -62,7 +62,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 CALIBRATION_SAMPLE = 2_000
 LARGEST_CHOSEN_DEGREE = 5
 LONGEST_WAIT_S = 120.0
-"""For a thread of the solver, while others keep them all at work."""
+"""The wait for a thread of the solver, while others keep them all at work."""
 
 Step = Callable[[int, int], object]
 """Told after each batch: how many are done, and of how many."""
@@ -121,7 +121,7 @@ class CalibrationRun:
     first: str | None
     last: str | None
     magnitudes: tuple[MagnitudeCalibration, ...] = ()
-    """Of each tracker that was calibrated; empty where they were not asked for."""
+    """The magnitudes of each calibrated tracker; empty where they were not asked for."""
 
     @property
     def calibrated_magnitudes(self) -> dict[str, Magnitudes]:
@@ -131,7 +131,7 @@ class CalibrationRun:
 
     @property
     def covariance(self) -> Matrix:
-        """Of all unknowns, those of magnitudes last: these share nothing with the others."""
+        """The covariance of all unknowns, magnitudes last: these share nothing with the others."""
         blocks = [self.found.covariance, *(each.covariance for each in self.magnitudes)]
         size = sum(len(each) for each in blocks)
         whole, first = np.zeros((size, size)), 0
@@ -300,13 +300,13 @@ def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
 
 
 def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
-    """What the stars do not show."""
+    """The unknowns that the stars do not show."""
     of_magnitudes = (each.not_observable for each in run.magnitudes)
     return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
 
 def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
-    """Of each tracker the rms of the residuals of used stars, before and after."""
+    """The rms of each tracker's residuals of used stars, before and after."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     rows = []
     for index, tracker in enumerate(found.stars.trackers):
@@ -330,15 +330,15 @@ def _rms(values: Vector) -> float:
 
 
 def notes(run: CalibrationRun) -> list[str]:
-    """What a mission file cannot hold of this calibration."""
+    """Remarks on the parts of this calibration that a mission file cannot hold."""
     kinds = {each.kind for each in run.found.unknowns}
-    told = [VECTORS] if kinds & {"scale", "distortion"} else []
-    told += [TIME_TAGS] if "time_tag" in kinds else []
-    return told + ([COLORS] if _colors_differ(run) else [])
+    remarks = [VECTORS] if kinds & {"scale", "distortion"} else []
+    remarks += [TIME_TAGS] if "time_tag" in kinds else []
+    return remarks + ([COLORS] if _colors_differ(run) else [])
 
 
 def _colors_differ(run: CalibrationRun) -> bool:
-    """Whether the calibrated trackers do not have one colour term within the noise of a star."""
+    """True if the calibrated trackers do not have one colour term within the noise of a star."""
     settings = run.calibrated_magnitudes
     colors = [settings[each.name].color_mag for each in run.mission.trackers]
     least = min(each.magnitude_sigma_mag for each in run.mission.trackers)
@@ -397,12 +397,12 @@ def geometry_of(tracker: Tracker) -> TrackerGeometry:
 
 def geometry_digest(mission: Mission) -> str:
     """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
-    told = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
-    for each, tracker in zip(told, mission.trackers, strict=True):
+    geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
+    for each, tracker in zip(geometries, mission.trackers, strict=True):
         # Adoptions of versions without magnitudes hold the digest of the rest.
         if tracker.magnitudes == AS_MEASURED:
             del each["magnitudes"]
-    return "sha256:" + hashlib.sha256(msgspec.json.encode(told)).hexdigest()
+    return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
 
 
 def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
@@ -415,12 +415,12 @@ def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Miss
 
 
 def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
-    told = msgspec.to_builtins(geometry)
+    fields = msgspec.to_builtins(geometry)
     if geometry.magnitudes is None:
-        del told["magnitudes"]
+        del fields["magnitudes"]
     settings = {
         **tracker.model_dump(exclude={"camera"}),
-        **told,
+        **fields,
         "camera": tracker.camera,
     }
     return Tracker.model_validate(settings)
@@ -444,8 +444,8 @@ def _calibrated_tracker(tracker: Tracker, changes: dict[str, Lines]) -> TrackerG
         name: tuple(value) for name, value in _values(changes["tracker"]).items()
     }
     if changes["calibration"]:
-        told = _values(changes["calibration"])
-        own["calibration"] = FocalPlaneSettings.model_validate(told)
+        values = _values(changes["calibration"])
+        own["calibration"] = FocalPlaneSettings.model_validate(values)
     return geometry_of(tracker.model_copy(update=own))
 
 
@@ -456,7 +456,7 @@ def _values(lines: Lines) -> dict[str, Any]:
 def mission_file_lines(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
 ) -> str:
-    """What a calibration changes of a mission file, as TOML."""
+    """The lines of a mission file that a calibration changes, as TOML."""
     parts = []
     for each in mission.trackers:
         changes = tracker_lines(each, found)

@@ -291,8 +291,8 @@ def found_columns(run: CalibrationRun) -> Row:
 # tracker are those that were adopted, and all other settings the file's.  Where the file's
 # own alignments or focal planes have changed since, the file holds.
 
-TOLD = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", "mission")
-"""What the event of a change says of it; the rest is long."""
+EVENT_FIELDS = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", "mission")
+"""The fields of a change's event; the others are long."""
 
 
 def adopted_missions(
@@ -464,8 +464,8 @@ class CalibrationAdoptions:
             id = calibrations.begin_adoption(connection, self._ids.new())
             calibrations.add_adoption(connection, row | {"id": id})
             adopted = calibrations.list_adoptions(connection, name)[0]
-            told = {each: getattr(adopted, each) for each in TOLD}
-            events.add_event(connection, "calibration", told, spacecraft=name)
+            fields = {each: getattr(adopted, each) for each in EVENT_FIELDS}
+            events.add_event(connection, "calibration", fields, spacecraft=name)
             return adopted
 
         self.follow()

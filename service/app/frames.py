@@ -30,7 +30,7 @@ _COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
 
 
 def _asks_for_last(known: FrameIn, mission: Mission) -> bool:
-    """Whether the batch of a frame may ask for the last attitude."""
+    """True if the batch of a frame may ask for the last attitude."""
     prior, settings = known.a_priori, mission.tracking
     is_default = settings is not None and settings.default
     return isinstance(prior, FromLastIn) or (prior is None and is_default)

@@ -46,7 +46,7 @@ MOST_KEPT = 50
 SCHEDULE = "schedule"
 """The author of the jobs that no person asked for."""
 SETTLED_S = LOOK_AHEAD_S + 600.0
-"""After the end of a day: then the data are there that the day depends on."""
+"""The delay after the end of a day, when the data that the day depends on are present."""
 LATE_DAYS = 3
 """Days before the last one that are looked at again, for batches that came late."""
 LOOK_EVERY_S = 600.0
@@ -54,7 +54,7 @@ LOOK_EVERY_S = 600.0
 
 @dataclass(frozen=True)
 class _Wanted:
-    """What a job makes."""
+    """The product of a job."""
 
     spacecraft: str
     run: str
@@ -252,7 +252,7 @@ class DefinitiveAttitudes:
         raise NotFound(f"{spacecraft} has no job {id[:40]!r} since the start of the service")
 
     def start_schedule(self) -> None:
-        """From now on make the definitive attitude of each day where the mission asks for it."""
+        """Start to make the definitive attitude of each day where the mission asks for it."""
         if self._schedule is None and any(map(self._is_daily, self._context.missions)):
             self._schedule = threading.Thread(
                 target=self._keep_schedule, name="definitive-schedule", daemon=True

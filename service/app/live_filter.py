@@ -24,7 +24,7 @@ from service.storage.sql.tables import batches, results
 from service.times import DAY_S, recorded_utc, utc_now
 
 REST = 20.0
-"""After a look the thread rests so many times as long as that took: it is at work 5 % at most."""
+"""The thread's rest as a multiple of its last look: it works 5 % of the time at most."""
 
 _TIMES = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
 _LAST_FORGOTTEN = select(func.max(audit.c.id)).where(audit.c.action == "forget_run")

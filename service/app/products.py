@@ -123,7 +123,7 @@ class Products:
         return min(MAX_LARGEST_GAP_S, max(about.largest_gap_s, CADENCES * usual_s))
 
     def _pages(self, about: SeriesInfo, selected: ResultFilter, **wanted: Any) -> Pages:
-        """What is recorded of a period in a grade, page by page."""
+        """The recorded attitudes of a period in a grade, page by page."""
         if about.grade == "raw":
             return attitude_pages(self._store.reading, self._store.archive, selected, **wanted)
         return graded_pages(self._store.reading, selected, about.grade, **wanted)

@@ -72,7 +72,7 @@ class UploadForm:
     is_packets: bool = False
     """An archive of space packets and their XTCE file, in place of lines."""
     spacecraft: str | None = None
-    """Of packets: the mission; None: the only one that reads packets."""
+    """The mission whose packets are read; None: the only one that reads packets."""
 
 
 class Replays:
@@ -98,7 +98,7 @@ class Replays:
         self._lock = threading.Lock()
         self._replays: list[RunningReplay] = []
         self._given_up: set[str] = set()
-        """Those that this process could not continue: it does not try again."""
+        """The replays that this process could not continue: it does not try again."""
         self._closing = False
 
     @property

@@ -29,7 +29,7 @@ from service.storage.queries.recorded_batch import (
     recorded_mission,
     sample_batches,
 )
-from service.storage.queries.results import OutcomeName, StatusName, here_of, neighbours
+from service.storage.queries.results import OutcomeName, StatusName, neighbours, place_of
 from service.storage.queries.star_field import star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid
@@ -103,9 +103,9 @@ class Results:
     def neighbours(self, id: str) -> Neighbours:
         """The results before and after one in time: `earlier` and `later`, or None."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
-            here = here_of(connection, id)
+            place = place_of(connection, id)
         with self._context.reading_record() as connection:
-            return neighbours(connection, self._context.store.archive, here)
+            return neighbours(connection, self._context.store.archive, place)
 
     def star_field(self, id: str, answer: Answer | None = None) -> StarField:
         """The data of the chart of a result's stars; see `star_field.star_field_of`.
@@ -238,8 +238,10 @@ class Comparisons:
             refuse_idle_options(b, [each.b for each in of_stars], mission, "b")
 
         stretch = Stretch(name, run, start, end, sample)
-        told = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
-        return self._compared(stretch, pair_of, (again, again), (told[0], told[1]), limit_s, check)
+        option_sets = tuple(each.model_dump(mode="json", exclude_none=True) for each in (a, b))
+        return self._compared(
+            stretch, pair_of, (again, again), (option_sets[0], option_sets[1]), limit_s, check
+        )
 
     def of_missions(
         self, stretch: Stretch, a: Mission, b: Mission, limit_s: float = math.inf

@@ -69,7 +69,7 @@ class Runs:
         )
 
     def would_forget(self, selected: ForgetFilter) -> Forgotten:
-        """What `forget` would remove."""
+        """The data that `forget` would remove."""
         checked_run_name(selected.run)
         with self._context.reading() as connection:
             return found(connection, selected)

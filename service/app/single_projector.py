@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 class SingleProjector:
-    """Whether this process is the one that projects; `start` makes it so where no other is.
+    """Knows if this process is the one that projects; `start` makes it so where no other is.
 
     A process without the lock of `Store` always projects: on SQLite, and a command.
     """
@@ -48,7 +48,7 @@ class SingleProjector:
 
     @property
     def is_projecting(self) -> bool:
-        """Whether this process projects, as far as is known without asking the database."""
+        """True if this process projects, as far as is known without asking the database."""
         return self._store.is_projecting
 
     def start(self, follow: Callable[[], object]) -> None:
@@ -68,7 +68,7 @@ class SingleProjector:
         self._thread.start()
 
     def resume_with(self, resume: Callable[[], object]) -> None:
-        """From now on continue what ended services left behind on this machine."""
+        """Start to continue what ended services left behind on this machine."""
         self._resume = resume
 
     def when_projecting(self, begin: Callable[[], object]) -> None:

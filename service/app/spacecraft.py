@@ -218,7 +218,7 @@ def _quantities(
 def _named(
     connection: Connection, mission: Mission, run: str, tracker: str | None
 ) -> dict[str, Any]:
-    """What an answer about a tracker says of it."""
+    """The fields of a tracker in an answer about it."""
     if tracker is None:
         return {"tracker": UNSET, "not_split": UNSET}
     waits = len(mission.trackers) > 1 and is_waiting(connection, mission.name, run)
@@ -248,7 +248,9 @@ def history_table(history: History) -> Table:
     if history.strategy == "latest":
         return batch_table(iter([history]))
     columns = [
-        _column(name, part, told) for name in history.series for part, told in BUCKET_PARTS.items()
+        _column(name, part, meaning)
+        for name in history.series
+        for part, meaning in BUCKET_PARTS.items()
     ]
     starts = [utc_of_unix(each).text for each in history.unix_s]
     page: list[Any] = [starts, [history.bucket_s] * len(starts), history.batches]
@@ -271,9 +273,9 @@ def _batch_page(page: History) -> TablePage:
     return [*(getattr(page, each.name) for each in BATCH_COLUMNS), *values]
 
 
-def _column(name: QuantityName, part: str = "", told: str = "") -> Column:
+def _column(name: QuantityName, part: str = "", meaning: str = "") -> Column:
     quantity = QUANTITIES[name]
-    about = f"{quantity.label}: {told}" if told else quantity.label
+    about = f"{quantity.label}: {meaning}" if meaning else quantity.label
     if part == "count":
         return Column(f"{name}_count", "integer", description=about)
     return Column(f"{name}_{part}" if part else name, unit=quantity.unit, description=about)

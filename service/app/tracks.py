@@ -26,7 +26,7 @@ from service.tracks.gathering import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000
-"""Of a period whose tracks are asked for: they are read in a few seconds."""
+"""The most batches of a period whose tracks are asked for: they are read in a few seconds."""
 EACH_SIDE = 20
 """Batches before and after one whose tracks are asked for."""
 
@@ -93,7 +93,7 @@ def _tracked(track: Track) -> TrackedObject:
     rate, sigma = track.rate_arcsec_per_s, track.sigma_rate_arcsec_per_s
     return TrackedObject(
         name=f"TRACK-{track.time[:19]}-{track.ra_deg:.2f}{track.dec_deg:+.2f}",
-        told=(
+        comments=(
             f"Rate {rate:.6g} arcsec/s with sigma {sigma:.2g}, at {track.time}",
             f"Sigma of the right ascension then {track.sigma_ra_arcsec:.3g} arcsec on the sky",
             f"Sigma of the declination then {track.sigma_dec_arcsec:.3g} arcsec",

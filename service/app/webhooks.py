@@ -158,7 +158,7 @@ class Webhooks:
         *,
         oldest_first: bool = False,
     ) -> Page[WebhookDelivery]:
-        """What waits for a webhook and its dead letters, or one of these; the latest first."""
+        """A webhook's waiting deliveries and dead letters, or one of these; the latest first."""
         known, is_open = _known(id), self._access.is_open
         with self._context.reading() as connection:
             registered.read_webhook(connection, known, utc_now().text, is_open)

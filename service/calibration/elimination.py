@@ -116,7 +116,7 @@ class Eliminated:
         return step, turns, _length(normal, step) if len(free) else of_attitudes
 
     def change(self, step: Vector, turns: Vector, stars: int) -> Vector:
-        """What such steps add to the residuals (2, n)."""
+        """The change of the residuals (2, n) by such steps."""
         found = np.empty((2, stars))
         for part in self.parts:
             by = part.flat
@@ -202,10 +202,10 @@ def _add_blocks(into: Matrix, part: Linearised, weight: Weights) -> None:
 Marks = npt.NDArray[np.bool_]
 
 LEAST_SHARE = 1e-9
-"""Of an unknown's information, what attitudes and other unknowns must leave of it."""
+"""The share of an unknown's information that attitudes and other unknowns must leave of it."""
 
 ORDER: tuple[Kind, ...] = ("alignment", "scale", "distortion", "temperature", "time_tag")
-"""Of unknowns that the stars do not tell apart, the later kind is the one not observable."""
+"""The order of kinds: of unknowns that the stars do not tell apart, the later is not observable."""
 
 REASONS: dict[Kind, str] = {
     "alignment": "too few batches in which this tracker and another both have identified stars",
@@ -231,7 +231,7 @@ class NotObservable:
 
 
 def observable(normal: Normal, unknowns: Sequence[Unknown]) -> Marks:
-    """Which unknowns (p,) the normal equations determine.
+    """Marks of the unknowns (p,) that the normal equations determine.
 
     An unknown is dropped where the attitudes and the unknowns before it in `ORDER` leave
     nothing of its information, and then where its sigma is beyond what is plausible.

@@ -38,7 +38,7 @@ ROUNDS, LINEARISATIONS = 30, 6
 LEAST_FREEDOM = 20
 """Residuals beyond what determines the unknowns: these give their scale to about a sixth."""
 FAR_RAD = 2e-3
-"""After larger steps than this the derivatives are computed anew."""
+"""The step above which the derivatives are computed anew."""
 LEAVE_OUT_FROM = 2
 """The round from which on stars far off are left out: before, the fit itself may be off."""
 RECOUNTED = 0.005
@@ -49,7 +49,7 @@ SETTLED = 0.1
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """What the stars of a stretch say of the trackers.
+    """The estimate of the trackers from the stars of a stretch.
 
     `value` (p,) and `covariance` (p, p) are of `unknowns`, in the unit of each.  `stars`
     (n) are those that were used, ordered by tracker and batch; `residual` (n, 2) is
@@ -203,8 +203,8 @@ def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tup
 
 def _reduced(found: Fit, model: Model) -> Eliminated:
     """The normal equations where the fit stands."""
-    given = found.values, found.attitude, found.residual, found.counted
-    return _eliminated(found.parts, *given, model)
+    arguments = found.values, found.attitude, found.residual, found.counted
+    return _eliminated(found.parts, *arguments, model)
 
 
 def _eliminated(
@@ -217,8 +217,8 @@ def _eliminated(
 ) -> Eliminated:
     derivatives = [linearised(part, values, attitude) for part in parts]
     edges = np.array([0, len(attitude)])
-    given = residual, counted.astype(np.float64), len(values), edges
-    return eliminate(derivatives, *given, model.attitudes_known)
+    arguments = residual, counted.astype(np.float64), len(values), edges
+    return eliminate(derivatives, *arguments, model.attitudes_known)
 
 
 def _residuals(
@@ -303,7 +303,7 @@ def weights(residual: Vector, scale: float, leave_out: bool) -> Weights:
 
 
 def covariance_factor(residual: Vector, scale: float, freedom: int) -> float:
-    """What the inverse of the unweighted normal matrix is multiplied by (Huber 1981, 7.6).
+    """The factor of the inverse of the unweighted normal matrix (Huber 1981, 7.6).
 
     The mean square of the bounded residuals over the square of the mean slope of the
     bound; `residual` (2, n) are those of the stars that were not left out.
@@ -362,8 +362,10 @@ def held_out(
     derivatives = [linearised(part, settled.values, settled.attitude) for part in settled.parts]
     used = settled.used.astype(np.float64)
     count = len(settled.unknowns)
-    given = settled.residual, used, count, edges, model.attitudes_known
-    by_block = [_from_zero(each, settled.values) for each in eliminate(derivatives, *given).blocks]
+    arguments = settled.residual, used, count, edges, model.attitudes_known
+    by_block = [
+        _from_zero(each, settled.values) for each in eliminate(derivatives, *arguments).blocks
+    ]
     freedom = degrees_of_freedom(stars, model, settled.used)
     squares = {
         degree: _predicted_squares(by_block, _free(settled, degree))
@@ -406,7 +408,7 @@ def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
 
 
 def _no_worse(excess: Vector) -> bool:
-    """Whether squares over blocks exceed others by no more than a standard error of the sum."""
+    """True if squares over blocks exceed others by no more than a standard error of the sum."""
     n = len(excess)
     error = float(np.std(excess, ddof=1)) * math.sqrt(n) if n > 1 else 0.0
     return float(excess.sum()) <= error

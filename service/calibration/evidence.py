@@ -79,7 +79,7 @@ def identified_magnitudes(
 
 
 def _shared(star: Indices) -> Marks:
-    """Which stars have an identity that another one has too: one of them must be wrong."""
+    """Marks of stars whose identity another one has too: one of them must be wrong."""
     names, count = np.unique(star, return_counts=True)
     return np.isin(star, names[count > 1])
 

@@ -30,7 +30,7 @@ Weights = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TrackerStars:
-    """What stays the same of one tracker's stars (n), whatever the unknowns are.
+    """The constants of one tracker's stars (n), whatever the unknowns are.
 
     `rows` are their places among all stars, `columns` (q,) those of the tracker's
     unknowns among all.  `tangent` (n, 2, 3) are the two directions, in tracker axes,
@@ -54,7 +54,7 @@ class TrackerStars:
     bending: tuple[tuple[int, Vector, Vector], ...]
 
     def places(self, *kinds: str, of_temperature: bool = False) -> list[int]:
-        """Which of the tracker's unknowns are of these kinds."""
+        """The places of the tracker's unknowns of these kinds."""
         return [
             place
             for place, each in enumerate(self.unknowns)

@@ -27,7 +27,7 @@ from service.vectors import Matrix, Vector
 ZERO, SCALE, COLOR = "magnitude zero", "magnitude scale", "magnitude colour"
 UNITS = {ZERO: "mag", SCALE: "1", COLOR: "mag/mag"}
 PLAUSIBLE = {ZERO: 1.0, SCALE: 0.3, COLOR: 0.5}
-"""In the unit of each: stars that leave a sigma beyond it do not show it."""
+"""A sigma in the unit of each: stars that leave a larger one do not show the unknown."""
 LARGEST = {ZERO: 20.0, SCALE: 0.4, COLOR: 1.0}
 """A value beyond it is that of no tracker: what it sends is constant, or in another unit."""
 REASONS = {
@@ -39,7 +39,7 @@ REASONS = {
 LEAST_STARS = 10
 """Different stars for each number that is estimated: fewer do not tell how much they scatter."""
 LEAST_SPREAD_MAG = 0.05
-"""Of magnitudes or colours, what the other unknowns must leave of it, rms."""
+"""The spread of magnitudes or colours, rms, that the other unknowns must leave."""
 HUBER, WRONG = 1.5, 5.0
 """Bounds of a residual in sigmas: beyond the first it counts less, beyond the second not at all."""
 ROUNDS = 50
@@ -163,8 +163,8 @@ def _corrected(
         )
     except ValidationError as error:
         (first, *_) = error.errors()
-        told = f"would have {first['loc'][0]} {first['input']:g}, which no mission file may have"
-        raise BadInput(Fault("magnitudes", told)) from None
+        message = f"would have {first['loc'][0]} {first['input']:g}, which no mission file may have"
+        raise BadInput(Fault("magnitudes", message)) from None
 
 
 def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> MagnitudeCalibration:

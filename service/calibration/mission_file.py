@@ -133,7 +133,7 @@ def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
 def _polynomials_deg(
     bent: Mapping[Unknown, float], radius_deg: float
 ) -> tuple[dict[tuple[int, int], float], ...]:
-    """What is added to h and to v, in degrees, by powers of the measured h and v in degrees."""
+    """Polynomials added to h and v, in degrees, by powers of the measured h and v in degrees."""
     size = max((each.degree for each in bent), default=0) + 1
     series = np.zeros((2, size, size))
     for each, value in bent.items():
@@ -199,7 +199,7 @@ def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> No
 
 
 def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str, Lines]]) -> bool:
-    """Whether the edited mission has every change, and is the same but for these."""
+    """True if the edited mission has every change, and is the same but for these."""
     for old, new in zip(before.trackers, edited.trackers, strict=True):
         wanted = expected[old.name]
         for key, value in wanted["tracker"].items():
@@ -210,8 +210,8 @@ def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str,
             scale = float(wanted["calibration"]["scale"])
             if not math.isclose(new.calibration.scale, scale, rel_tol=1e-12):
                 return False
-        told = {key: float(value) for key, value in wanted["magnitudes"].items()}
-        if told and new.magnitudes.model_dump() != told:
+        magnitudes = {key: float(value) for key, value in wanted["magnitudes"].items()}
+        if magnitudes and new.magnitudes.model_dump() != magnitudes:
             return False
     same = [
         new.model_copy(update={name: getattr(old, name) for name in (*AXES, *_TABLES)})

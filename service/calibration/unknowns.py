@@ -1,4 +1,4 @@
-"""What a calibration may estimate of each tracker, under which names and in which units.
+"""The unknowns that a calibration may estimate of each tracker, with their names and units.
 
 Constants and the rotation of a tracker's distortion are its alignment, and the
 alignment and clock of the first tracker are the attitude's own.  They are left out
@@ -21,7 +21,7 @@ STRETCH, SKEW = "stretch", "skew"
 
 @dataclass(frozen=True)
 class Model:
-    """Which unknowns a calibration has.
+    """The unknowns of a calibration.
 
     `degree` is that of the distortion, 2-D Legendre polynomials; below 1 there is none.
     With a `reference_temperature_c` alignment, scale and the linear distortion change with

@@ -75,9 +75,9 @@ class Parser(argparse.ArgumentParser):
             raise
 
 
-def _meant(given: str, known: Iterable[str]) -> str:
+def _meant(text: str, known: Iterable[str]) -> str:
     """The end of an error message: the nearest word that there is, or nothing."""
-    near = difflib.get_close_matches(given, tuple(known), n=1)
+    near = difflib.get_close_matches(text, tuple(known), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
 

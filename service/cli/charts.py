@@ -18,7 +18,7 @@ TIME_LEFT, TIME_RIGHT, BARS_LEFT, BARS_RIGHT = 76, 640, 690, 940
 TOP, BOTTOM = 26, 166
 """Within a row."""
 MOST_POINTS = 3_000
-"""Of an axis: the picture of a longer series shows a part of the attitudes, evenly spread."""
+"""The most points along an axis: a longer series is shown by evenly spread attitudes."""
 POINT, SIGMA, BAR = "#1f5f99", "#b3541e", "#7ba7cf"
 
 

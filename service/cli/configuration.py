@@ -16,12 +16,12 @@ if TYPE_CHECKING:
 
 def settings_of(parsed: Namespace) -> Settings:
     """The settings of the environment, overridden by the command's options."""
-    given = {
+    overrides = {
         name: value
         for name in ("database", "host", "port")
         if (value := getattr(parsed, name, None)) is not None
     }
-    return dataclasses.replace(Settings.from_environment(), **given)
+    return dataclasses.replace(Settings.from_environment(), **overrides)
 
 
 def service_url(parsed: Namespace) -> str:

@@ -40,14 +40,14 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue
         failed += result.attitude is None
-        told = {"file": str(file), **to_builtins(picture_of(result)), "overlay": None}
-        told.pop("overlay_png")
+        report = {"file": str(file), **to_builtins(picture_of(result)), "overlay": None}
+        report.pop("overlay_png")
         unwritten = None
         try:
-            told["overlay"] = str(_write_overlay(parsed, file, result))
+            report["overlay"] = str(_write_overlay(parsed, file, result))
         except OSError as error:
             unwritten = f"the picture cannot be written: {error.filename}: {error.strerror}"
-        print(json.dumps(told) if parsed.json else _summary(file, told))
+        print(json.dumps(report) if parsed.json else _summary(file, report))
         if unwritten is not None:
             # The attitude is found all the same.
             failed += 1
@@ -94,52 +94,56 @@ def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | 
     return None
 
 
-def _summary(file: Path, told: dict[str, Any]) -> str:
-    found = told["attitude"]
-    lines = [f"{file}: {told['candidates']} candidates, " + _matched(told)]
+def _summary(file: Path, report: dict[str, Any]) -> str:
+    found = report["attitude"]
+    lines = [f"{file}: {report['candidates']} candidates, " + _matched(report)]
     if found is not None:
-        lens = told["lens"]
+        lens = report["lens"]
         q = " ".join(f"{each:.6f}" for each in found["quaternion"])
         sigma = " ".join(f"{each:.1f}" for each in found["sigma_arcsec"])
         width, height = lens["field_deg"]
-        unit = "one count" if told["exposure_s"] is None else "one count a second"
+        unit = "one count" if report["exposure_s"] is None else "one count a second"
         lines.append(
             f"  RA {found['ra_deg']:.4f} deg  Dec {found['dec_deg']:+.4f} deg  roll "
             f"{found['roll_deg']:.3f} deg (of the upper edge, from north through east)"
         )
-        lines.append(f"  pixels {told['orientation']}")
+        lines.append(f"  pixels {report['orientation']}")
         lines.append(
             f"  quaternion {q}  (ICRS to camera, scalar last: x right, y down, z to the sky)"
         )
         lines.append(
             f"  {found['status']} (the lens is not calibrated)  sigma {sigma} arcsec about x, y, "
-            f"z; scaled by the residuals, {told['residual_rms_px']:.2f} px rms, with "
-            f"{told['shared_error_px']:.2f} px that more stars would not take away; aberration "
+            f"z; scaled by the residuals, {report['residual_rms_px']:.2f} px rms, with "
+            f"{report['shared_error_px']:.2f} px that more stars would not take away; aberration "
             f"{found['aberration']}"
         )
         lines.append(
             f"  field {width:.3f} x {height:.3f} deg, focal length {lens['focal_px']:.1f} "
-            f"+- {lens['focal_sigma_px'] or 0.0:.1f} px, star images {told['psf_sigma_px']:.1f} px "
-            "(one sigma)"
+            f"+- {lens['focal_sigma_px'] or 0.0:.1f} px, star images "
+            f"{report['psf_sigma_px']:.1f} px (one sigma)"
         )
-        if told["zero_point_mag"] is not None:
+        if report["zero_point_mag"] is not None:
             lines.append(
-                f"  zero point {told['zero_point_mag']:.2f} mag for {unit}, "
-                f"scatter {told['zero_point_sigma_mag'] or 0.0:.2f} mag"
+                f"  zero point {report['zero_point_mag']:.2f} mag for {unit}, "
+                f"scatter {report['zero_point_sigma_mag'] or 0.0:.2f} mag"
             )
         names = [
             f"{each['name'] or each['id']} {each['v_mag']:.1f}"
-            for each in told["stars"][:FEW_NAMES]
+            for each in report["stars"][:FEW_NAMES]
         ]
-        lines.append("  " + ", ".join(names) + (", ..." if len(told["stars"]) > FEW_NAMES else ""))
-    lines += [f"  {printable(each)}" for each in told["remarks"]]
-    if told["overlay"] is not None:
-        lines.append(f"  picture: {told['overlay']}")
+        lines.append(
+            "  " + ", ".join(names) + (", ..." if len(report["stars"]) > FEW_NAMES else "")
+        )
+    lines += [f"  {printable(each)}" for each in report["remarks"]]
+    if report["overlay"] is not None:
+        lines.append(f"  picture: {report['overlay']}")
     return "\n".join(lines)
 
 
-def _matched(told: dict[str, Any]) -> str:
-    return "no attitude" if told["attitude"] is None else f"{len(told['stars'])} stars identified"
+def _matched(report: dict[str, Any]) -> str:
+    return (
+        "no attitude" if report["attitude"] is None else f"{len(report['stars'])} stars identified"
+    )
 
 
 def _write_overlay(parsed: Namespace, file: Path, result: "PictureResult") -> Path:

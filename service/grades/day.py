@@ -33,13 +33,13 @@ WARM_UP_S = 6 * 3600.0
 """For the bias to settle (two hours), after a tracker that is wrong at the beginning was found
 out (an hour, and two in which everything is rejected)."""
 LOOK_AHEAD_S = 2 * 3600.0
-"""For the smoother, and for doubts at the end of the day to be settled."""
+"""The data after a day for the smoother, and for doubts at its end to be settled."""
 STEP_NS = 10**9
-"""Of the samples in each second of TAI the first is kept."""
+"""The time between samples: the first sample in each second of TAI is kept."""
 MOST_SAMPLES = 4_000_000
-"""Of a day with its surroundings: 30 Hz; they are in memory together, at 1 kB each."""
+"""The most samples of a day with its surroundings: 30 Hz, all in memory at 1 kB each."""
 OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
-"""What may become of a measurement; see `filtering.state.Outcome`."""
+"""The outcomes of a measurement; see `filtering.state.Outcome`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +86,7 @@ class GradedDay:
 
     @property
     def samples(self) -> int:
-        """Of one grade."""
+        """The samples of one grade."""
         return sum(len(each.samples["smoothed"]) for each in self.stretches)
 
 
@@ -118,9 +118,9 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
     for each in found.stretches:
         result = filter_attitude(each.model, each.gyro, each.attitudes, each.directions)
         smoothed = smooth(result, each.model)
-        told = _graded(each, result, smoothed, start, end)
-        if told is not None:
-            stretches.append(told)
+        graded = _graded(each, result, smoothed, start, end)
+        if graded is not None:
+            stretches.append(graded)
         met = result.innovations
         inside = (met.tai_ns >= start) & (met.tai_ns < end)
         for name, code in OUTCOMES.items():
@@ -204,9 +204,9 @@ Packable = TypeVar("Packable", GradedSamples, MeasuredInnovations)
 Fields = tuple[tuple[str, str, int], ...]
 
 LEVEL = 1
-"""Of zlib; level 6 takes five times as long for about 3 % less."""
+"""The level of zlib; level 6 takes five times as long for about 3 % less."""
 MOST_PACKED = 3_600
-"""Of a block: an hour."""
+"""The most samples of a block: an hour."""
 _FIELDS: dict[type, Fields] = {
     GradedSamples: (
         ("tai_ns", "<i8", 1),

@@ -46,7 +46,7 @@ class TimedColumns:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredInnovations(TimedColumns):
-    """What became of m measured attitudes, in order of time; equal times are allowed.
+    """The innovations of m measured attitudes, in order of time; equal times are allowed.
 
     `tai_ns` (m,) and `outcome` (m,), a `filtering.state.Outcome`.  About the body axes in
     arcsec: `innovation_arcsec` (m, 3) with its covariance `predicted_arcsec2` (m, 6), the upper
@@ -66,7 +66,7 @@ class MeasuredInnovations(TimedColumns):
 
     @property
     def is_used(self) -> npt.NDArray[np.bool_]:
-        """Whether the filter took the measurement (m,): it was accepted, or began with it."""
+        """The measurements (m,) that the filter took: it was accepted, or began with it."""
         return _used(self.outcome)
 
     @property

@@ -1,4 +1,4 @@
-"""What the filter takes: recorded measurements and gyro samples, in unbroken stretches."""
+"""The input of the filter: recorded measurements and gyro samples, in unbroken stretches."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -28,7 +28,7 @@ _LONGEST_GAP_NS = int(LONGEST_GAP_S) * 10**9
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """What the filter is given of an unbroken stretch; `gyro` is None at a constant rate."""
+    """The filter's input of an unbroken stretch; `gyro` is None at a constant rate."""
 
     model: GyroModel | ConstantRateModel
     gyro: GyroSamples | None
@@ -58,7 +58,7 @@ class Cut:
 
 Mask = npt.NDArray[np.bool_]
 LEAST_RATIO = 1e-10
-"""Of the smallest variance to the largest: a covariance of less is no better than singular."""
+"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,17 +110,20 @@ def usable_attitudes(
     return kept, int(np.count_nonzero(~sound))
 
 
-def attitudes_where(given: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
+def attitudes_where(attitudes: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
     """Some of the attitudes."""
     return AttitudeMeasurements(
-        given.tai_ns[places], given.quaternion[places], given.covariance_rad2[places]
+        attitudes.tai_ns[places], attitudes.quaternion[places], attitudes.covariance_rad2[places]
     )
 
 
-def directions_where(given: DirectionMeasurements, places: Any) -> DirectionMeasurements:
+def directions_where(directions: DirectionMeasurements, places: Any) -> DirectionMeasurements:
     """Some of the directions."""
     return DirectionMeasurements(
-        given.tai_ns[places], given.body[places], given.inertial[places], given.sigma_rad[places]
+        directions.tai_ns[places],
+        directions.body[places],
+        directions.inertial[places],
+        directions.sigma_rad[places],
     )
 
 
@@ -213,12 +216,12 @@ def _without_gyro(
 # samples that the gyro can have measured.
 
 GAP_IN_STEPS = 1.5
-"""Of the median step: a longer one is a gap, where the mission says nothing else."""
+"""A step longer than this many median steps is a gap, unless the mission sets one."""
 NS = 1e-9
 
 
 def believed(settings: GyroSettings, rates_rad_s: Vector) -> npt.NDArray[np.bool_]:
-    """Which of the rates (n, 3) about the gyro's axes are within the mission's largest, as (n,).
+    """Marks (n,) of rates (n, 3) about the gyro's axes that are within the mission's largest.
 
     Blocks beyond it are refused on arrival; the mission may have named another number since.
     """

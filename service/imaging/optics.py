@@ -60,7 +60,7 @@ class Pupil:
 
     @property
     def open_area_m2(self) -> float:
-        """What it lets through of a uniform light: the integral of |P|²."""
+        """The part of a uniform light that it lets through: the integral of |P|²."""
         return float(np.sum(np.abs(self.transmission) ** 2)) * self.cell_m**2
 
     @property
@@ -69,11 +69,11 @@ class Pupil:
         return centres(self.transmission.shape[0], self.cell_m)
 
     def behind(self, transmission: PupilField) -> "Pupil":
-        """With a further transparency before or after it."""
+        """The pupil with a further transparency before or after it."""
         return Pupil(self.transmission * transmission, self.cell_m)
 
     def with_plate(self, thickness_m: Array, index: float, wavelength_m: float) -> "Pupil":
-        """With a glass of this thickness: alpha = 2 pi (n1 - 1) gamma / lambda (2.5).
+        """The pupil with a glass of this thickness: alpha = 2 pi (n1 - 1) gamma / lambda (2.5).
 
         The phase, and where the glass disperses the index, belong to one wavelength.
         """
@@ -81,7 +81,7 @@ class Pupil:
         return self.behind(np.exp(1j * alpha))
 
     def is_even(self) -> bool:
-        """Whether f(x, y) = f(-x, y) = f(x, -y), which makes the image even (7.10 to 7.16)."""
+        """True if f(x, y) = f(-x, y) = f(x, -y), which makes the image even (7.10 to 7.16)."""
         f = self.transmission
         tight = 1e-12 * float(np.abs(f).max())
         return bool(np.allclose(f, f[::-1], 0, tight) and np.allclose(f, f[:, ::-1], 0, tight))
@@ -193,7 +193,7 @@ class Spectrum:
 
     @property
     def mean_wavelength_m(self) -> float:
-        """By power."""
+        """The mean wavelength, weighted by power."""
         return float(self.wavelength_m @ self.power / self.power.sum())
 
     def correlation(self, delay_s: npt.ArrayLike) -> npt.NDArray[np.complex128]:
@@ -254,8 +254,8 @@ def image_of(
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
     power = spectrum.power * (spectrum.wavelength_m if photons else 1.0)
     for wavelength, share in zip(spectrum.wavelength_m, power / power.sum(), strict=True):
-        here = pupil(float(wavelength)) if callable(pupil) else pupil
-        total += share * image_at(here, float(wavelength), angle, angle)
+        transparency = pupil(float(wavelength)) if callable(pupil) else pupil
+        total += share * image_at(transparency, float(wavelength), angle, angle)
     return PointImage(total, step_rad)
 
 

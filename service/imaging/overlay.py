@@ -67,8 +67,8 @@ def marks_of(
     """The marks of a recorded `Answer`; without a run catalog no star has a predicted place."""
     found = [star for star in detections["stars"] if star["u_px"] is not None]
     used = [star for star in found if star["used"]]
-    told = next(each.stars for each in answer.observations if each.tracker == tracker.name)
-    names = [None if each.star is None else str(each.star.id) for each in told]
+    answered = next(each.stars for each in answer.observations if each.tracker == tracker.name)
+    names = [None if each.star is None else str(each.star.id) for each in answered]
     predicted = _predicted(names, answer, batch, tracker, camera, run_catalog)
     marks = [
         Mark(
@@ -78,7 +78,7 @@ def marks_of(
             name or "",
             place if each.outcome == "unique" else None,
         )
-        for star, each, name, place in zip(used, told, names, predicted, strict=True)
+        for star, each, name, place in zip(used, answered, names, predicted, strict=True)
     ]
     marks += [Mark(star["u_px"], star["v_px"], "left_out") for star in found if not star["used"]]
     return marks + [Mark(u, v, "sharp") for u, v in detections["hot_or_cosmic_px"]]

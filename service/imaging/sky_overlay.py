@@ -21,7 +21,7 @@ MOST_LABELS = 60
 _GRID, _STAR, _CANDIDATE, _TEXT = (60, 90, 130), (90, 220, 120), (150, 120, 70), (230, 230, 230)
 Box = tuple[float, float, float, float]
 Places = Callable[[Vector], tuple[Vector, Vector]]
-"""Where directions (n, 3) of the camera's axes stand on the picture, in its pixels."""
+"""A function from directions (n, 3) in the camera's axes to places in pixels of the picture."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class _Pen:
         self.taken: list[Box] = []
 
     def at(self, u_px: float, v_px: float) -> tuple[float, float]:
-        """Where a place of the picture is drawn."""
+        """The point where a place of the picture is drawn."""
         return (u_px + 0.5) * self.scale, (v_px + 0.5) * self.scale
 
     def circle(self, u_px: float, v_px: float, radius: float, color: Any) -> None:

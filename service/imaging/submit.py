@@ -51,7 +51,7 @@ if TYPE_CHECKING:
 
 LEAST_SIGMA_ARCSEC = 1e-3
 BLENDED_SHARE = 0.15
-"""Of the image's sigma: what the light of an unseen companion may move a blended star.
+"""The share of the image's sigma by which an unseen companion may move a blended star.
 
 One with the share r of the light moves it by 0.86 r sigma at most, where it stands
 1.4 sigma away; nearer ones are merged in run catalogs too."""
@@ -88,8 +88,8 @@ class FrameIn(Wire):
 
     def fingerprint(self, spacecraft: str, digest: str) -> str:
         """The digest of the frame and of all that is told of it."""
-        told = f"{spacecraft}\n{digest}\n{self.model_dump_json(exclude_defaults=True)}"
-        return hashlib.sha256(told.encode()).hexdigest()
+        text = f"{spacecraft}\n{digest}\n{self.model_dump_json(exclude_defaults=True)}"
+        return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_known(values: dict[str, Any]) -> FrameIn:
@@ -176,7 +176,7 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
 
 
 def choices_of(frame: Frame) -> list[str]:
-    """What was chosen of a file, and how its pixels were turned, where they were."""
+    """The options chosen for a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
 
@@ -190,13 +190,13 @@ def batch_of_stars(
     stars: list[dict[str, Any]],
 ) -> BatchIn:
     """The batch of a tracker's stars, with what is told of their frame."""
-    told = json.loads(known.model_dump_json(exclude_defaults=True))
+    fields = json.loads(known.model_dump_json(exclude_defaults=True))
     for name in ("tracker", "exposure_s", "centroid", "image"):
-        told.pop(name, None)
+        fields.pop(name, None)
     whole = {
         "spacecraft": spacecraft,
         "a_priori": None,
-        **told,
+        **fields,
         "batch": known.batch_of(digest),
         "time": time,
         "observations": [{"tracker": tracker.name, "stars": stars}],
@@ -254,14 +254,14 @@ def _record(
         noise_counts=round(found.noise_counts, 3),
         candidates=found.count,
         sharp=[(round(u, 1), round(v, 1)) for u, v in sharp][:MAX_SHARP_KEPT],
-        stars=[_told(star) for star in stars],
+        stars=[_star_fields(star) for star in stars],
         timings_us=timings_us,
         preview=preview,
         preview_step=step,
     )
 
 
-def _told(star: "MeasuredStar") -> dict[str, Any]:
+def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
     """A measured candidate, ready for JSON."""
     record = star.record
     return {

@@ -30,7 +30,7 @@ PENDING_A_WORKER = 2
 """Chunks a worker that it has, or that wait for it."""
 
 LineAnswer = Answered | Recorded | AcquisitionError
-"""To a line: of a batch the answer, of a gyro block its row, or what is wrong with it."""
+"""The answer to a line: a batch's answer, a gyro block's row, or what is wrong with it."""
 
 
 # Lines of telemetry, a batch or a gyro block each: read and solved many at once.
@@ -143,7 +143,7 @@ def identity_in(text: bytes, run: str) -> Identity | None:
 
 
 Decided = UnsavedResult | GyroBlock | TrackedLine | Answered | AcquisitionError
-"""Of a line before it is recorded."""
+"""The state of a line before it is recorded."""
 
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
@@ -160,7 +160,7 @@ def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
 INTERACTIVE_WINDOW_S = 0.5
 """Bulk pauses so long after a single batch, because another may follow."""
 LINES, FEW_LINES = 64, 8
-"""Of a chunk: the more, the less each costs; but a single post waits for one chunk at most."""
+"""Lines of a chunk: the more, the less each costs; but a single post waits for up to one chunk."""
 
 
 class Bulk:
@@ -205,7 +205,7 @@ class Bulk:
 
     @property
     def _gives_way(self) -> bool:
-        """Whether batches come one by one as well."""
+        """True if batches come one by one as well."""
         return self._submissions.idle_s < INTERACTIVE_WINDOW_S
 
     def begin(
@@ -255,7 +255,7 @@ class Bulk:
         return self._submissions.submit_tracked(submission_from_json(line.text))
 
     def asks_for_last(self, submission: Submission) -> bool:
-        """Whether a line asks for the last attitude."""
+        """True if a line asks for the last attitude."""
         return self._submissions.solver.asks_for_last(submission.batch)
 
     def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
@@ -287,7 +287,7 @@ class BulkChunk:
         self._computed = bulk.compute(lines, require)
 
     def is_computed(self, within_s: float) -> bool:
-        """Whether it is computed, or comes to be within so many seconds."""
+        """True if it is computed, or comes to be within so many seconds."""
         return bool(wait([self._computed], within_s).done)
 
     def queue_write(self) -> None:

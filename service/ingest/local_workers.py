@@ -33,11 +33,11 @@ from service.ingest import worker_process
 from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-"""Before processes are started in place of some that died: twice as long each time."""
+"""The pause before processes replace some that died: twice as long each time."""
 IDLE_S = 600.0
-"""After so long without a chunk the processes end, and give their memory back."""
+"""The time without a chunk after which the processes end, and give their memory back."""
 MOST_STARTS = 3
-"""Of processes for one chunk, where they die before they have it."""
+"""The most starts of processes for one chunk, where they die before they have it."""
 SERVER_RETRY_S = 0.1
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
@@ -74,7 +74,7 @@ class _Processes(Generic[Input, Output]):
     stop: Connection
     tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
     pids: set[int] = field(default_factory=set)
-    """Those that are ready to work; all are, as soon as one is."""
+    """The processes that are ready to work; all are, as soon as one is."""
     is_ending: bool = False
     _closing: threading.Lock = field(default_factory=threading.Lock)
 
@@ -170,12 +170,12 @@ class LocalWorkers(Generic[Input, Output]):
         context.set_forkserver_preload([worker_process.__name__])
         # Python 3.11.0 would have the server listen where every local user can connect.
         util.abstract_sockets_supported = False  # type: ignore[misc]
-        there, stop = context.Pipe(duplex=False)
+        receiver, stop = context.Pipe(duplex=False)
         executor = ProcessPoolExecutor(
             self.count,
             context,
             begin,
-            (self._config, there, context.Barrier(self.count), logs.configured()),
+            (self._config, receiver, context.Barrier(self.count), logs.configured()),
         )
         processes = self._processes = _Processes(executor, stop)
         ready: list[Future[int]] = []
@@ -292,7 +292,7 @@ class LocalWorkers(Generic[Input, Output]):
                 return
         if error is None:
             try:
-                found = [each for some in future.result() for each in pickle.loads(some)]
+                found = [each for pack in future.result() for each in pickle.loads(pack)]
             except Exception as unreadable:  # whatever the classes of the results raise
                 error = unreadable
             else:

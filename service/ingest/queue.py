@@ -38,7 +38,7 @@ DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
 
 Found = Answered | Exception | Callable[[Connection], Answered] | None
-"""What a look-up gives: the answer, the error, a change that gives the answer, or nothing."""
+"""The outcome of a look-up: answer, error, a change that gives the answer, or nothing."""
 
 log = logging.getLogger(__name__)
 
@@ -108,7 +108,7 @@ class IngestQueue:
         self._writer, self._pool = writer, pool
         self._lock = threading.Lock()
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
-        """Those that are being computed or recorded, each with its repeats."""
+        """The batches that are being computed or recorded, each with its repeats."""
         self._sequences: Sequences[PendingBatch] = Sequences()
         self._unanswered: dict[PendingBatch, None] = {}
         self._written: list[tuple[PendingBatch, WriteOutcome]] = []
@@ -186,7 +186,7 @@ class IngestQueue:
         return [job for job in to_write if job.change is not None or job.unsaved_results]
 
     def _is_for_now(self, job: QueuedJob) -> bool:
-        """Whether a batch is to be computed now; otherwise later, or one like it is already."""
+        """True if a batch is to be computed now; False if later, or if one like it is already."""
         pending: PendingBatch = job.pending
         with self._lock:
             repeats = self._in_flight.get(pending.identity)
@@ -293,10 +293,10 @@ class IngestQueue:
                 _set_futures([(pending, outcome)])
             else:
                 by_loop.setdefault(pending.future.get_loop(), []).append((pending, outcome))
-        for loop, some in by_loop.items():
+        for loop, group in by_loop.items():
             # The loop may be closed: then no client waits for these answers.
             with suppress(RuntimeError):
-                loop.call_soon_threadsafe(_set_futures, some)
+                loop.call_soon_threadsafe(_set_futures, group)
 
 
 def _set_futures(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
@@ -313,15 +313,15 @@ T = TypeVar("T")
 
 
 class Sequences(Generic[T]):
-    """Those of one key that wait while another of it is at work.  The caller holds a lock."""
+    """The batches of one key that wait while another of it is at work.  The caller holds a lock."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, list[tuple[int, int, T]]] = {}
-        """Of each key that has one at work: the time of a batch, a number, the batch."""
+        """By key that has one at work: the time of a waiting batch, a number, the batch."""
         self._numbers = count()
 
     def enter(self, key: Hashable, time_ns: int, item: T) -> bool:
-        """Whether it may begin; if not, `leave` gives it when its turn has come."""
+        """True if it may begin; if not, `leave` gives it when its turn has come."""
         waiting = self._waiting.get(key)
         if waiting is None:
             self._waiting[key] = []

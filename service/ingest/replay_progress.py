@@ -37,12 +37,12 @@ from service.storage.store import Store
 
 MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3
-"""Of one line: all are stored again with every chunk that adds some, and read as a whole."""
+"""The most faults of one line: each chunk that adds some stores all again, read as a whole."""
 MAX_TEXT_KEPT = 300
 MAX_APIDS_KEPT = 100
-"""Those with the most packets; the sums are of all."""
+"""The application ids with the most packets are kept; the sums are of all."""
 SAVE_EVERY_S = 0.2
-"""Between two stored states: each is a transaction, and an event for all who listen."""
+"""The time between two stored states: each is a transaction, and an event for all listeners."""
 SAVE_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 
 log = logging.getLogger(__name__)

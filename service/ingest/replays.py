@@ -36,7 +36,7 @@ ReplaySource = Iterable[bytes | Line]
 # the batches of space packets have the numbers of their packets.
 
 MAX_BLANK_LINES = 1_000_000
-"""Of a file.  They hold nothing, and five gigabytes of them pack to five megabytes."""
+"""The blank lines of a file.  They hold nothing, and five gigabytes pack to five megabytes."""
 
 
 @dataclass
@@ -50,7 +50,7 @@ class LineGroup:
     numbers: list[int] = field(default_factory=list)
     texts: list[bytes] = field(default_factory=list)
     faults: list[tuple[int, Fault]] = field(default_factory=list)
-    """Of lines that were refused when they were read, with their numbers."""
+    """The faults of lines that were refused when they were read, with their numbers."""
 
     def __len__(self) -> int:
         return len(self.texts) + len(self.faults)
@@ -180,7 +180,7 @@ class RunningReplay:
 
     @property
     def is_over(self) -> bool:
-        """Whether the replay has ended; one that is about to begin has not."""
+        """True if the replay has ended; one that is about to begin has not."""
         return self._over.is_set()
 
     def stop(self) -> None:

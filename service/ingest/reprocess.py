@@ -52,7 +52,7 @@ class ReprocessProgress:
     refusals: list[str] = field(default_factory=list)
     """The first of them, each naming its batch."""
     partitions: int = 0
-    """Of a reprocessing into an archive: how many there are, at most."""
+    """The most partitions of a reprocessing into an archive."""
     partitions_done: int = 0
 
     def add_refused(self, refused: Sequence["RefusedBatch"]) -> None:
@@ -74,7 +74,7 @@ class ReprocessPlan:
     processes: int = 0
     """How many workers; 0: one a core, 1: none but this process."""
     track: bool = False
-    """Whether batches are searched about the last attitude of the run, one after another."""
+    """True if batches are searched about the last attitude of the run, one after another."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ def _conditions(plan: ReprocessPlan) -> list[ColumnElement[bool]]:
 
 
 def not_yet(run: str) -> ColumnElement[bool]:
-    """Whether a batch is not in a run, neither recorded nor archived, as SQL beside `batches`."""
+    """The SQL condition, beside `batches`, that a batch is not in a run, recorded or archived."""
     done = batches.alias("done")
     return and_(
         *(
@@ -223,7 +223,7 @@ def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
 
 
 def after_place(place: tuple[int, str]) -> ColumnElement[bool]:
-    """Whether a result comes after a place in order of time, as SQL."""
+    """The SQL condition that a result comes after a place in order of time."""
     time_ns, batch_id = PLACE
     return (time_ns > place[0]) | and_(time_ns == place[0], batch_id > place[1])
 

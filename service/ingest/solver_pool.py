@@ -79,7 +79,7 @@ class Solver:
         return [found[place] for place in range(len(batches))]
 
     def asks_for_last(self, batch: ObservationBatch) -> bool:
-        """Whether the attitude of a batch is to be predicted from the record first.
+        """True if the attitude of a batch is to be predicted from the record first.
 
         False for an unknown spacecraft, whose batch is refused.
         """
@@ -150,7 +150,7 @@ def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
 
 
 def may_take_long(batch: ObservationBatch) -> bool:
-    """Whether a batch may take seconds rather than a millisecond, as far as its form tells."""
+    """True if a batch may take seconds rather than a millisecond, as far as its form tells."""
     return (
         (batch.a_priori is None and batch.measurement is None)
         or bool(batch.options.tolerances)
@@ -174,7 +174,7 @@ class SolverTask(NamedTuple):
     work: Callable[[], object]
     refuse: Callable[[Exception], object]
     give_up_s: float
-    """On the clock of `time.monotonic`."""
+    """A time on the clock of `time.monotonic`."""
 
 
 class FairQueue:
@@ -206,14 +206,14 @@ class SolverPool:
     """
 
     def __init__(self, threads: int | None = None) -> None:
-        """At least two threads, by default one for each processor."""
+        """Start at least two threads, by default one for each processor."""
         count = max(2, threads or os.cpu_count() or 1)
         self._short, self._long = FairQueue(), FairQueue()
         self._long_slots = count - 1
         self._changed = threading.Condition()
         self._closing = False
         self.builder = ThreadPoolExecutor(BUILDS_AT_ONCE, "sky")
-        """What builds what tasks need while they wait."""
+        """The pool that builds tables that tasks need while they wait."""
         self._threads = [
             threading.Thread(target=self._run, name=f"solver-{number}", daemon=True)
             for number in range(count)

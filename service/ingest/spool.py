@@ -33,7 +33,7 @@ class SpooledReplay:
     caller: str
     """The name of that token."""
     spacecraft: list[str] | None
-    """Those that the token is bound to; None: all."""
+    """The spacecraft that the token is bound to; None: all."""
     packets: str | None = None
     """The spacecraft whose space packets the file holds; None: the file has lines."""
 

@@ -41,7 +41,7 @@ SAMPLES_BEFORE_S = 60.0
 
 
 def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
-    """Whether the attitude of a batch is to be predicted from the record."""
+    """True if the attitude of a batch is to be predicted from the record."""
     if batch.tracking is not None:
         return not batch.tracking.resolved
     is_default = mission is not None and mission.tracking is not None and mission.tracking.default
@@ -64,11 +64,11 @@ def with_prediction(
     the batch's own run.
     """
     batch = submission.batch
-    told: dict[str, Any] = {"from": "last"}
+    a_priori: dict[str, Any] = {"from": "last"}
     if batch.tracking is None:
-        told["by_default"] = True
-    told["prediction"] = _prediction(connection, batch, mission, gyro_run or batch.run)
-    body = json.loads(submission.text) | {"a_priori": told}
+        a_priori["by_default"] = True
+    a_priori["prediction"] = _prediction(connection, batch, mission, gyro_run or batch.run)
+    body = json.loads(submission.text) | {"a_priori": a_priori}
     made = submission_from_json(json.dumps(body))
     return structs.replace(submission, batch=made.batch, text=made.text)
 
@@ -157,11 +157,11 @@ def _rate(
     passed_s = (batch.time.tai_ns - last.known.tai_ns) * 1e-9
     both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
     # Zero is what a batch has that tells nothing of its rates.
-    given = [np.radians(each) for each in both if each.any()]
-    if given:
+    rates = [np.radians(each) for each in both if each.any()]
+    if rates:
         settings = mission.tracking or TrackingSettings()
         sigma = math.radians(settings.body_rate_sigma_deg_per_s)
-        return given_rate(given, sigma, passed_s), "body_rates"
+        return given_rate(rates, sigma, passed_s), "body_rates"
     if before is not None and before.known.tai_ns < last.known.tai_ns:
         derived = derived_rate(before.known, last.known, passed_s)
         # Between them there may have been a manoeuvre, such as a flip of the roll.

@@ -99,10 +99,10 @@ def packed(found: Sequence[object]) -> list[bytes]:
     """Some together, which share their names; large ones alone: unpacking holds the lock."""
     packs = []
     for first in range(0, len(found), PACKED_TOGETHER):
-        some = found[first : first + PACKED_TOGETHER]
-        pack = pickle.dumps(some, pickle.HIGHEST_PROTOCOL)
+        chunk = found[first : first + PACKED_TOGETHER]
+        pack = pickle.dumps(chunk, pickle.HIGHEST_PROTOCOL)
         if len(pack) <= MOST_BYTES:
             packs.append(pack)
         else:
-            packs += [pickle.dumps([each], pickle.HIGHEST_PROTOCOL) for each in some]
+            packs += [pickle.dumps([each], pickle.HIGHEST_PROTOCOL) for each in chunk]
     return packs

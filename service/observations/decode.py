@@ -141,18 +141,18 @@ _PRIOR = msgspec.json.Decoder(SentPrior)
 
 def batch_from_canonical(text: str) -> ObservationBatch:
     """The batch as the core takes it, from a text that `wire` made."""
-    told = _BATCH.decode(text)
-    chosen, prior = told.options, told.a_priori
+    sent = _BATCH.decode(text)
+    chosen, prior = sent.options, sent.a_priori
     return ObservationBatch(
-        spacecraft=told.spacecraft,
-        batch=told.batch,
-        run=told.run,
-        time=parse_utc(told.time),
-        a_priori=None if prior is None else _prior_of(prior, told.sun_vector, told.position_km),
-        body_rates_deg_per_s=_array(told.body_rates_deg_per_s),
-        velocity_km_per_s=_optional_array(told.velocity_km_per_s),
-        aberration=told.aberration,
-        observations=tuple([_tracker_stars(each) for each in told.observations]),
+        spacecraft=sent.spacecraft,
+        batch=sent.batch,
+        run=sent.run,
+        time=parse_utc(sent.time),
+        a_priori=None if prior is None else _prior_of(prior, sent.sun_vector, sent.position_km),
+        body_rates_deg_per_s=_array(sent.body_rates_deg_per_s),
+        velocity_km_per_s=_optional_array(sent.velocity_km_per_s),
+        aberration=sent.aberration,
+        observations=tuple([_tracker_stars(each) for each in sent.observations]),
         options=Options(
             identifier=chosen.identifier,
             solver=chosen.solver,
@@ -160,9 +160,9 @@ def batch_from_canonical(text: str) -> ObservationBatch:
             tolerances=chosen.tolerances,
             zone_grid_deg=chosen.zone_grid_deg,
         ),
-        position_km=_optional_array(told.position_km),
+        position_km=_optional_array(sent.position_km),
         tracking=None if prior is None or prior.from_ is None else _tracking_of(prior),
-        measurement=None if told.measurement is None else _measured(told.measurement),
+        measurement=None if sent.measurement is None else _measured(sent.measurement),
     )
 
 
@@ -179,11 +179,13 @@ def _prior_of(
     None where nothing could be predicted from the last attitude.
     """
     if prior.from_ is not None:
-        told = prior.prediction
-        if told is None or told.quaternion is None:
+        prediction = prior.prediction
+        if prediction is None or prediction.quaternion is None:
             return None
         return PredictedPrior(
-            _quaternion(told.quaternion), _array(told.covariance_arcsec2), told.margin_deg
+            _quaternion(prediction.quaternion),
+            _array(prediction.covariance_arcsec2),
+            prediction.margin_deg,
         )
     if prior.quaternion is not None:
         return QuaternionPrior(_quaternion(prior.quaternion))
@@ -212,11 +214,16 @@ def _quaternion(components: tuple[float, float, float, float]) -> Vector:
 
 
 def _tracking_of(prior: SentPrior) -> Tracking:
-    told = prior.prediction
-    if told is None:
+    prediction = prior.prediction
+    if prediction is None:
         return Tracking(prior.by_default)
     return Tracking(
-        prior.by_default, told.result, told.age_s, told.rate, told.reason, resolved=True
+        prior.by_default,
+        prediction.result,
+        prediction.age_s,
+        prediction.rate,
+        prediction.reason,
+        resolved=True,
     )
 
 

@@ -1,4 +1,4 @@
-"""What pydantic finds wrong in a body, in the service's words."""
+"""The faults that pydantic finds in a body, in the service's words."""
 
 from typing import Any
 
@@ -16,7 +16,7 @@ PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")
 
 
 def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
-    """What pydantic found, in the service's words: a dotted field, a message, the value."""
+    """Faults that pydantic found, in the service's words: a dotted field, a message, the value."""
     return [
         Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
         for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]

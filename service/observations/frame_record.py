@@ -1,4 +1,4 @@
-"""What is kept of a frame beside the batch that was made of it."""
+"""The record of a frame beside the batch that was made of it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -25,7 +25,7 @@ class FrameRecord:
     noise_counts: float
     candidates: int
     sharp: Sequence[tuple[float, float]]
-    """Where (u, v) hot pixels and cosmic rays were passed by."""
+    """The places (u, v) of hot pixels and cosmic rays that were left out."""
     stars: Sequence[Mapping[str, Any]]
     timings_us: Mapping[str, int]
     preview: bytes
@@ -35,7 +35,7 @@ class FrameRecord:
     a file was taken, and how its pixels were turned."""
 
     def summary(self) -> dict[str, Any]:
-        """What the answer says of the frame."""
+        """The part of the answer that is about the frame."""
         used = sum(bool(star["used"]) for star in self.stars)
         return {
             "digest": self.digest,

@@ -116,8 +116,8 @@ class StarIn(Wire):
     def _one_direction(self) -> Self:
         angles = (self.h_deg is not None, self.v_deg is not None)
         for kind in ("counts", "times"):
-            given = [getattr(self, f"{axis}_{kind}") is not None for axis in ("h", "v")]
-            if any(given) and not all(given):
+            present = [getattr(self, f"{axis}_{kind}") is not None for axis in ("h", "v")]
+            if any(present) and not all(present):
                 raise ValueError(f"needs both h_{kind} and v_{kind}, or neither")
         if self.h_times is not None:
             if self.vector is not None or any(angles) or self.h_counts is not None:
@@ -335,7 +335,7 @@ def _stars_of_different_trackers(
 
 LEAST_SIGMA_ARCSEC, LARGEST_SIGMA_ARCSEC = 1e-3, 36_000.0
 LEAST_RATIO = 1e-10
-"""Of the least variance to the largest: a covariance of less is no better than singular."""
+"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
 
 
 def _of_a_tracker(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
@@ -478,7 +478,7 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 
 def checked_from_model(model: BatchIn) -> Checked:
-    """What a model stands for that is already checked."""
+    """The checked value for which a model stands."""
     text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
     sent = text
     if isinstance(prior, FromLastIn) and (prior.prediction or prior.by_default):

@@ -41,10 +41,10 @@ class StarBatch:
     body: dict[str, Any]
     columns: list[TrackerColumns] = field(default_factory=list)
     slots: list[list[int]] = field(default_factory=list)
-    """Of each tracker the slot of each of its stars."""
+    """By tracker, the slot of each of its stars."""
 
     def has_stars(self) -> bool:
-        """Whether a slot of any tracker held a star."""
+        """True if a slot of any tracker held a star."""
         return any(self.slots)
 
 

@@ -11,7 +11,7 @@ from service.extras import require_extra
 from service.packets.xtce_file import MAX_BYTES, normalised_xtce
 
 MAX_ENTRIES = 20_000
-"""Of one packet, with those of the containers in it."""
+"""The most entries of one packet, with those of the containers in it."""
 
 _LOADING = threading.Lock()
 """While it loads a file, space-packet-parser keeps the file's namespaces in a class."""

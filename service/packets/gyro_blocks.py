@@ -19,7 +19,7 @@ from service.packets.stream import SpacePacket
 from service.times import parse_utc, shifted
 
 MOST_SAMPLES = 10_000
-"""Of a block, as a request may have."""
+"""The most samples of a block, as in a request."""
 
 Values = Mapping[str, Any]
 Axes = tuple[float, float, float]

@@ -52,7 +52,7 @@ class MeasurementColumns:
     sigma: tuple[str, ...]
     covariance: tuple[str, ...]
     arcsec: float
-    """Of one unit of `sigma`."""
+    """Arcseconds in one unit of `sigma`."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class PacketMap:
     rates: tuple[str, ...]
     gyro: tuple[str, ...]
     gyro_values: tuple[tuple[str, ...], ...]
-    """Of each axis a name for each sample of a gyro block."""
+    """By axis, a name for each sample of a gyro block."""
     gyro_offsets: tuple[str, ...]
     velocity: tuple[str, ...]
     position: tuple[str, ...]

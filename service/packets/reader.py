@@ -41,7 +41,7 @@ READ_BYTES = 1 << 16
 
 
 class PacketTotals(Struct, kw_only=True):
-    """What was in the packets that were read."""
+    """The contents of the packets that were read."""
 
     packets: int = 0
     bytes: int = 0

@@ -16,7 +16,7 @@ IDLE_APID = 2047
 CONTINUATION, FIRST, LAST, WHOLE = range(4)
 """The sequence flags."""
 MOST_BYTES = 1 << 20
-"""Of a packet that is joined of segments."""
+"""The most bytes of a packet that is joined of segments."""
 SYNC_MARKERS = {
     bytes.fromhex(marker): f"{kind} {marker.upper()}"
     for marker, kind in (
@@ -38,7 +38,7 @@ class SpacePacket:
 
     number: int
     offset: int
-    """Of the packet's first byte in the file."""
+    """The offset of the packet's first byte in the file."""
     content: bytes
 
     @property

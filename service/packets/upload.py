@@ -70,12 +70,12 @@ def _checked(header: bytes, offset: int) -> tuple[int, bytes]:
     try:
         if len(header) < BLOCK_BYTES or header[257:262] != b"ustar":
             raise ValueError
-        size, told = _octal(header[124:136]), _octal(header[148:156])
+        size, checksum = _octal(header[124:136]), _octal(header[148:156])
     except ValueError:
         message = f"is no tar archive (POSIX ustar): there is no header at byte {offset}"
         raise BadFile(Fault(_FIELD, message)) from None
     # The sum counts its own field as blanks.
-    if told != sum(header[:148]) + 8 * 32 + sum(header[156:]):
+    if checksum != sum(header[:148]) + 8 * 32 + sum(header[156:]):
         raise BadFile(Fault(_FIELD, f"has a header with a wrong checksum at byte {offset}"))
     return size, header[156:157]
 

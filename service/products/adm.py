@@ -98,20 +98,22 @@ RATE_WORDS = {
 
 def header(about: SeriesInfo) -> Pairs:
     """Comments that say where the message comes from, its date and its originator."""
-    told = [f"Written by attitude-acquisition {about.version}", f"Run {about.run}"]
-    told.append(
+    comments = [f"Written by attitude-acquisition {about.version}", f"Run {about.run}"]
+    comments.append(
         f"Attitudes of status {about.status}"
         if about.status != "all"
         else "Attitudes good or suspect"
     )
     if about.grade in GRADE_WORDS:
-        told.append(GRADE_WORDS[about.grade])
+        comments.append(GRADE_WORDS[about.grade])
     if about.start or about.end:
         what = "Batches" if about.grade == "raw" else "Samples"
-        told.append(f"{what} from {about.start or 'the first'} to before {about.end or 'the end'}")
-    told.append(f"Largest gap within a segment {about.largest_gap_s!r} s")
+        comments.append(
+            f"{what} from {about.start or 'the first'} to before {about.end or 'the end'}"
+        )
+    comments.append(f"Largest gap within a segment {about.largest_gap_s!r} s")
     return [
-        *(("COMMENT", one_line(each)) for each in told),
+        *(("COMMENT", one_line(each)) for each in comments),
         ("CREATION_DATE", time_text(about.created)),
         ("ORIGINATOR", ORIGINATOR),
     ]
@@ -171,8 +173,8 @@ def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
     if about.grade != "raw":
         return
     counts = zip(COUNTS, stars.tolist(), strict=True)
-    told = [(f"USER_DEFINED_STARS_{name}", str(count)) for name, count in counts]
-    yield f"\nUSER_START\n{kvn(told)}USER_STOP\n".encode()
+    user_defined = [(f"USER_DEFINED_STARS_{name}", str(count)) for name, count in counts]
+    yield f"\nUSER_START\n{kvn(user_defined)}USER_STOP\n".encode()
 
 
 def _opening(about: SeriesInfo, first: str) -> str:
@@ -189,18 +191,18 @@ def _opening(about: SeriesInfo, first: str) -> str:
 
 
 def _state_metadata(about: SeriesInfo, has_rates: bool) -> Pairs:
-    told: Pairs = [
+    pairs: Pairs = [
         ("REF_FRAME_A", REF_FRAME_A),
         ("REF_FRAME_B", REF_FRAME_B),
         ("NUMBER_STATES", "7" if has_rates else "4"),
         ("ATT_TYPE", "QUATERNION"),
     ]
     if not has_rates:
-        return told
+        return pairs
     comment = "Rates are as the batches gave them, else derived from the attitudes"
     if about.grade != "raw":
         comment = "Rates are estimated by the filter"
-    return [("COMMENT", comment), *told, ("RATE_TYPE", "ANGVEL")]
+    return [("COMMENT", comment), *pairs, ("RATE_TYPE", "ANGVEL")]
 
 
 def _states(part: AttitudeBlock, has_rates: bool) -> Vector:
@@ -232,10 +234,10 @@ def _variances_deg2(about: SeriesInfo, part: AttitudeBlock) -> Vector:
 
 def _determination(about: SeriesInfo, methods: Counter[str]) -> str:
     ((method, _),) = methods.most_common(1)
-    told: list[tuple[str, str]] = []
+    pairs: list[tuple[str, str]] = []
     if len(methods) > 1:
-        told.append(("COMMENT", "Attitudes by " + " and ".join(sorted(methods))))
-    told += [
+        pairs.append(("COMMENT", "Attitudes by " + " and ".join(sorted(methods))))
+    pairs += [
         ("AD_METHOD", method.upper()),
         ("ATTITUDE_SOURCE", "GND"),
         ("NUMBER_STATES", "4"),
@@ -255,7 +257,7 @@ def _determination(about: SeriesInfo, methods: Counter[str]) -> str:
             ("SENSOR_NOISE_STDDEV", f"{sigma} {sigma}"),
         ]
         sensors.append(f"SENSOR_START\n{kvn(sensor)}SENSOR_STOP\n")
-    return f"\nAD_START\n{kvn(told)}{''.join(sensors)}AD_STOP\n"
+    return f"\nAD_START\n{kvn(pairs)}{''.join(sensors)}AD_STOP\n"
 
 
 def _seconds(elapsed_ns: Integers) -> list[str]:
@@ -321,10 +323,10 @@ def _metadata(about: SeriesInfo, parts: Iterable[AttitudeBlock]) -> Pairs:
         start, stop = start or part.time[0], part.time[-1]
         origins.update(part.rate_origin.tolist())
     words = RATE_WORDS.get(frozenset(origins))
-    told: Pairs = [] if words is None else [("COMMENT", f"Angular velocity {words}")]
+    comments: Pairs = [] if words is None else [("COMMENT", f"Angular velocity {words}")]
     rates: Pairs = [] if words is None else [("ANGVEL_FRAME", REF_FRAME_B)]
     return [
-        *told,
+        *comments,
         *identity(about),
         ("REF_FRAME_A", REF_FRAME_A),
         ("REF_FRAME_B", REF_FRAME_B),

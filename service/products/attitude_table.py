@@ -59,7 +59,7 @@ COLUMNS = (
     Column("batch", "text", description="Name of the batch.", width=128),
     Column("id", "text", description="Id of the result.", width=26),
 )
-"""Of raw attitudes."""
+"""The columns of raw attitudes."""
 
 _OF_BATCHES = ("rate_origin", "residual_rms_arcsec", "predicted_rms_arcsec", "batch")
 _OF_ESTIMATES: dict[str, dict[str, Any]] = {
@@ -89,7 +89,7 @@ ESTIMATED_COLUMNS = (
     Column("model", "text", description="gyro or constant_rate.", width=16),
     Column("revision", "integer", description="Of the day, from 1."),
 )
-"""Of filtered and smoothed attitudes."""
+"""The columns of filtered and smoothed attitudes."""
 
 
 def attitude_table(series: AttitudeSeries) -> Table:

@@ -33,7 +33,7 @@ StatusWanted = Literal["good", "suspect", "all"]
 ProductGrade = Literal["raw", "filtered", "smoothed"]
 OWN, DERIVED, NONE, ESTIMATED = "own", "derived", "none", "estimated"
 SAME_MOMENT_NS = 1_000
-"""Of attitudes that are closer than this the last one counts: clocks of kernels have 1 us."""
+"""The last of attitudes closer than this counts: clocks of kernels have 1 us."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class SeriesTracker:
 
 @dataclass(frozen=True)
 class SeriesInfo:
-    """What a series of attitudes is of: the spacecraft, the filters, and its identifiers.
+    """The subject of a series of attitudes: the spacecraft, the filters, and its identifiers.
 
     Attitudes of the grade `raw` are those of batches; see `service.grades` for the others.
     `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
@@ -96,7 +96,7 @@ class SeriesInfo:
             raise BadBatch(faults)
 
     def described(self) -> str:
-        """What the series is of, for a message."""
+        """The subject of the series, for a message."""
         words = "attitudes" if self.status == "all" else f"{self.status} attitudes"
         if self.grade != "raw":
             words = words.replace("attitudes", f"{self.grade} attitudes")
@@ -108,7 +108,7 @@ class SeriesInfo:
         return f"{words} of {self.spacecraft} in run {self.run}{period}"
 
     def provenance(self) -> dict[str, str]:
-        """Where the attitudes come from, as texts by name."""
+        """The origin of the attitudes, as texts by name."""
         return {
             "spacecraft": self.spacecraft,
             "object_id": self.object_id or self.spacecraft,
@@ -145,12 +145,12 @@ class AttitudeRows:
     method: Texts
     quaternion: Vector
     covariance_arcsec2: Vector
-    """Of shape (n, 6): 11, 12, 13, 22, 23, 33."""
+    """Covariances (n, 6): 11, 12, 13, 22, 23, 33."""
     rate_deg_per_s: Vector
     residual_rms_arcsec: Vector
     predicted_rms_arcsec: Vector
     stars: Integers
-    """Of shape (n, 4): observed, unique, ambiguous, unmatched."""
+    """Counts of stars (n, 4): observed, unique, ambiguous, unmatched."""
     model: Texts
     revision: Integers
     bias_deg_per_h: Vector
@@ -236,7 +236,7 @@ class _Assembler:
         self._wanted = ("good", "suspect") if about.status == "all" else (about.status,)
         self._unwanted = 0
         self._held: AttitudeBlock | None = None
-        self._given = 0
+        self._emitted = 0
 
     def fed(self, page: AttitudeRows) -> AttitudeBlock:
         """The rows that are finished now that a page is known too; perhaps none."""
@@ -250,20 +250,20 @@ class _Assembler:
 
     def rest(self) -> AttitudeBlock | None:
         """The rows that still waited, or None where there were none."""
-        if self._held is None or len(self._held) == self._given:
+        if self._held is None or len(self._held) == self._emitted:
             return None
         return self._finished(self._held, waiting=0)
 
     def _finished(self, rows: AttitudeBlock, waiting: int) -> AttitudeBlock:
         rows = self._without_repeats(rows)
-        given = self._given
-        first = rows.stretch[0] if given else 0
+        emitted = self._emitted
+        first = rows.stretch[0] if emitted else 0
         rows = _with_stretches(rows, self._about.largest_gap_s, first)
-        end = max(given, len(rows) - waiting)
-        finished = _with_rates(rows).taken(slice(given, end))
+        end = max(emitted, len(rows) - waiting)
+        finished = _with_rates(rows).taken(slice(emitted, end))
         # The last one given stays, for the rate and the sign of the next.
-        self._given = min(end, 1)
-        self._held = rows.taken(slice(end - self._given, None))
+        self._emitted = min(end, 1)
+        self._held = rows.taken(slice(end - self._emitted, None))
         return finished
 
     def _without_repeats(self, rows: AttitudeBlock) -> AttitudeBlock:
@@ -273,12 +273,12 @@ class _Assembler:
             dropped[1:] = close
         else:
             dropped[:-1] = close
-        dropped[: self._given] = False
+        dropped[: self._emitted] = False
         return rows.taken(~dropped) if dropped.any() else rows
 
 
 def _among(texts: Texts, wanted: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Which texts are among some; `numpy.isin` needs texts of fixed width."""
+    """Marks of the texts that are among some; `numpy.isin` needs texts of fixed width."""
     return np.asarray(np.logical_or.reduce([texts == each for each in wanted]))
 
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from service.products.attitudes import AttitudeSeries
 
 MOST_BATCHES = 5_000_000
-"""Of a period whose attitudes are kept in a temporary file: up to 400 bytes each."""
+"""The most batches of a period whose attitudes are in a temporary file: up to 400 bytes each."""
 
 TableWriter = Callable[[Table], Iterator[bytes]]
 AttitudeWriter = Callable[["AttitudeSeries"], Iterator[bytes]]
@@ -95,7 +95,7 @@ def write_table(name: str, table: Table) -> Iterator[bytes]:
 
 
 def _read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
-    """Whether there is none, and the pages, of which the first is read at once.
+    """A flag that is true if there is none, and the pages, of which the first is read at once.
 
     Errors of the database are raised here, and not when part of a file is sent already.
     """
@@ -220,4 +220,4 @@ OUTPUT_FORMATS: dict[str, OutputFormat] = {
         most_batches=MOST_BATCHES,
     ),
 }
-"""By name."""
+"""The output formats by name."""

@@ -57,8 +57,8 @@ def _stamps(texts: Sequence[str]) -> npt.NDArray[np.datetime64]:
 
 
 def _described(column: Column) -> dict[str, str]:
-    told = {"unit": column.unit, "frame": column.frame, "description": column.description}
-    return {name: text for name, text in told.items() if text}
+    texts = {"unit": column.unit, "frame": column.frame, "description": column.description}
+    return {name: text for name, text in texts.items() if text}
 
 
 class _Sink:

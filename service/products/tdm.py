@@ -16,11 +16,11 @@ REFERENCE_FRAME = "EME2000"
 class TrackedObject:
     """An object with its points, in order of time: UTC, degrees, magnitudes where known.
 
-    `told` are comments on it.
+    `comments` are comments on it.
     """
 
     name: str
-    told: Sequence[str]
+    comments: Sequence[str]
     time: Sequence[str]
     ra_deg: Sequence[float]
     dec_deg: Sequence[float]
@@ -47,7 +47,7 @@ def _segment(observer: str, tracked: TrackedObject) -> str:
     order = sorted(range(len(tracked.time)), key=tracked.time.__getitem__)
     times = [time_text(tracked.time[k]) for k in order]
     metadata: Pairs = [
-        *(("COMMENT", one_line(each)) for each in tracked.told),
+        *(("COMMENT", one_line(each)) for each in tracked.comments),
         ("TIME_SYSTEM", TIME_SYSTEM),
         ("START_TIME", times[0]),
         ("STOP_TIME", times[-1]),

@@ -1,4 +1,4 @@
-"""What is added to the batches of a replay: attitudes carried along, or data of a file."""
+"""Additions to the batches of a replay: attitudes carried along, or data of a file."""
 
 import json
 from abc import ABC, abstractmethod
@@ -26,7 +26,7 @@ from service.vectors import (
 class FromFile(ABC):
     """Writes what a file says of a batch's time into the batch, before it is sent.
 
-    The recorded batch then holds it.  `given` counts the batches that got something.
+    The recorded batch then holds it.  `supplied` counts the batches that got something.
     """
 
     option: str
@@ -38,7 +38,7 @@ class FromFile(ABC):
 
     def __init__(self) -> None:
         self._spacecraft: str | None = None
-        self.given = 0
+        self.supplied = 0
 
     def prepared(self, item: Item) -> Item:
         """The item with what the file says, unchanged where that is nothing.
@@ -55,7 +55,7 @@ class FromFile(ABC):
         added = self.added_to(batch)
         if not added:
             return item
-        self.given += 1
+        self.supplied += 1
         body = json.loads(item.submission.text) | added
         return replace(item, submission=submission_from_json(json.dumps(body)))
 
@@ -120,7 +120,7 @@ class FileEphemeris(FromFile):
 # batch explains its answer.
 
 CARRIED_WITHIN_S = 3600.0
-"""After more than an hour a batch keeps its own a priori knowledge."""
+"""The age of the last attitude above which a batch keeps its own a priori knowledge."""
 
 
 @dataclass(frozen=True)
@@ -154,8 +154,8 @@ class AttitudeCarrier:
         passed_s = (batch.time.tai_ns - known.time.tai_ns) * 1e-9
         if abs(passed_s) > CARRIED_WITHIN_S:
             return item
-        given = [each for each in (known.rates_deg_per_s, batch.body_rates_deg_per_s) if each.any()]
-        rates_deg_per_s = np.mean(given, axis=0) if given else np.zeros(3)
+        rates = [each for each in (known.rates_deg_per_s, batch.body_rates_deg_per_s) if each.any()]
+        rates_deg_per_s = np.mean(rates, axis=0) if rates else np.zeros(3)
         body = json.loads(item.submission.text)
         quaternion = quaternion_from_matrix(turned(known.attitude, rates_deg_per_s, passed_s))
         body["a_priori"] = {"quaternion": quaternion.tolist(), "frame": "EME2000"}

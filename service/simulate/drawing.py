@@ -1,4 +1,4 @@
-"""What every picture for the documentation has in common.
+"""The common part of every picture for the documentation.
 
 matplotlib is imported when a picture is drawn: it comes with the extra `plots`.
 """

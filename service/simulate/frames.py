@@ -34,10 +34,10 @@ from service.vectors import Matrix, Vector, quaternion_from_matrix
 DEFAULT_START = "2026-03-01T00:00:00.000Z"
 CADENCE_S = 60.0
 FAINTEST_RENDERED_MAG = 9.0
-"""As deep as the embedded catalog is."""
+"""The limit of the embedded catalog."""
 FAINTEST_TOLD_MAG = 8.0
 MARGIN_PX = 10
-"""Beyond the frame's edge, where stars shine in; more where their images reach farther."""
+"""Pixels beyond the frame's edge where stars shine in; more where their images reach farther."""
 FAINT_REACHES = ((2e3, 16), (3e4, 48))
 """Below so many electrons, the image of an aperture is drawn no farther than so many pixels: a
 pixel beyond holds a tenth of an electron."""
@@ -46,7 +46,7 @@ FULL_SCALE = 65535
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """What decides the frames that are drawn; the same settings always give the same frames."""
+    """The settings of the frames that are drawn; the same settings always give the same frames."""
 
     frames: int
     seed: int = 1
@@ -98,7 +98,7 @@ class DrawnFrame:
 
 @dataclass(frozen=True)
 class _Chip:
-    """What stays the same from frame to frame: the pixels' response, and which are hot."""
+    """The constants from frame to frame: the pixels' response, and which are hot."""
 
     response: CountArray
     hot: CountArray

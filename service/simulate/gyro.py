@@ -24,7 +24,7 @@ SAMPLES_OF_A_BLOCK = 1_000
 GAP_AT, CLOCK_STEP_AT = 0.4, 0.7
 """Shares of the pass at which a gap begins and the clock steps."""
 _DIGITS = 12
-"""Of a rate in rad/s: far below the noise of any gyro."""
+"""The digits of a rate in rad/s: far below the noise of any gyro."""
 
 
 @dataclass(frozen=True)

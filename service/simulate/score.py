@@ -17,12 +17,12 @@ GAUSSIAN_MEDIAN = 0.6745
 
 @dataclass
 class Score:
-    """What came of the batches of one kind of stretch."""
+    """The result of the batches of one kind of stretch."""
 
     batches: int = 0
     refused: int = 0
     stars: Counter[str] = field(default_factory=Counter)
-    """By outcome, `observed` for all, and `wrong`: unique, but not the true star."""
+    """Counts by outcome, `observed` for all, and `wrong`: unique, but not the true star."""
     worst_axis_arcsec: list[float] = field(default_factory=list)
     predicted_arcsec: list[float] = field(default_factory=list)
     chi_square: list[float] = field(default_factory=list)
@@ -133,7 +133,7 @@ def _median(values: list[float]) -> float:
 
 
 def score_table(scores: dict[str, dict[str, Score]]) -> str:
-    """For each mission a line of the nominal stretches and one of those with errors."""
+    """A table with a line of nominal stretches and one of those with errors for each mission."""
     head = (
         f"{'':<15}{'batches':>8}{'stars':>7}{'unique':>9}{'ambig.':>8}{'unmatch.':>9}{'wrong':>8}"
         f"{'attitudes':>11}{'error':>8}{'sigma':>7}{'within':>8}{'solve':>8}{'whole':>8}"

@@ -1,4 +1,4 @@
-"""What the trackers of a turning, moving spacecraft see of the sky, and what they measure.
+"""The sky as the trackers of a turning, moving spacecraft see it, and their measurements.
 
 Each star is where it appears from the moving spacecraft while the body turns
 with constant rates, measured at its own time: carried to the batch's epoch, it
@@ -72,9 +72,9 @@ class RealSky:
     first: Rows
     """Where each star's components begin; one entry more than there are stars."""
     light: Vector
-    """Of each component, in the mission's instrument."""
+    """The light of each component, in the mission's instrument."""
     magnitude_mag: Vector
-    """Of each star, all its components together."""
+    """The magnitude of each star, all its components together."""
 
     def directions(self, star: Rows, time: Utc, position_km: Vector) -> Vector:
         """Unit vectors (n, 3), ICRS, from a spacecraft at a geocentric position to some stars.
@@ -100,7 +100,7 @@ class RealSky:
 
 @lru_cache(maxsize=4)
 def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) -> RealSky:
-    """What stands behind the stars of a run catalog that was made with these settings."""
+    """The sky behind the stars of a run catalog that was made with these settings."""
     alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
     then = moved(
         catalog.ra_deg,
@@ -199,8 +199,8 @@ class BatchScene:
             exact = direction if kind == "position_error" else seen.direction
             rates = seen.tracker.body_from_tracker.T @ np.radians(self.rates_deg_per_s)
             for k, magnitude_mag in enumerate(seen.magnitude.tolist()):
-                given = readings(seen.tracker, exact[k], rates, magnitude_mag, self.rng)
-                where[k] = where[k] if given is None else given
+                reading = readings(seen.tracker, exact[k], rates, magnitude_mag, self.rng)
+                where[k] = where[k] if reading is None else reading
         return [
             {**place, "magnitude": magnitude, "time_offset_s": offset_s}
             for place, magnitude, offset_s in zip(
@@ -226,7 +226,7 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
 
 IMAGE_SIGMA_SAMPLES = 1.2
 LIGHT_OVER_NOISE = 300.0
-"""Of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
+"""The light of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
 LIGHT_AT_MAG, FAINTEST_MAG = 5.0, 7.5
 FULL_SHARE = 0.8
 MOST_STEPS_OFF = 2.0

@@ -1,4 +1,4 @@
-"""What a pass is asked to be: its length, its stars, and the stretches where things go wrong."""
+"""The description of a pass: its length, its stars, and the stretches where things go wrong."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -57,7 +57,7 @@ NO_TROUBLES = Troubles(Trouble(), Trouble(), Trouble(), Trouble())
 
 @dataclass(frozen=True)
 class Stretch:
-    """What holds for one batch: the kind of trouble, its size, and how far into it (0 to 1)."""
+    """The conditions of one batch: the kind of trouble, its size, and how far into it (0 to 1)."""
 
     kind: Kind = "nominal"
     size: float = 0.0

@@ -124,7 +124,7 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
 def _motion(
     mission: Mission, rates: Vector, cadence_s: float, rng: np.random.Generator
 ) -> Iterable[Matrix | float]:
-    """What the rates make of each batch: the attitude, or the roll about a pole on the Sun."""
+    """The motion of each batch by its rates: the attitude, or the roll about a pole on the Sun."""
     if isinstance(mission.zone, Band):
         steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
         rolls_rad: list[float] = (
@@ -209,7 +209,7 @@ def _truth(
 
 
 def truth_path(telemetry: Path) -> Path:
-    """Where the truth of a telemetry file stands: OUT.truth.ndjson beside OUT.ndjson."""
+    """The truth of a telemetry file: OUT.truth.ndjson beside OUT.ndjson."""
     return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
 
 
@@ -221,7 +221,7 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
     """
     count = 0
 
-    def told() -> Iterator[DrawnBatch]:
+    def truth_written() -> Iterator[DrawnBatch]:
         nonlocal count
         for each in drawn:
             truth.write(_line(each.truth))
@@ -233,10 +233,13 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
         out = stack.enter_context(_appearing(telemetry))
         if telemetry_format(telemetry) == "csv":
             write_batches_csv(
-                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in told()), out
+                (BatchIn.model_validate_json(json.dumps(each.batch)) for each in truth_written()),
+                out,
             )
         else:
-            out.writelines(_line(line) for each in told() for line in (each.batch, *each.gyro))
+            out.writelines(
+                _line(line) for each in truth_written() for line in (each.batch, *each.gyro)
+            )
     return count
 
 

@@ -132,10 +132,10 @@ class Views:
         while True:
             before = self.attitude()
             after = self.shifted(before, *SLEW_DEG)
-            here, there = self.visible(before), self.visible(after)
-            there = there[~np.isin(there, here[:half])]
-            if min(len(here), len(there)) >= half:
-                return self.group(before, here[:half]), self.group(after, there[:half])
+            early, late = self.visible(before), self.visible(after)
+            late = late[~np.isin(late, early[:half])]
+            if min(len(early), len(late)) >= half:
+                return self.group(before, early[:half]), self.group(after, late[:half])
 
     def mirrored(self, stars: int) -> Group:
         """So many stars as a tracker with one axis of the wrong sign measures them."""

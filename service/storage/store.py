@@ -128,7 +128,7 @@ class Store(Readers):
             file.require_there()
         timeouts = TO_COMMIT if serving else None
         self.file_lock = None if file is None else FileLock(file)
-        """Of a SQLite file."""
+        """The lock of a SQLite file."""
         self._writing = writing_engine(url, file=file, create=create, timeouts=timeouts)
         try:
             if self.file_lock is None:
@@ -147,7 +147,7 @@ class Store(Readers):
             raise
         super().__init__(database, serving=serving, file=file)
         self.lock = ProjectorLock() if serving and file is None else None
-        """Of PostgreSQL: nothing is projected before it is taken."""
+        """The lock of PostgreSQL: nothing is projected before it is taken."""
         wait_s = LONGEST_WAIT_S if serving else None
         self.at_work = set[str]() if self.lock is None else self.lock.at_work
         """The ids of replays and calibrations that this process is at work on."""
@@ -166,7 +166,7 @@ class Store(Readers):
 
     @property
     def is_projecting(self) -> bool:
-        """Whether this process projects, as far as is known without asking the database."""
+        """True if this process projects, as far as is known without asking the database."""
         return self.lock is None or self.lock.is_held
 
     @contextmanager

@@ -58,12 +58,12 @@ def batches_around(connection: Connection, id: str, each_side: int) -> RecordedB
 
     Raises `NotFound` where there is no such result.
     """
-    here = read_result(connection, id)
-    same = ResultFilter(here["run"], here["spacecraft"]).conditions()
-    own = (results.c.batch_id, here["batch_id"])
+    result = read_result(connection, id)
+    same = ResultFilter(result["run"], result["spacecraft"]).conditions()
+    own = (results.c.batch_id, result["batch_id"])
     descending = [column.desc() for column in PLACE]
-    earlier = _ROWS.where(*same, own[0] != own[1], results.c.time_ns <= here["time_ns"])
-    later = _ROWS.where(*same, own[0] != own[1], results.c.time_ns > here["time_ns"])
+    earlier = _ROWS.where(*same, own[0] != own[1], results.c.time_ns <= result["time_ns"])
+    later = _ROWS.where(*same, own[0] != own[1], results.c.time_ns > result["time_ns"])
     found = [
         *connection.execute(earlier.order_by(*descending).limit(each_side)).mappings(),
         *connection.execute(_ROWS.where(results.c.id == id)).mappings(),

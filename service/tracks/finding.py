@@ -104,7 +104,7 @@ def _moving(points: Points, found: Link, batches: Batches) -> Track:
 
 
 def _is_good(motion: Motion) -> bool:
-    """Whether the points lie on one motion at all: chi-square within four sigmas of its mean."""
+    """True if the points lie on one motion at all: chi-square within four sigmas of its mean."""
     degrees = motion.degrees_of_freedom
     return motion.chi_square < degrees + SIGMAS * math.sqrt(2.0 * degrees)
 

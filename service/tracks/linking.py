@@ -114,7 +114,7 @@ def fit_motion(time_s: Vector, direction: Vector, covariance: Vector, *, moves: 
 
 
 def offsets(motion: Motion, points: "tuple[Vector, Vector, Vector]") -> tuple[Vector, Vector]:
-    """Of times, directions and covariances: offsets (n, 2) from a motion in rad, and variances.
+    """The offsets (n, 2) in rad of directions from a motion, and their variances.
 
     The variances (n, 2, 2) are of the points alone; both are along the axes carried there.
     """

@@ -76,7 +76,7 @@ ROUTERS: tuple[APIRouter, ...] = (
 )
 
 COMPRESS_LEVEL = 4
-"""Of gzip: a third of the time of its default, for 7 % more bytes of a list."""
+"""The level of gzip: a third of the time of its default, for 7 % more bytes of a list."""
 
 COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, OUTPUT_FORMATS["parquet"].media_type)
 """Media types that are compressed by themselves, or are streams of events."""
@@ -91,8 +91,8 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
     @asynccontextmanager
     async def lifespan(web_app: FastAPI) -> AsyncIterator[None]:
         anyio.to_thread.current_default_thread_limiter().total_tokens = WORKER_THREADS
-        here = asyncio.get_running_loop()
-        warming = threading.Thread(target=_warm_up, args=(web_app, app, here), name="warm-up")
+        loop = asyncio.get_running_loop()
+        warming = threading.Thread(target=_warm_up, args=(web_app, app, loop), name="warm-up")
         warming.start()
         reporting = asyncio.create_task(report_to_supervisor(app))
         try:

@@ -1,4 +1,4 @@
-"""Which connections are kept: a bound for all, a share for each client address.
+"""Limits of the connections that are kept: a bound for all, a share for each client address.
 
 A connection is idle while no request of it is being answered.  Where a bound is
 reached, the connection that has been idle for the longest time is closed, so that
@@ -47,7 +47,7 @@ class Admission:
         trusted: Iterable[Network] = (),
         reserved: int = RESERVED_FOR_LOOPBACK,
     ) -> None:
-        """At most `most` connections, and `per_address` of a client that is not `trusted`.
+        """Allow at most `most` connections, and `per_address` of a client that is not `trusted`.
 
         The last `reserved` connections are for loopback addresses.
         """

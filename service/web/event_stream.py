@@ -27,10 +27,10 @@ HELD = 2_000
 READ_AT_ONCE = 500
 POLL_S = 1.0
 GATHER_S = 0.05
-"""After a commit: under load many are read at once."""
+"""The wait after a commit: under load many are read at once."""
 HEARTBEAT_S = 15.0
 LONGEST_S = 900.0
-"""Of one stream; who listens comes again by itself, and is asked anew who it is."""
+"""The duration of one stream; the listener then connects again, and is authenticated anew."""
 MAX_LISTENERS = 100
 MAX_OF_ONE_TOKEN = 10
 """Streams at a time: some pages in some browsers, and no more that would keep out others."""
@@ -127,10 +127,10 @@ class Live:
         if last is None:
             last = await self._read(self._app.events.last)
             # How many events there are of others is no business of a bound token.
-            told = await self._read(self._app.events.last, listener.caller.spacecraft)
+            newest = await self._read(self._app.events.last, listener.caller.spacecraft)
         else:
-            told = last
-        yield _line(told, "hello", f'{{"last":{told}}}')
+            newest = last
+        yield _line(newest, "hello", f'{{"last":{newest}}}')
         heard_s = clock()
         while not self._stopping and listener.is_admitted and clock() < end_s:
             news = self._news
@@ -142,7 +142,7 @@ class Live:
             if found:
                 last = found[-1].id
                 named = None if spacecraft is None else (spacecraft,)
-                lines = b"".join(_told(e) for e in found if e.concerns(run, named))
+                lines = b"".join(_event_line(e) for e in found if e.concerns(run, named))
                 if lines:
                     heard_s = clock()
                     yield lines
@@ -226,7 +226,7 @@ class Live:
         return await run_sync(ask, *arguments, limiter=self._threads)
 
 
-def _told(event: Event) -> bytes:
+def _event_line(event: Event) -> bytes:
     return _line(event.id, event.kind, event.data)
 
 

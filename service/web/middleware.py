@@ -131,7 +131,7 @@ class AroundRequests:
                 self._log(scope, inner, status, seconds)
 
     async def _is_open(self, path: str) -> bool:
-        """Whether access is open; of probes, while the database does not answer, whether it was."""
+        """True if access is open; for probes without a database, the last known answer."""
         try:
             return await is_open(self.access)
         except Busy:
@@ -241,8 +241,8 @@ async def _answered(route: APIRoute, request: Request) -> Response:
 def _request_id(scope: Scope) -> str:
     """The id that a client or a proxy gave a request, where it is a plain word; else a new one."""
     # Not by `secrets`: its system call gives up the interpreter's lock, and an id may be guessed.
-    given = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
-    return given.decode() if _SANE_ID.fullmatch(given) else f"{getrandbits(64):016x}"
+    sent = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
+    return sent.decode() if _SANE_ID.fullmatch(sent) else f"{getrandbits(64):016x}"
 
 
 def _run(scope: Scope) -> str | None:
@@ -359,7 +359,7 @@ class ConditionalAnswers:
 
 
 def _is_whole(message: Message) -> bool:
-    """Whether a message begins an answer that comes in one piece; streams tell no length."""
+    """True if a message begins an answer that comes in one piece; streams tell no length."""
     return (
         message["type"] == "http.response.start"
         and message["status"] == 200
@@ -381,7 +381,7 @@ def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, 
 
 
 def _names(asked: Headers, tag: str) -> bool:
-    """Whether `If-None-Match` names a tag; weak and strong ones of one name are the same."""
+    """True if `If-None-Match` names a tag; weak and strong ones of one name are the same."""
     opaque = tag.removeprefix("W/")
     named = [each.strip() for line in asked.getlist("if-none-match") for each in line.split(",")]
     return any(each == "*" or each.removeprefix("W/") == opaque for each in named)

@@ -22,7 +22,7 @@ from service.web.connection_limits import Admission
 MAX_PIPELINED = 128
 """Requests that wait on one connection until the one before them is answered."""
 PIPELINED_PAUSE_S = 0.01
-"""Before each of them is begun: a connection that is full of requests leaves time for others."""
+"""The pause before each of them begins: a connection full of requests leaves time for others."""
 READ_BYTES = 16 << 10
 """The most that is read at a time: a connection holds no more that the app has not asked for."""
 
@@ -150,12 +150,12 @@ class _Http(HttpToolsProtocol):
     """Nothing that still arrives is looked at."""
     _answering: RequestResponseCycle | None = None
     _in_pipeline = False
-    """Whether the request that begins has waited behind another one."""
+    """True if the request that begins has waited behind another one."""
     _in_body = False
     _section_bytes = _fields = 0
-    """Of the head or the trailers, as far as the parser has reported them."""
+    """The size of the head or the trailers, as far as the parser has reported them."""
     _head_bytes = 0
-    """As read, with up to `READ_BYTES` of what came before: the parser reports whole fields."""
+    """Bytes read, with up to `READ_BYTES` before them: the parser reports whole fields."""
     _body_bytes = _framing_bytes = 0
 
     def __init__(
@@ -326,7 +326,7 @@ class _Http(HttpToolsProtocol):
         self._close_timer = self.loop.call_later(LINGER_S, self.abort)
 
     def _can_interrupt(self) -> bool:
-        """Whether nothing was sent of the answer to the request whose body is being read."""
+        """True if nothing was sent of the answer to the request whose body is being read."""
         return self._in_body and not self.pipeline and not self.cycle.response_started
 
     # ---- bodies that are answered already ------------------------------------------------------
@@ -389,7 +389,7 @@ class _Http(HttpToolsProtocol):
 
 
 MAX_HEAD_BYTES = 64 << 10
-"""Of a request line with its header fields, and of the trailer fields after a chunked body."""
+"""The bytes of a request line with its header fields, and of the trailers after a chunked body."""
 MAX_FIELDS = 100
 """Header fields of a head, or trailer fields."""
 

@@ -34,7 +34,7 @@ MAX_ADDRESSES = 8
 RESOLVE_S = 3.0
 """How long a name may take to resolve when a webhook is registered."""
 MAX_LOOK_UPS = 64
-"""Of names at once; each has a thread, which a silent name server may hold for half a minute."""
+"""Look-ups of names at once; each has a thread, which a silent name server may hold for 30 s."""
 
 
 class Refused(Exception):

@@ -1,4 +1,4 @@
-"""Which events a webhook wants, the messages that they become, and what comes of sending them."""
+"""The events that a webhook wants, the messages that they become, and the outcome of sending."""
 
 import base64
 import hashlib
@@ -21,7 +21,7 @@ log = logging.getLogger(__name__)
 
 TEST_KIND = "test"
 TOTAL_S = 10.0
-"""From the look-up of the name to the end of the answer."""
+"""The time from the look-up of the name to the end of the answer."""
 GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
 
 
@@ -44,7 +44,7 @@ class _Message(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of an attempt: a status, or the fault that kept the answer away.
+    """The outcome of an attempt: a status, or the fault that kept the answer away.
 
     `retry_after_s` is what the receiver asked for, in seconds.
     """
@@ -56,12 +56,12 @@ class Outcome:
 
     @property
     def delivered(self) -> bool:
-        """Whether the receiver has the event."""
+        """True if the receiver has the event."""
         return self.fault is None
 
 
 def wants(webhook: Registered, event: Event) -> bool:
-    """Whether an event passes the filters of a webhook."""
+    """True if an event passes the filters of a webhook."""
     if webhook.kinds is not None and event.kind not in webhook.kinds:
         return False
     if not event.concerns(webhook.run, webhook.spacecraft):
@@ -166,7 +166,7 @@ class _Failing:
 
 
 class DeliveryLog:
-    """What became of the attempts to deliver, since the start."""
+    """The outcomes of the attempts to deliver, since the start."""
 
     def __init__(self) -> None:
         self.counts: Counter[tuple[str, str, Result]] = Counter()

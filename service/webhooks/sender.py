@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 
 POLL_S = 1.0
 GATHER_S = 0.2
-"""After a commit: under load many events are queued at once."""
+"""The wait after a commit: under load many events are queued at once."""
 PARALLEL = 4
 """Attempts for one webhook at a time: a receiver that does not answer occupies its own alone."""
 READ_AT_ONCE = 500
@@ -360,8 +360,8 @@ class WebhookSender:
 
     # ---- the records -------------------------------------------------------------------------
 
-    async def _read(self, ask: Callable[..., T], *given: Any) -> T:
-        return await self._loop.run_in_executor(self._readers, ask, *given)
+    async def _read(self, ask: Callable[..., T], *arguments: Any) -> T:
+        return await self._loop.run_in_executor(self._readers, ask, *arguments)
 
     async def _change(self, change: Callable[[Connection], T]) -> T:
         return await asyncio.wrap_future(self._store.writer.change(change))
@@ -421,11 +421,11 @@ class Turn:
 
     @property
     def is_fresh(self) -> bool:
-        """Whether this process delivers, and no other can do so within the next seconds."""
+        """True if this process delivers, and no other can do so within the next seconds."""
         return self._is_held and time.monotonic() - self._beaten_s < FRESH_S
 
     async def take(self, read: Read) -> bool:
-        """Whether this process delivers now; call it at least every few seconds."""
+        """True if this process delivers now; call it at least every few seconds."""
         now_s = time.monotonic()
         if self._is_held:
             if now_s - self._beaten_s >= BEAT_S:

@@ -30,14 +30,14 @@ def report_text(plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | N
 
 
 def heading(plan: Plan) -> list[str]:
-    """What was simulated, in lines."""
+    """The description of the simulation, in lines."""
     first = plan.settings[0]
     mission, errors = first.mission, first.errors
     where = "the whole sky"
     if plan.direction_deg is not None:
         ra_deg, dec_deg = plan.direction_deg
         where = f"{plan.within_deg:g} deg about RA {ra_deg:g}, Dec {dec_deg:g} deg"
-    said = {
+    statements = {
         "phi_deg": f"phi {errors.phi_deg:g} deg",
         "theta_deg": f"theta {errors.theta_deg:g} deg",
         "psi_deg": f"psi {errors.psi_deg:g} deg",
@@ -48,7 +48,7 @@ def heading(plan: Plan) -> list[str]:
         ),
         "magnitude_error_mag": f"magnitude {errors.magnitude_error_mag:g} mag",
     }
-    unswept = [text for name, text in said.items() if name not in first.values]
+    unswept = [text for name, text in statements.items() if name not in first.values]
     switched = [f"{name} {'on' if is_on else 'off'}" for name, is_on in plan.tests.items()]
     lines = [
         (
@@ -77,7 +77,7 @@ def _percent(share: Interval) -> str:
 
 
 def met(rates: Sequence[Rates], at_most_ambiguous: float) -> list[str]:
-    """Which settings keep ambiguous stars below a share, in lines."""
+    """The settings that keep ambiguous stars below a share, in lines."""
     wanted = f"At most {100 * at_most_ambiguous:g} % ambiguous"
     found = meeting(rates, at_most_ambiguous)
     if found:

@@ -18,7 +18,7 @@ from service.missions.mission import Band, Mission, Tolerances
 
 MOST_SETTINGS = 400
 MOST_DIGITS = 12
-"""Of a value in a range: .3 + 3 * .2 is to be 0.9."""
+"""The digits of a value in a range: .3 + 3 * .2 is to be 0.9."""
 BOUND_SIGMAS = 6.0
 """The bound of magnitude errors: RCMAG of the paper's Table 1 is six times its SIGMAG."""
 
@@ -54,7 +54,7 @@ LIMITS = {
     "magnitude_bound_mag": (0.001, 100.0),
 }
 SIZES = ("radius_deg", "half_width_deg")
-"""Of a cap and of a band, in the table `zone` of the mission file."""
+"""The sizes of a cap and of a band, in the table `zone` of the mission file."""
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
-"""In the place of no error at all, by which the bound could not be divided."""
+"""The sigma in place of no error at all, by which the bound could not be divided."""
 OUTCOMES = {
     "unique_right": CORRECT,
     "ambiguous": AMBIGUOUS,
@@ -45,7 +45,7 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """What is simulated: zones about axes drawn over the sky, or within an angle of a direction.
+    """The simulated cases: zones about axes drawn over the sky, or within an angle of a direction.
 
     `within_deg` is RCCAT; `tests` are those switched on or off.  Each zone has `views` fields
     of view with at most `most_stars` observed stars each.  All settings are of one tracker.
@@ -119,7 +119,7 @@ def _rates(setting: Setting, counts: Integers) -> Rates:
 
 
 def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
-    """What became of one zone's stars: counts (settings, 4) in the order of `tally`."""
+    """The outcome of one zone's stars: counts (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
         views = list(_views(plan, number, off_axis_deg, sky))

@@ -1,4 +1,4 @@
-"""What the paper prints: its worlds, its runs with their counts, its times and its k_g.
+"""The numbers that the paper prints: its worlds, its runs with their counts, its times and its k_g.
 
 Beside each run stands what an independent implementation of the same reading
 got from 40 experiments of the paper's size: the reference.
@@ -133,7 +133,7 @@ class Paper:
 
 @cache
 def the_paper() -> Paper:
-    """What the paper prints, read once."""
+    """The numbers that the paper prints, read once."""
     data = json.loads(_FILE.read_text(encoding="utf-8"))
     return Paper(
         worlds={name: World(name, **_tuples(world)) for name, world in data["worlds"].items()},

@@ -1,4 +1,4 @@
-"""Whether two sets of counts agree: the printed run with ours, our rates with the reference's.
+"""Tests if two sets of counts agree: the printed run with ours, our rates with the reference's.
 
 An experiment is many independent zones, so that the covariance of its counts
 is that of one zone's counts times their number: as good from few experiments
@@ -22,7 +22,7 @@ ALLOWED_PCT = 0.05
 
 @dataclass(frozen=True)
 class Spread:
-    """Of one experiment of the paper's size, over `experiments`: mean (2,) and covariance (2, 2).
+    """One experiment of the paper's size, over `experiments`: mean (2,) and covariance (2, 2).
 
     The two counts are the stars not identified (ambiguous or unmatched) and
     those misidentified.
@@ -45,7 +45,7 @@ class Difference:
 
     @property
     def agrees(self) -> bool:
-        """Whether the rates differ by no more than may be."""
+        """True if the rates differ by no more than may be."""
         return abs(self.ours_pct - self.reference_pct) <= self.allowed_pct
 
 
@@ -86,7 +86,7 @@ def distance_squared(printed: PrintedCounts, ours: Spread) -> float:
 
 
 def is_inside(tally: Tally) -> bool:
-    """Whether the printed counts lie in the 95 % region of experiments of their size."""
+    """True if the printed counts lie in the 95 % region of experiments of their size."""
     return distance_squared(tally.run.printed, spread(tally)) <= CHI_SQUARE_95
 
 

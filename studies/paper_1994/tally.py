@@ -1,4 +1,4 @@
-"""What became of a run's stars, zone by zone."""
+"""The outcome of a run's stars, zone by zone."""
 
 from dataclasses import dataclass
 
@@ -15,7 +15,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Tally:
-    """What became of a run's stars: counts (zones, 4), zone by zone, over all experiments."""
+    """The outcome of a run's stars: counts (zones, 4), zone by zone, over all experiments."""
 
     run: Run
     identifier: Identifier

@@ -26,7 +26,7 @@ BYTES_PER_PAIR = 8 + 4 + 4 + 4 / PAIRS_PER_BIN
 
 
 LIMITS_S = {11: 4.0, 12: 600.0}
-"""What the missions allow for an update (XTE, SWAS), and for the result of a pass (SOHO)."""
+"""The times that the missions allow for an update (XTE, SWAS), and for a pass's result (SOHO)."""
 
 Row = dict[str, Any]
 

@@ -154,7 +154,7 @@ def _within(axis: Vector, radius_rad: float, rng: np.random.Generator) -> Vector
 
 
 def _least_axis(direction: Vector) -> Vector:
-    """For each direction the coordinate axis that it leans to least."""
+    """The coordinate axis to which each direction leans least."""
     return np.asarray(np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
 
 

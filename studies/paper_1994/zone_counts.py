@@ -22,17 +22,17 @@ class ZoneQuantity:
     zone: str
     quantity: str
     paper: int
-    here: int
+    ours: int
     within: float
 
     @property
     def off(self) -> float:
         """Our count beyond the paper's, as a share of the paper's."""
-        return self.here / self.paper - 1.0
+        return self.ours / self.paper - 1.0
 
     @property
     def passed(self) -> bool:
-        """Whether the difference is within its bound."""
+        """True if the difference is within its bound."""
         return abs(self.off) <= self.within
 
 
@@ -58,9 +58,9 @@ def counts(sky: SkyModel) -> Iterator[ZoneQuantity]:
     for zone in paper["zones"]:
         axis = from_ra_dec(zone["ra_deg"], zone["dec_deg"])
         found = counted(sky, missions[zone["mission"]], axis, time)
-        for quantity, here in zip(("stars", "pairs"), found, strict=True):
+        for quantity, ours in zip(("stars", "pairs"), found, strict=True):
             yield ZoneQuantity(
-                zone["name"], quantity, zone[quantity], here, paper["within"][quantity]
+                zone["name"], quantity, zone[quantity], ours, paper["within"][quantity]
             )
     bands = paper["sun_bands"]
     mission = missions[bands["mission"]]

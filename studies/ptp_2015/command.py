@@ -257,9 +257,9 @@ def _in_short(found: Measurements) -> list[str]:
     for px in (1.0, 2.0):
         tallies = [t for t in found.tallies.get("figure-12", ()) if t.case.position_px == px]
         for tally in sorted(tallies, key=lambda each: -each.strict.count):
-            told = f"{printed[tally.algorithm]:.2f}" if tally.algorithm in printed else ""
+            of_paper = f"{printed[tally.algorithm]:.2f}" if tally.algorithm in printed else ""
             rates = (tally.strict, tally.checked, tally.wrong)
-            rows.append((f"{px:g} px", tally.algorithm, told, *map(str, rates)))
+            rows.append((f"{px:g} px", tally.algorithm, of_paper, *map(str, rates)))
     if not rows:
         return []
     header = ("noise", "algorithm", "paper: Table 6 %", "strict", "checked", "wrong")

@@ -41,7 +41,7 @@ ALGORITHMS: Mapping[str, Build] = {
 OF_THE_PAPER = ("PTP", "P-vector", "planar triangle")
 COMPARED = (*OF_THE_PAPER, "Liebe's triangles", "pyramid")
 SIGMA_FLOOR_PX = 0.25
-"""What algorithms are told where there is no noise: a range of nothing would find nothing."""
+"""The sigma that algorithms assume where there is no noise: a range of nothing finds nothing."""
 SCENES_A_TASK = 50
 
 
@@ -55,7 +55,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class Database:
-    """What an algorithm keeps for the catalog to V 6, and what it took to make it."""
+    """The data that an algorithm keeps for the catalog to V 6, and the cost of making them."""
 
     algorithm: str
     entries: int
@@ -102,12 +102,12 @@ def _perform(task: _Task) -> npt.NDArray[np.int64]:
     """Counts (algorithms, scenes, columns) of some scenes of a case."""
     case = task.case
     sky = _sky(case.magnitude_sigma_mag if case.adds else 0.0)
-    told_rad = max(case.position_px, SIGMA_FLOOR_PX) * case.conditions.camera.pixel_rad
+    assumed_rad = max(case.position_px, SIGMA_FLOOR_PX) * case.conditions.camera.pixel_rad
     counted = np.empty((len(case.algorithms), task.count, len(COLUMNS)), np.int64)
     for at, scene in enumerate(
         draw_scenes(sky, case.conditions, task.count, task.seed, task.first)
     ):
-        seen = replace(scene, sigma_rad=np.full(len(scene.direction), told_rad))
+        seen = replace(scene, sigma_rad=np.full(len(scene.direction), assumed_rad))
         for k, name in enumerate(case.algorithms):
             counted[k, at] = _ask(_database(name), seen)
     return counted
@@ -141,7 +141,7 @@ def false_fields(scenes: int, seed: int) -> list[dict[str, str | int]]:
     """
     case, rng = Case("ptp-false", ("PTP",), 2.0), np.random.default_rng([seed, 2])
     half = np.tan(np.radians(5.0))
-    told_rad = case.position_px * case.conditions.camera.pixel_rad
+    assumed_rad = case.position_px * case.conditions.camera.pixel_rad
     counts = {"mirrored sky": np.zeros(2, int), "random points": np.zeros(2, int)}
     for scene in draw_scenes(_sky(0.0), case.conditions, scenes, seed):
         points = rng.uniform(-half, half, (len(scene.direction), 2))
@@ -151,7 +151,7 @@ def false_fields(scenes: int, seed: int) -> list[dict[str, str | int]]:
             "random points": drawn / np.linalg.norm(drawn, axis=1)[:, None],
         }
         for name, direction in fields.items():
-            sigma_rad = np.full(len(direction), told_rad)
+            sigma_rad = np.full(len(direction), assumed_rad)
             row = _ask(_database("PTP"), replace(scene, direction=direction, sigma_rad=sigma_rad))
             counts[name] += row[1] >= 3, row[3] >= 3
     return [
@@ -186,7 +186,7 @@ def stars_in_fields(scenes: int, seed: int) -> npt.NDArray[np.int64]:
 
 
 def all_projections() -> Projections:
-    """Of the guide triangles of the sky to the limit: Table 2, Figures 6 and 7."""
+    """The projections of the sky's guide triangles to the limit: Table 2, Figures 6 and 7."""
     return projections_of(_sky(0.0).run_catalog)
 
 

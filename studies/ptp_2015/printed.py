@@ -1,4 +1,4 @@
-"""What Zhou & Ye 2015 print of their experiments: the tables, and what the text tells of figures.
+"""The printed experiments of Zhou & Ye 2015: the tables, and the text's numbers on figures.
 
 The figures themselves are pictures without numbers; the text gives the ends of
 their lines.
@@ -37,7 +37,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class StarsInField:
-    """What the text tells of Figure 10: stars in the field of view over 10,000 attitudes."""
+    """The text's numbers on Figure 10: stars in the field of view over 10,000 attitudes."""
 
     least: int
     most: int
@@ -71,7 +71,7 @@ class Printed:
 
 @cache
 def the_ptp_paper() -> Printed:
-    """What is printed, read once."""
+    """The printed numbers, read once."""
     data = json.loads(_FILE.read_text(encoding="utf-8"))
     return Printed(
         axis=tuple(data["table_1"]["axis"]),

@@ -17,7 +17,7 @@ from studies.ptp_2015.rivals.proposed import proposed_by_votes
 
 SHOWN_EVERY = 25
 SIGMA_AT_1_PX = 2.87
-"""Of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
+"""The sigma of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
 COLORS = ("#0b5394", "#b45309")
 
 
@@ -58,7 +58,7 @@ class Projections:
 
 
 def projections_of(stars: RunCatalog) -> Projections:
-    """Those of a list of stars."""
+    """The projections of a list of stars."""
     four = build_triangles(stars.direction)
     return Projections(four, _once(four), _once(build_triangles(stars.direction, slaves=3)))
 
@@ -154,7 +154,7 @@ def table_2(found: Projections) -> str:
 
 
 def printed_slope(found: Projections) -> float:
-    """What one limit index is worth in P, if Tables 1 and 2 are of one database.
+    """The worth of one limit index in P, if Tables 1 and 2 are of one database.
 
     K of the first row of Table 2 is the row of a triangle whose P follows from the rows of
     Table 1, 90 rows before, by the density that they show themselves.
@@ -162,12 +162,12 @@ def printed_slope(found: Projections) -> float:
     index, count = the_ptp_paper().table_2[0]
     rows = the_ptp_paper().table_1
     density = (rows[-1][0] - rows[0][0]) / (rows[-1][1] - rows[0][1])
-    there = rows[-1][1] + (count - rows[-1][0]) / density
-    return (there - float(found.triangles.projection.value[0])) / (index - 1)
+    projection = rows[-1][1] + (count - rows[-1][0]) / density
+    return (projection - float(found.triangles.projection.value[0])) / (index - 1)
 
 
 def note_on_table_2(found: Projections) -> str:
-    """What the printed numbers imply of the database that they were made with."""
+    """A note on the database that the printed numbers imply."""
     slope = printed_slope(found)
     value = found.triangles.projection.value
     implied = (float(value[-1]) - float(value[0])) / slope + 1.0
@@ -250,8 +250,8 @@ def draw_figure_6(figure: Any, found: Projections) -> None:
     """The sides of triangles with the axis of their projections, and how many lie where."""
     index = found.triangles
     left = figure.add_subplot(1, 2, 1, projection="3d")
-    some = index.side[::SHOWN_EVERY]
-    left.scatter(*some.T, s=2, color=COLORS[0], alpha=0.4, linewidths=0)
+    sides = index.side[::SHOWN_EVERY]
+    left.scatter(*sides.T, s=2, color=COLORS[0], alpha=0.4, linewidths=0)
     ends = np.array([index.projection.value[0], index.projection.value[-1]])
     line = index.mean + ends[:, None] * index.axis
     left.plot(*line.T, color=COLORS[1], lw=2)

@@ -36,7 +36,7 @@ OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
     "figure-6": projections.figure_6,
     "figure-7": projections.figure_7,
 }
-"""Of all triangles of the sky: no field is drawn for these."""
+"""Tables of all triangles of the sky: no field is drawn for these."""
 
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
@@ -53,7 +53,7 @@ RATES = (
 
 @dataclass(frozen=True)
 class Measurements:
-    """What was measured: tallies by table, the counts of Figure 10, the databases."""
+    """The measurements: tallies by table, the counts of Figure 10, the databases."""
 
     scenes: int
     seed: int
@@ -62,7 +62,7 @@ class Measurements:
     databases: Sequence[Database] = field(default_factory=tuple)
     false_fields: Sequence[Mapping[str, str | int]] = ()
     projections: Projections | None = None
-    """Of the sky's triangles, for Table 2 and Figures 6 and 7."""
+    """The projections of the sky's triangles, for Table 2 and Figures 6 and 7."""
 
     @property
     def drawn(self) -> PlottedSeries:
@@ -142,19 +142,19 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
     printed = {row.algorithm: row for row in the_ptp_paper().table_6}
     rows = []
     for tally in tallies:
-        told = printed.get(tally.algorithm)
+        of_paper = printed.get(tally.algorithm)
         rows.append(
             (
                 tally.algorithm,
                 "lost and added" if tally.case.adds else "lost alone",
-                f"{told.rate_pct:.2f}" if told else "",
+                f"{of_paper.rate_pct:.2f}" if of_paper else "",
                 str(tally.strict),
                 str(tally.loose),
                 str(tally.checked),
                 str(tally.wrong),
-                f"{told.time_ms:.2f}" if told else "",
+                f"{of_paper.time_ms:.2f}" if of_paper else "",
                 tally.times,
-                f"{told.memory_mb:g}" if told else "",
+                f"{of_paper.memory_mb:g}" if of_paper else "",
                 f"{size[tally.algorithm].nbytes / MB:.2f}",
             )
         )
@@ -166,7 +166,7 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
 
 
 def database_table(databases: Iterable[Database]) -> str:
-    """What each algorithm keeps for the sky to V 6, and how long that takes to make."""
+    """The data that each algorithm keeps for the sky to V 6, and the time to make them."""
     printed = {row.algorithm: row.memory_mb for row in the_ptp_paper().table_6}
     rows = (
         (
@@ -225,14 +225,14 @@ def line_table(tallies: Sequence[Tally], axis: str, unit: str, printed: Ends) ->
     for tally in sorted(tallies, key=lambda t: getattr(t.case, axis)):
         value = getattr(tally.case, axis)
         ends = printed.get(tally.algorithm)
-        told = ""
+        of_paper = ""
         if ends and value in (values[0], values[-1]):
-            told = f"{ends[0] if value == values[0] else ends[1]:.1f}"
+            of_paper = f"{ends[0] if value == values[0] else ends[1]:.1f}"
         rows.append(
             (
                 f"{value:g} {unit}",
                 tally.algorithm,
-                told,
+                of_paper,
                 str(tally.strict),
                 str(tally.loose),
                 str(tally.checked),

@@ -1,4 +1,4 @@
-"""What became of the fields of one condition under one algorithm, and the rates of it."""
+"""The outcome of the fields of one condition under one algorithm, and the rates of it."""
 
 import math
 from dataclasses import dataclass
@@ -11,8 +11,8 @@ import numpy.typing as npt
 from service.simulate.scenes import Conditions
 
 COLUMNS = ("stars", "named", "named_right", "unique", "unique_right", "own_us", "check_us")
-"""Of a field: stars; those that the algorithm names, those named rightly; after the check likewise;
-microseconds of the algorithm, of the check."""
+"""Counts of a field: stars, those that the algorithm names, those named rightly; the last two
+after the check; microseconds of the algorithm, of the check."""
 SIGMAS_95 = 1.959964
 
 Fields = npt.NDArray[np.bool_]
@@ -111,7 +111,7 @@ class Tally:
 
     @cached_property
     def wrong(self) -> FieldShare:
-        """After the attitude check a star is misnamed."""
+        """The share of fields in which a star is misnamed after the attitude check."""
         return self._rate(self._column("unique_right") < self._column("unique"))
 
     @cached_property

@@ -15,7 +15,7 @@ Verdict = Literal["confirmed", "corrected", "qualified", "added"]
 
 @dataclass(frozen=True)
 class Claim:
-    """What the report says in a section, what is found here, and whether that is in its bounds.
+    """A statement of the report in a section, the finding here, and whether that is in its bounds.
 
     `figures` are the numbers behind `ours`, by name.
     """
@@ -48,7 +48,7 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """Whether everything is within its bounds."""
+        """True if everything is within its bounds."""
         return all(claim.holds for claim in self.claims)
 
 

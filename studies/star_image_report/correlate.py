@@ -18,7 +18,7 @@ from service.imaging.centroids.window import Array
 
 @dataclass(frozen=True)
 class Location:
-    """Where an image stands against its reference.
+    """The place of an image against its reference.
 
     `peak` is the normalised correlation there, 1 for equal shapes; `peak_ratio` that peak
     over the next one; the sigmas are the Cramér-Rao bound for the noise that was told.
@@ -36,8 +36,8 @@ def peak_offset(samples: Array) -> float:
     """The place of the greatest sample of a circle, from the first, by a parabola through three."""
     at = int(np.argmax(samples))
     n = len(samples)
-    before, here, after = samples[at - 1], samples[at], samples[(at + 1) % n]
-    bend = float(before - 2.0 * here + after)
+    before, peak, after = samples[at - 1], samples[at], samples[(at + 1) % n]
+    bend = float(before - 2.0 * peak + after)
     fine = 0.5 * float(before - after) / bend if bend < 0.0 else 0.0
     whole = at if at <= n // 2 else at - n
     return whole + fine
@@ -120,7 +120,7 @@ def _shifted(image: Array, u_px: float, v_px: float) -> Array:
 
 
 def locate(image: Array, reference: Array, noise_sigma: float = 0.0) -> Location:
-    """Where the reference stands in an image of the same shape, to a small part of a pixel.
+    """The place of the reference in an image of the same shape, to a small part of a pixel.
 
     The greatest normalised correlation over all whole displacements, then the zero of
     its derivatives.  `noise_sigma` is that of a pixel of the image.
@@ -182,7 +182,7 @@ def _peak_ratio(surface: Array, row: int, column: int) -> float:
 
 
 def _bounds(pattern: Array, scale: float, noise_sigma: float) -> tuple[float, float]:
-    """What no unbiased method does better than, in white noise, for this many times the pattern."""
+    """The bounds of any unbiased method, in white noise, for this many times the pattern."""
     transform = np.fft.fft2(pattern)
     fu = 2j * math.pi * np.fft.fftfreq(pattern.shape[1])[None, :]
     fv = 2j * math.pi * np.fft.fftfreq(pattern.shape[0])[:, None]

@@ -107,8 +107,8 @@ def _constant(wavelength_m: float, openings: int = 5) -> float:
     open_share = between_wires(centres(40 * openings, cell), cell, MESH.wires(openings + 1))
     square = Pupil(open_share[:, None] * open_share[None, :], cell)
     middle = np.zeros(1)
-    there = float(image_at(square, wavelength_m, middle, middle)[0, 0])
-    return there / float(mesh_intensity(0.0, 0.0, wavelength_m, MESH, openings))
+    middle_intensity = float(image_at(square, wavelength_m, middle, middle)[0, 0])
+    return middle_intensity / float(mesh_intensity(0.0, 0.0, wavelength_m, MESH, openings))
 
 
 def _null(wire_m: float, fine: int) -> float:

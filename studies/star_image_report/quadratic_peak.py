@@ -101,7 +101,7 @@ class StopRule:
     inconsistency_sigmas: float | None = 4.0
 
     def says(self, hump: Hump, estimate: StateEstimate) -> "Verdict":
-        """Whether to go on."""
+        """The verdict on an estimate: go on, or stop, with an image that is consistent or not."""
         if not np.all(estimate.sigma[:2] < self.required_sigma):
             return Verdict(done=False, consistent=True)
         if self.inconsistency_sigmas is None:
@@ -112,7 +112,7 @@ class StopRule:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Whether the estimate is as sharp as required, and whether the image is where it may be."""
+    """Tells if the estimate is as sharp as required, and if the image is where it may be."""
 
     done: bool
     consistent: bool

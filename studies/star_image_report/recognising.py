@@ -27,7 +27,7 @@ RADIUS_DEG, FAINTEST_MAG = 5.0, 6.0
 def patterns(study: Study) -> Row:
     """IM-11."""
     rng = study.rng(11)
-    told = _discrimination(study)
+    shares = _discrimination(study)
     return Row(
         "IM-11",
         "Raster finder and pattern constant",
@@ -35,7 +35,7 @@ def patterns(study: Study) -> Row:
             _identity(rng),
             _noise(rng, study.trials(20_000)),
             *_rasters(rng, 100 if study.quick else 400),
-            _recogniser(told),
+            _recogniser(shares),
             _pointing(rng),
         ),
         {
@@ -43,7 +43,7 @@ def patterns(study: Study) -> Row:
                 "How often K alone knows a field again (V 6, brightest within 5°, errors of "
                 "35.25″ per axis): only one stored field within three sigma, and the nearest.",
                 (8.0, 3.2),
-                lambda figure: _draw(figure, told),
+                lambda figure: _draw(figure, shares),
             )
         },
     )
@@ -133,15 +133,15 @@ def _fields(rng: np.random.Generator, number: int, stars: int) -> list[Array]:
 
 
 def _discrimination(study: Study) -> dict[int, list[tuple[int, float, float]]]:
-    """By number of stars: size of the store, share unique within 3 sigma, share nearest right."""
+    """By number of stars, rows of store size, share unique within 3 sigma, share nearest right."""
     rng = study.rng(111)
     sigma = SIGMA_ARCSEC / ARCSEC_PER_RADIAN
     sizes = STORES[:4] if study.quick else STORES
-    told: dict[int, list[tuple[int, float, float]]] = {}
+    shares: dict[int, list[tuple[int, float, float]]] = {}
     for stars in STARS:
         fields = _fields(rng, max(LEAST_FIELDS, *sizes), stars)
         keys = [chord_constant(field) for field in fields]
-        told[stars] = []
+        shares[stars] = []
         for size in sizes:
             # Several small stores, so that one unlucky field does not speak for all.
             unique = nearest = draws = 0
@@ -153,26 +153,26 @@ def _discrimination(study: Study) -> dict[int, list[tuple[int, float, float]]]:
                     unique += store.within(stars, constant, sigma) == [str(k)]
                     nearest += store.nearest(stars, constant) == str(k)
                     draws += 1
-            told[stars].append((size, unique / draws, nearest / draws))
-    return told
+            shares[stars].append((size, unique / draws, nearest / draws))
+    return shares
 
 
-def _recogniser(told: dict[int, list[tuple[int, float, float]]]) -> Claim:
-    def said(size: int, which: int) -> str:
-        rows = [next(row for row in rows if row[0] == size) for rows in told.values()]
+def _recogniser(shares: dict[int, list[tuple[int, float, float]]]) -> Claim:
+    def percent(size: int, which: int) -> str:
+        rows = [next(row for row in rows if row[0] == size) for rows in shares.values()]
         return " / ".join(f"{row[which]:.0%}" for row in rows)
 
-    small = min(row[2] for rows in told.values() for row in rows if row[0] == 10)
-    large = max(row[1] for rows in told.values() for row in rows if row[0] == 300)
+    small = min(row[2] for rows in shares.values() for row in rows if row[0] == 10)
+    large = max(row[1] for rows in shares.values() for row in rows if row[0] == 300)
     return Claim(
         "7.8",
         "K, compared with a stored set, recognises the pattern",
         "for 3 / 5 / 8 stars, nearest K right among 10 stored fields: "
-        f"{said(10, 2)}, 30: {said(30, 2)}, 100: {said(100, 2)}, 300: {said(300, 2)}; the only one "
-        f"within 3 sigma among 300: {said(300, 1)}",
+        f"{percent(10, 2)}, 30: {percent(30, 2)}, 100: {percent(100, 2)}, "
+        f"300: {percent(300, 2)}; the only one within 3 sigma among 300: {percent(300, 1)}",
         "qualified",
         small > 0.85 and large < 0.25,
-        {f"{stars} stars": rows for stars, rows in told.items()},
+        {f"{stars} stars": rows for stars, rows in shares.items()},
     )
 
 
@@ -207,9 +207,9 @@ def _flat(field: Array, aim: Array) -> tuple[Array, Array]:
     return np.asarray(field @ across / depth), np.asarray(field @ along / depth)
 
 
-def _draw(figure: Any, told: dict[int, list[tuple[int, float, float]]]) -> None:
+def _draw(figure: Any, shares: dict[int, list[tuple[int, float, float]]]) -> None:
     axes = figure.subplots(1, 2, sharey=True)
-    for stars, rows in told.items():
+    for stars, rows in shares.items():
         sizes, unique, nearest = np.array(rows).T
         axes[0].semilogx(sizes, 100 * unique, "o-", label=f"{stars} stars")
         axes[1].semilogx(sizes, 100 * nearest, "o-", label=f"{stars} stars")

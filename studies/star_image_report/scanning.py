@@ -314,7 +314,7 @@ class Misalignment:
 
 
 def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: float) -> Misalignment:
-    """From the displacements of two stars that should stand at (-u0, 0) and (u0, 0) (7.23 to 7.25).
+    """The misalignment from two stars that should stand at (-u0, 0) and (u0, 0) (7.23 to 7.25).
 
     Only right for a pair symmetric about the boresight.  Two stars that look alike leave
     half a turn open: this is the answer within a quarter turn.
@@ -328,7 +328,7 @@ def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: floa
 
 
 def by_positions(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> Misalignment:
-    """From any two or more stars (n, 2), wherever they stand: roll first, then displacement.
+    """The misalignment from two or more stars (n, 2) anywhere: roll first, then displacement.
 
     Least squares of a turn and a move, stars told apart, so that any roll is found.
     Raises `BadInput` for fewer than two stars, or for stars all in one place.
@@ -347,7 +347,7 @@ def by_positions(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> Misalignmen
 
 
 def sigmas(position_sigma: float, half_distance: float) -> tuple[float, float]:
-    """Of either displacement, sigma / sqrt 2, and of the roll, sqrt 2 sigma / (2 u0)."""
+    """Sigmas of either displacement, sigma / sqrt 2, and of the roll, sqrt 2 sigma / (2 u0)."""
     return position_sigma / math.sqrt(2.0), math.sqrt(2.0) * position_sigma / (2.0 * half_distance)
 
 
@@ -395,7 +395,7 @@ def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> Prof
 
 
 def truncated(displacement: float, half_length: float, end_light: float, light: float) -> float:
-    """What a scan from -V to V finds: d [1 - 2 V <Phi(V)> / E], with <Phi(V)> the mean of its ends.
+    """The result of a scan from -V to V: d [1 - 2 V <Phi(V)> / E]; <Phi(V)> the mean of its ends.
 
     `light` is E, the integral along the line.
     """
@@ -405,5 +405,5 @@ def truncated(displacement: float, half_length: float, end_light: float, light: 
 def with_background(
     displacement: float, light_sum: float, samples: int, background: float
 ) -> float:
-    """What a scan finds when a level is left in: d E / (E + (2N + 1) b0)."""
+    """The result of a scan when a level is left in: d E / (E + (2N + 1) b0)."""
     return displacement * light_sum / (light_sum + samples * background)

@@ -92,5 +92,5 @@ class SunTracker:
     def attenuation(self) -> float:
         """Brightness on the tail at the detectors, over that of the direct image."""
         zero = np.zeros(1)
-        there = float(self.tail_light(np.array([self.out_arcmin]), zero)[0])
-        return there / float(self.tail_light(zero, zero)[0])
+        tail = float(self.tail_light(np.array([self.out_arcmin]), zero)[0])
+        return tail / float(self.tail_light(zero, zero)[0])

@@ -28,7 +28,7 @@ class Mesh:
 
     @property
     def opening_m(self) -> float:
-        """Between two wires: s = d - wire."""
+        """The opening between two wires: s = d - wire."""
         return self.pitch_m - self.wire_m
 
     @property
@@ -108,8 +108,8 @@ def _factor(angle_rad: npt.ArrayLike, wavelength_m: float, mesh: Mesh, openings:
 
 def along_p(pupil: Pupil, wavelength_m: float, p_rad: Array) -> Array:
     """Intensity along the tail of the wires across x, over that at the star."""
-    here = image_at(pupil, wavelength_m, np.concatenate([[0.0], p_rad]), np.zeros(1))[0]
-    return np.asarray(here[1:] / here[0])
+    intensity = image_at(pupil, wavelength_m, np.concatenate([[0.0], p_rad]), np.zeros(1))[0]
+    return np.asarray(intensity[1:] / intensity[0])
 
 
 def tail(
@@ -127,12 +127,12 @@ def tail(
 def first_tail_null_rad(
     pupil: Pupil, wavelength_m: float, diameter_m: float, low_rad: float, high_rad: float
 ) -> float:
-    """Where the tail is darkest between two angles, to a small part of a fringe."""
+    """The angle between two angles where the tail is darkest, to a small part of a fringe."""
     p = np.linspace(low_rad, high_rad, 241)
     light = tail(pupil, wavelength_m, p, wavelength_m / diameter_m)
     at = int(np.clip(np.argmin(light), 1, len(p) - 2))
-    before, here, after = light[at - 1 : at + 2]
-    bend = before - 2.0 * here + after
+    before, lowest, after = light[at - 1 : at + 2]
+    bend = before - 2.0 * lowest + after
     return float(p[at] + (0.5 * (before - after) / bend if bend > 0.0 else 0.0) * (p[1] - p[0]))
 
 
@@ -153,5 +153,5 @@ def shares_of_light(
 
 
 def order_angle_rad(order: int, wavelength_m: float, mesh: Mesh) -> float:
-    """Where the principal maxima of the mesh stand: m lambda / d."""
+    """The angle of a principal maximum of the mesh: m lambda / d."""
     return order * wavelength_m / mesh.pitch_m

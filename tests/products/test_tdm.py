@@ -8,7 +8,7 @@ from service.times import parse_utc
 TIMES = ("2016-12-31T23:59:59.500Z", "2016-12-31T23:59:60.250Z", "2017-01-01T00:00:01.125Z")
 SEEN = TrackedObject(
     name="TRACK-1",
-    told=("Rate 1.5 arcsec/s",),
+    comments=("Rate 1.5 arcsec/s",),
     time=TIMES,
     ra_deg=(359.999, 0.001, 0.003),
     dec_deg=(-10.5, -10.25, -10.125),

@@ -51,5 +51,5 @@ class AsyncAlarms(AsyncConnection):
         """Add a comment to an alarm."""
         return await self._act(id, "comment", {"who": who, "comment": comment})
 
-    async def _act(self, id: str, action: str, said: dict[str, Any]) -> AlarmWithActions:
-        return await self.post(AlarmWithActions, path_of("alarms", id, action), said)
+    async def _act(self, id: str, action: str, body: dict[str, Any]) -> AlarmWithActions:
+        return await self.post(AlarmWithActions, path_of("alarms", id, action), body)

@@ -1,4 +1,4 @@
-"""What differs between waiting in an event loop and in a thread: here, in an event loop."""
+"""The differences between waiting in an event loop and in a thread: here, in an event loop."""
 
 import asyncio
 from collections import deque

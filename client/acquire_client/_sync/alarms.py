@@ -51,5 +51,5 @@ class Alarms(Connection):
         """Add a comment to an alarm."""
         return self._act(id, "comment", {"who": who, "comment": comment})
 
-    def _act(self, id: str, action: str, said: dict[str, Any]) -> AlarmWithActions:
-        return self.post(AlarmWithActions, path_of("alarms", id, action), said)
+    def _act(self, id: str, action: str, body: dict[str, Any]) -> AlarmWithActions:
+        return self.post(AlarmWithActions, path_of("alarms", id, action), body)

@@ -1,4 +1,4 @@
-"""What differs between waiting in an event loop and in a thread: here, in a thread."""
+"""The differences between waiting in an event loop and in a thread: here, in a thread."""
 
 import time
 from collections import deque

@@ -179,10 +179,10 @@ def restore(parsed: Namespace) -> int:
     return 0
 
 
-def _folder(given: Path | None, option: str) -> Path:
+def _folder(path: Path | None, option: str) -> Path:
     from service.settings import Settings
 
-    folder = given or Settings.from_environment().archive_folder
+    folder = path or Settings.from_environment().archive_folder
     if folder is None:
         raise BadInput(Fault(option, "must be given, or ACQUIRE_ARCHIVE_FOLDER set"))
     if not folder.is_dir():

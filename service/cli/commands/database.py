@@ -384,10 +384,10 @@ def prune(parsed: Namespace) -> int:
 
 
 def _beside(gyro_blocks: int, graded_days: int) -> str:
-    """What to say of gyro blocks and graded days beside batches, if there are any."""
-    told = [f"{gyro_blocks} gyro blocks"] if gyro_blocks else []
-    told += [f"{graded_days} days of filtered attitudes"] if graded_days else []
-    return "".join(f" and {each}" for each in told)
+    """The words on gyro blocks and graded days beside batches, if there are any."""
+    counts = [f"{gyro_blocks} gyro blocks"] if gyro_blocks else []
+    counts += [f"{graded_days} days of filtered attitudes"] if graded_days else []
+    return "".join(f" and {each}" for each in counts)
 
 
 def add_forget(group: Any) -> None:
@@ -442,7 +442,7 @@ def forget(parsed: Namespace) -> int:
     try:
         with store.reading() as connection:
             total = forgetting.found(connection, selected)
-        print(_told(total), file=sys.stderr if parsed.json else sys.stdout)
+        print(_removal_text(total), file=sys.stderr if parsed.json else sys.stdout)
         if not parsed.yes and not _is_confirmed(parsed.run):
             print("nothing was removed", file=sys.stderr)
             return 1
@@ -464,7 +464,7 @@ def forget(parsed: Namespace) -> int:
     return 0
 
 
-def _told(total: "Forgotten") -> str:
+def _removal_text(total: "Forgotten") -> str:
     of = "" if total.spacecraft is None else f" of {total.spacecraft}"
     counts = [
         (total.batches, "batches with their results"),
@@ -484,7 +484,7 @@ def _is_confirmed(run: str) -> bool:
 
 
 def _note(parsed: Namespace) -> Any:
-    """What adds the entry of the audit list."""
+    """A function that adds the entry of the audit list."""
     asked = {
         "spacecraft": parsed.spacecraft,
         "batches": parsed.batch,

@@ -26,7 +26,7 @@ TABLES = {
     "gyro": "Write the recorded gyro samples of a spacecraft, one row per sample.",
     "stars": "Write the stars of a spacecraft's batches with their outcomes, one row per star.",
 }
-"""What the command of each table does; see `app.products.table`."""
+"""The summary of the command of each table; see `app.products.table`."""
 
 
 def add(commands: Any) -> None:
@@ -100,7 +100,7 @@ def _write_attitude(parsed: Namespace) -> int:
     from service.app.products import open_products
 
     start, end = period_of(parsed)
-    given = {
+    arguments = {
         name: value
         for name, value in (
             ("largest_gap_s", parsed.largest_gap),
@@ -119,7 +119,7 @@ def _write_attitude(parsed: Namespace) -> int:
             grade=parsed.grade,
             order=parsed.order,
             most_batches=attitude_formats()[parsed.format].most_batches,
-            **given,
+            **arguments,
         )
         written_to(parsed.output, write_attitudes(parsed.format, series))
     return 0

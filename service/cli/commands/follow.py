@@ -88,8 +88,8 @@ def run(parsed: Namespace) -> int:
         parsed.consumer,
         parsed.refusals or f"acquire.refused.{stream}",
         parsed.answers,
-        _there(parsed.credentials, "--credentials"),
-        _there(parsed.authority, "--authority"),
+        _existing_file(parsed.credentials, "--credentials"),
+        _existing_file(parsed.authority, "--authority"),
         parsed.concurrency,
     )
     url, metrics = checked_url(service_url(parsed)), Metrics()
@@ -123,8 +123,8 @@ def _show(metrics: "Metrics") -> None:
 
 
 def _text(metrics: "Metrics") -> str:
-    told = ", ".join(f"{number:,} {name}" for name, number in metrics.counts.items())
-    return f"{told}; {metrics.lag:,} to come"
+    counts = ", ".join(f"{number:,} {name}" for name, number in metrics.counts.items())
+    return f"{counts}; {metrics.lag:,} to come"
 
 
 def _server_and_stream(text: str) -> tuple[str, str]:
@@ -136,7 +136,7 @@ def _server_and_stream(text: str) -> tuple[str, str]:
     return f"{parts.scheme}://{parts.netloc}", stream
 
 
-def _there(file: Path | None, name: str) -> Path | None:
+def _existing_file(file: Path | None, name: str) -> Path | None:
     if file is not None and not file.is_file():
         raise BadInput(Fault(name, "is not there, or is no file", shown_value(str(file))))
     return file

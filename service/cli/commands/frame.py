@@ -111,10 +111,10 @@ def run(parsed: Namespace) -> int:
 
         return solve_pictures(parsed, settings_of(parsed))
     for name in ("fov", "focal_px", "focal_mm", "pixel_um", "dark"):
-        given = getattr(parsed, name)
-        if given is not None:
+        value = getattr(parsed, name)
+        if value is not None:
             message = "goes without --spacecraft; a mission's file describes its camera"
-            raise BadInput(Fault(f"--{name.replace('_', '-')}", message, shown_value(str(given))))
+            raise BadInput(Fault(f"--{name.replace('_', '-')}", message, shown_value(str(value))))
     if parsed.batch is not None and len(parsed.files) > 1:
         message = "names one frame; leave it out for several"
         raise BadInput(Fault("--batch", message, shown_value(parsed.batch)))

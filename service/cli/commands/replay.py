@@ -212,13 +212,13 @@ def run(parsed: Namespace) -> int:
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
     if parsed.json:
-        given = {source.key: source.given for source in sources}
-        print_json({"run": run, **summary.counts(), **given})
+        supplied = {source.key: source.supplied for source in sources}
+        print_json({"run": run, **summary.counts(), **supplied})
     else:
         print(f"{'run':<20}{run}")
         print(summary.table())
         for source in sources:
-            print(f"{source.title:<20}{source.given:,} batches")
+            print(f"{source.title:<20}{source.supplied:,} batches")
     return 1 if summary.refused else 0
 
 

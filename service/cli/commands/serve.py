@@ -104,7 +104,7 @@ def prepare(parsed: Namespace) -> int:
     built = len(set(folder().glob("*.npy")) - before)
     keys = [entry.key for entry in sky.cache.state().entries]
     # The cache's keys are of any type; those of this sky are pairs of kind and key.
-    there = sum(is_kept(*key) for key in keys)  # type: ignore[misc]
+    kept = sum(is_kept(*key) for key in keys)  # type: ignore[misc]
     done = f"{built} files built in {time.monotonic() - start:.1f} s" if built else "built already"
     print(f"sky: {done}\nfolder: {folder().parent}")
-    return 0 if there == len(keys) else 1
+    return 0 if kept == len(keys) else 1

@@ -73,8 +73,8 @@ def run(parsed: Namespace) -> int:
 
 def _text(progress: Any) -> str:
     new, total = len(progress.new), len(progress.days)
-    told = f"{new} recorded, {total - new} unchanged, {progress.empty} without an attitude"
-    lines = [f"days with batches: {progress.total} ({told} to start from)"]
+    outcome = f"{new} recorded, {total - new} unchanged, {progress.empty} without an attitude"
+    lines = [f"days with batches: {progress.total} ({outcome} to start from)"]
     if progress.archived:
         lines.append(
             f"left as they are: {progress.archived}, for batches about them are archived; "

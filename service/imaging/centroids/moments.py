@@ -195,7 +195,7 @@ BLEND_SHARE = 0.01
 
 
 def is_blended(found: Fit, psf: Psf) -> bool:
-    """Whether pixels hold light beside the star that its shape does not explain.
+    """True if pixels hold light beside the star that its shape does not explain.
 
     What is left after the star is taken off, at its best place, is searched for a
     second one of the same shape about every pixel.
@@ -211,8 +211,8 @@ def is_blended(found: Fit, psf: Psf) -> bool:
     kernel = psf.pixel(near[None, :], near[:, None])
     summed = correlate((region.light - model) * weight, kernel, mode="constant")
     against = correlate(weight, kernel**2, mode="constant")
-    told = against > 0.0
-    second = summed[told] / against[told]
-    above = summed[told] / np.sqrt(against[told])
+    weighted = against > 0.0
+    second = summed[weighted] / against[weighted]
+    above = summed[weighted] / np.sqrt(against[weighted])
     shown = (above > BLEND_SIGMAS) & (second > BLEND_SHARE * found.flux_counts)
     return bool(np.any(shown))

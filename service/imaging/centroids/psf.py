@@ -1,4 +1,4 @@
-"""What a point of light looks like on pixels: a Gaussian, or any image, as of an Airy disc."""
+"""The image of a point of light on pixels: a Gaussian, or any image, as of an Airy disc."""
 
 import math
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class GaussianPsf:
 
     @property
     def fwhm_px(self) -> float:
-        """Of the Gaussian itself, without the pixel."""
+        """The full width at half maximum of the Gaussian itself, without the pixel."""
         return 2.0 * math.sqrt(2.0 * math.log(2.0)) * self.sigma_px
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
@@ -110,7 +110,7 @@ class SampledPsf:
 
     @cached_property
     def fwhm_px(self) -> float:
-        """Where half of the peak is left along u, twice, without the pixel."""
+        """The full width at half of the peak along u, without the pixel."""
         middle = self.image.shape[1] // 2
         along = self.image[self.image.shape[0] // 2, middle:] / self.image.max()
         first = int(np.argmax(along < 0.5))
@@ -165,7 +165,7 @@ class SampledPsf:
 
 
 def _is_raster(u: Array, v: Array) -> bool:
-    """Whether places are rising columns (1, n) and rising rows (m, 1)."""
+    """True if places are rising columns (1, n) and rising rows (m, 1)."""
     if u.ndim != 2 or v.ndim != 2 or u.shape[0] != 1 or v.shape[1] != 1:
         return False
     return bool(np.all(np.diff(u[0]) > 0.0) and np.all(np.diff(v[:, 0]) > 0.0))

@@ -1,4 +1,4 @@
-"""What every centroid method gives back: a place with its errors, or why there is none."""
+"""The result of every centroid method: a place with its errors, or why there is none."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from service.observations.scans.profile import BREAKDOWN_RATIO
 
 
 class Flag(StrEnum):
-    """What a user should know of a star's image."""
+    """A warning about a star's image."""
 
     SATURATED = "saturated"
     EDGE = "edge"
@@ -49,7 +49,7 @@ class CentroidRecord:
 
     @property
     def usable(self) -> bool:
-        """Whether there is a place."""
+        """True if there is a place."""
         return self.refused is None
 
 

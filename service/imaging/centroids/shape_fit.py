@@ -20,7 +20,7 @@ ENOUGH_SIGMAS = 0.01
 """A step this small against its own uncertainty is the last; the next would be its square."""
 LONGEST_STEP_PX = 0.7
 MOVE_BEYOND_PX = 0.75
-"""Beyond half a pixel, so that a star between two pixels does not toss the square about."""
+"""More than half a pixel, so that a star between two pixels does not move the square to and fro."""
 FARTHEST_IN_HALF_WIDTHS = 2.0
 
 

@@ -21,7 +21,7 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Detector:
-    """What turns light into counts: gain, the noise of reading (and of dark current), full well."""
+    """The properties of a detector: gain, the noise of reading (and of dark current), full well."""
 
     gain_e_per_count: float = 1.0
     read_noise_e: float = 0.0
@@ -86,13 +86,13 @@ class Window:
 
     @cached_property
     def usable(self) -> Mask:
-        """Where a pixel holds a believable number below saturation."""
+        """The pixels that hold a believable number below saturation."""
         finite = np.isfinite(self.counts) & (self.counts < self.detector.saturation_counts)
         return finite if self.good is None else finite & self.good
 
     @cached_property
     def saturated(self) -> Mask:
-        """Where a pixel is full."""
+        """The pixels that are full."""
         return np.asarray(self.counts >= self.detector.saturation_counts)
 
     @cached_property
@@ -161,7 +161,7 @@ class Region:
 
     @cached_property
     def inside(self) -> tuple[slice, slice]:
-        """Where the rectangle stands in the window's arrays."""
+        """The rectangle's slices of the window's arrays."""
         return (
             slice(self.row - self.above, self.row + self.below + 1),
             slice(self.column - self.left, self.column + self.right + 1),
@@ -189,11 +189,11 @@ class Region:
 
     @cached_property
     def usable(self) -> Mask:
-        """Where the pixels may be believed."""
+        """The pixels that may be believed."""
         return self.window.usable[self.inside]
 
     def flags(self, wanted_half: int) -> tuple[Flag, ...]:
-        """What the pixels themselves say: full, masked, cut by the edge of the frame."""
+        """The flags of the pixels themselves: full, masked, cut by the edge of the frame."""
         saturated = self.window.saturated[self.inside]
         reach = min(self.left, self.right, self.above, self.below)
         named = (
@@ -201,7 +201,7 @@ class Region:
             (bool((~self.usable & ~saturated).any()), Flag.MASKED),
             (self.window.cut and reach < wanted_half, Flag.EDGE),
         )
-        return tuple(flag for said, flag in named if said)
+        return tuple(flag for is_set, flag in named if is_set)
 
 
 def square_about(window: Window, column: int, row: int, half: int) -> Region | None:

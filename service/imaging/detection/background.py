@@ -26,7 +26,7 @@ UNEVEN, UNEVEN_SHARE = 0.5, 0.005
 """In sigmas of noise, the level that stray light leaves in a coarse mesh, and the least share of
 such meshes.  On even frames a few have 0.3 sigmas."""
 SURE_SIGMAS = 6.0
-"""Of the error of a fine mesh's level."""
+"""A multiple of the error of a fine mesh's level."""
 MEDIAN_ERROR = 1.25
 """The error of a median over that of a mean."""
 MAD_SIGMAS = 1.48

@@ -22,10 +22,10 @@ MARGIN = 1.4
 """How much brighter than the image of a point could be over its neighbours a pixel is hot."""
 LEAST_SIGMAS = 5.0
 CERTAIN_SIGMAS = 12.0
-"""Of what is left of a star that was struck, so that the rest of a track is none."""
+"""Sigmas of what is left of a star that was struck, so that the rest of a track is none."""
 
 HIT_SHARE = 0.1
-"""Of a star's brightest pixel: less may be a shape that is not quite the one presumed."""
+"""The share of a star's brightest pixel: less may be a shape that is not quite as presumed."""
 
 _ASIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
@@ -44,7 +44,7 @@ class Behind:
 def stars_behind(
     light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: Vector
 ) -> Behind:
-    """What lies behind candidates (k,) that are sharper than a star, each with its own noise.
+    """The stars behind candidates (k,) that are sharper than a star, each with its own noise.
 
     About each, pixel by pixel, what stands out from its four neighbours more than the
     middle of a star's image can is taken off, the brightest first, until nothing does.
@@ -153,7 +153,7 @@ _ROUNDS = 2
 def is_sharp(
     light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float
 ) -> npt.NDArray[np.bool_]:
-    """Whether (n,) candidates are narrower, along some direction, than a point's image can be.
+    """The candidates (n,) that are narrower, along some direction, than a point's image can be.
 
     Second moments under a Gaussian weight as wide as that image; the smaller axis of
     each is held against what the image itself gives.

@@ -54,9 +54,9 @@ class Detections:
     sharp_v_px: Vector
     """Hot pixels and cosmic rays: what was found and is no star."""
     images: StarImages | None
-    """Of a camera whose images of stars reach far: those of the brighter candidates."""
+    """The images of the brighter candidates, of a camera whose images of stars reach far."""
     image_of: npt.NDArray[np.intp]
-    """Which of the images is a candidate's (n,); -1 where none is."""
+    """The index of each candidate's image (n,); -1 where none is."""
 
     @property
     def count(self) -> int:
@@ -164,7 +164,7 @@ def _footprint(
 def _options(
     noise: float | CountArray, mask: npt.NDArray[np.bool_] | None, camera: Camera
 ) -> dict[str, Any]:
-    """What SEP is asked for: the threshold is in the noise behind the filter.
+    """Options of SEP: the threshold is in the noise behind the filter.
 
     SEP itself means the noise before it, unless it is given that of each pixel, with which it
     takes three times as long.
@@ -203,7 +203,7 @@ def _good(
     stars: npt.NDArray[np.void],
     others: npt.NDArray[np.void],
 ) -> npt.NDArray[np.bool_]:
-    """Where a pixel may be believed: the bright ones of what is no star are not."""
+    """The pixels that may be believed: bright ones that are no star's are not."""
     good = known.copy()
     good[others["ypeak"], others["xpeak"]] = False
     # Of a track all pixels, unless a star is among them.

@@ -21,7 +21,7 @@ from service.missions.mission import Tracker
 from service.vectors import Vector
 
 MARGIN_PX = 2
-"""Of a window beyond the square that a centroid sums, so that the square may follow the star."""
+"""The margin about the square that a centroid sums, so that the square may follow the star."""
 FAINT_SHARE = 0.4
 """Light above the threshold of the faintest star that is wanted: the rest of it lies below."""
 
@@ -160,7 +160,7 @@ def _chosen(
 
 
 def _by_magnitude_else_light(magnitude_mag: float, flux_counts: float) -> tuple[bool, float]:
-    """Where a star is put in the order: those without a magnitude behind, the most light first."""
+    """The sort key of a star: those without a magnitude last, the most light first."""
     if math.isnan(magnitude_mag):
         return True, -flux_counts if flux_counts > 0.0 else math.inf
     return False, magnitude_mag

@@ -18,7 +18,7 @@ from service.vectors import Vector, read_only
 
 MESH_PX = 32
 GUESSED_PSF_PX = 1.2
-"""For the first look, from which the width of a star's image is measured."""
+"""The width of the first look, from which the width of a star's image is measured."""
 LIKE_PSF = 1.35
 """A filter that is no more than this too wide or too narrow loses hardly any signal."""
 LEAST_PSF_PX, MOST_PSF_PX = 0.7, 5.0
@@ -32,7 +32,7 @@ MAX_WORKING_PIXELS = 4_000_000
 MAX_POINTS = 300
 FIRST_THRESHOLD, SECOND_THRESHOLD = 5.0, 3.5
 FULL_SHARE = 0.9
-"""Of the largest count: images with a higher peak may be cut off, and tell no width."""
+"""The share of the largest count above which a peak may be cut off, and its width unknown."""
 HOT_SHARE = 0.25
 """Light of the four neighbours over that of the brightest pixel: a star has more down to an image
 of a third of a pixel, one standard deviation."""
@@ -64,7 +64,7 @@ class PointSources:
     noise_counts: float
     background_counts: float
     clipped_share: float
-    """Of the pixels, those at the lowest count: where it is large, the background was cut off."""
+    """The share of pixels at the lowest count: where it is large, the background was cut off."""
     light: CountArray
     binning: int
     width_px: int
@@ -139,7 +139,7 @@ def find_points(
 
 @dataclass(frozen=True)
 class _Shapes:
-    """Of every image its place, width, lack of roundness (0 to 1), and light under the weight."""
+    """Every image's place, width, lack of roundness (0 to 1), and light under the weight."""
 
     u_px: Vector
     v_px: Vector
@@ -323,7 +323,7 @@ def without_dark(frame: Frame, dark: Frame) -> Frame:
 
 
 def hot_pixels(dark: CountArray) -> CountArray:
-    """Whether a pixel (rows, columns) of a dark frame stands out, or holds no number."""
+    """The pixels (rows, columns) of a dark frame that stand out, or hold no number."""
     middle = np.nanmedian(dark)
     # Counts are whole numbers: a quiet sensor may have a spread of none.
     spread = max(1.48 * float(np.nanmedian(np.abs(dark - middle))), 0.5)

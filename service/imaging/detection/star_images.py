@@ -25,18 +25,18 @@ from service.observations.scans.profile import BREAKDOWN_RATIO
 
 ROUNDS = 4
 FAR_FWHMS = 1.2
-"""Beyond this distance light is that of the tails."""
+"""The distance beyond which light is that of the tails."""
 TAIL_NOISES = 0.5
 """A star is taken off where the brightest pixel of its tails has so many sigmas of noise."""
 DOUBT = 0.03
-"""Of the light taken off: what an image that is not quite the one presumed may leave."""
+"""The share of the light taken off that an image unlike the presumed one may leave."""
 SAME_PX = 2.5
 LEAST_SHARE = 0.5
-"""Of a candidate's light, left where brighter stars are taken off: less may be a piece of a tail.
+"""Light left of a candidate after brighter stars are taken off: less may be a piece of a tail.
 
 A star that stands on a brighter tail shows in the next round."""
 SEEN_SHARE = 0.3
-"""Of a star's light, at least seen as that of its candidate."""
+"""The share of a star's light that must be seen as that of its candidate."""
 MOST_IMAGES, MOST_TRIED = 400, 800
 """Stars taken off, and candidates tried in a round: the work is bounded on any frame."""
 MARGIN_PX = 2
@@ -68,8 +68,8 @@ class StarImages:
 
     def places_and_light(self) -> Array:
         """U, v and counts of the stars (3, n)."""
-        told = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
-        return np.array(told, dtype=np.float64).reshape(-1, 3).T
+        rows = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3).T
 
     def behind(self, window: Window, number: int | None) -> Window:
         """The window with the light of all stars but one as part of its background."""

@@ -61,11 +61,11 @@ def _colour_axis(shape: tuple[int, ...]) -> int | None:
 
 def exactly(file: IO[bytes], count: int) -> bytes:
     """The next bytes of a file; raises `BadFile` where it ends before, and reads nothing."""
-    here = file.tell()
-    left = file.seek(0, os.SEEK_END) - here
+    start = file.tell()
+    left = file.seek(0, os.SEEK_END) - start
     if left < count:
         raise bad_frame("is cut off", f"{max(left, 0)} bytes of data where {count} are declared")
-    file.seek(here)
+    file.seek(start)
     return file.read(count)
 
 

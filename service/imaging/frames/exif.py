@@ -18,7 +18,7 @@ from service.imaging.frames.frame import AS_STORED, CountArray, Frame, bad_frame
 
 MAX_EXIF_BYTES = 1 << 20
 _TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 8, 8, 8, 8, 8)
-"""By the number of the type, of which 0 is none."""
+"""Bytes by the number of the type, of which 0 is none."""
 _EXIF, _EXPOSURE, _TAKEN, _OFFSET, _FRACTION = 0x8769, 33434, 36867, 36881, 37521
 _LONGEST_EXPOSURE_S = 3600.0
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)")
@@ -39,7 +39,7 @@ class Entry(NamedTuple):
 
     @property
     def size_bytes(self) -> int:
-        """Of all its numbers."""
+        """The size of all its numbers."""
         known = self.kind < len(_TYPE_BYTES)
         return self.number * (_TYPE_BYTES[self.kind] if known else 8)
 
@@ -111,10 +111,10 @@ def exposure_of(image: Any) -> tuple[str | None, float | None]:
         exif = exif_of(image).get_ifd(_EXIF)  # type: ignore[attr-defined]
     except Exception:
         return None, None
-    return told_exposure(*(exif.get(tag) for tag in (_TAKEN, _OFFSET, _FRACTION, _EXPOSURE)))
+    return exif_exposure(*(exif.get(tag) for tag in (_TAKEN, _OFFSET, _FRACTION, _EXPOSURE)))
 
 
-def told_exposure(
+def exif_exposure(
     taken: object, offset: object, fraction: object, exposure: Any
 ) -> tuple[str | None, float | None]:
     """UTC of mid exposure and exposure in seconds from the values of four tags of EXIF."""
@@ -147,7 +147,7 @@ def _utc(taken: object, offset: object, fraction: object, exposure_s: float | No
 
 
 def _is_small(image: Any) -> bool:
-    """Whether EXIF outside of the directories of a TIFF takes little memory."""
+    """True if EXIF outside of the directories of a TIFF takes little memory."""
     exif = image.info.get("exif", b"")
     if len(exif) > MAX_EXIF_BYTES:
         return False

@@ -35,7 +35,7 @@ OTHERS: Mapping[bytes, str] = {
 }
 """Formats that are known by their first bytes, and not read."""
 MORE_BYTES, BYTES_PER_PIXEL = 64 << 20, 24
-"""What a compressed file may unfold into: three planes of 64 bits, and further units beside."""
+"""The most that a compressed file may unfold into: three planes of 64 bits, and other units."""
 _BLOCK_BYTES = 1 << 20
 _LONGEST_MAGIC = 16
 _GZIP = b"\x1f\x8b"
@@ -71,7 +71,7 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
 
 @contextmanager
 def _unzipped(file: IO[bytes], limits: FrameLimits) -> Iterator[IO[bytes]]:
-    """What a gzip file holds, in a temporary file; raises `BadFile` for more than a frame takes."""
+    """The content of a gzip file, in a temporary file; raises `BadFile` if larger than a frame."""
     rows, columns = limits.shape or (limits.max_pixels, 1)
     most = MORE_BYTES + BYTES_PER_PIXEL * min(rows * columns, limits.max_pixels)
     file.seek(0)
@@ -147,7 +147,7 @@ _MAX_TAGS = 256
 
 
 def is_raw(file: IO[bytes], start: bytes) -> bool:
-    """Whether a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
+    """True if a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
     if start.startswith(MAGICS) or start[4:12] == _CR3:
         return True
     if not start.startswith((b"II*\0", b"MM\0*")):

@@ -47,11 +47,11 @@ def read_fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     full_scale = _full_scale(header) * len(planes)
     if len(planes) > 1:
         remarks = (*remarks, "image: its three planes were summed as colours")
-    told = time_of_header(header, primary)
+    timing = time_of_header(header, primary)
     counts, orientation = _as_shown(counts, header.behind(primary))
     return Frame(
-        *(counts, "FITS", digest, full_scale, told.time, told.exposure_s),
-        no_time=f"the file has no time of exposure: {told.reason}",
+        *(counts, "FITS", digest, full_scale, timing.time, timing.exposure_s),
+        no_time=f"the file has no time of exposure: {timing.reason}",
         orientation=orientation,
         remarks=remarks,
     )

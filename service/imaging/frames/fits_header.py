@@ -196,7 +196,7 @@ AVERAGES, STARTS, ENDS = (
     ("DATE-END", "MJD-END"),
 )
 TIMES_OF_DAY = ("TIME-OBS", "UT")
-"""Of a date without one."""
+"""The keywords of the time of day of a date without one."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
 """Moments that are farther apart contradict each other."""
@@ -239,12 +239,12 @@ def time_of_header(header: Header, primary: Header) -> HeaderTime:
     own = [header, primary]
     dates = next((each for each in own if _has(each, AVERAGES + STARTS)), header)
     exposed = next((each for each in own if _has(each, EXPOSURES)), header)
-    told = _Told(dates, header.behind(primary))
+    date_cards = _DateCards(dates, header.behind(primary))
     exposure_s, problem = exposure_of(exposed)
     if problem:
         return HeaderTime(None, None, problem)
     try:
-        moment = told.middle(exposure_s)
+        moment = date_cards.middle(exposure_s)
     except _NoTime as error:
         return HeaderTime(None, exposure_s, str(error))
     return HeaderTime(moment.text, exposure_s)
@@ -252,11 +252,18 @@ def time_of_header(header: Header, primary: Header) -> HeaderTime:
 
 def exposure_of(header: Header) -> tuple[float | None, str]:
     """The exposure in seconds, and what is contradictory in it."""
-    told = {key: _seconds(header, key) for key in EXPOSURES if key in header.cards}
-    known = {key: value for key, value in told.items() if value is not None}
-    total, given = known.get("EXPTIME"), known.get("EXPOSURE")
-    if total is not None and given is not None and abs(total - given) > 0.01 * max(total, given):
-        return None, f"EXPTIME is {total:g} s and EXPOSURE {given:g} s, which contradict each other"
+    seconds = {key: _seconds(header, key) for key in EXPOSURES if key in header.cards}
+    known = {key: value for key, value in seconds.items() if value is not None}
+    total, exposure = known.get("EXPTIME"), known.get("EXPOSURE")
+    if (
+        total is not None
+        and exposure is not None
+        and abs(total - exposure) > 0.01 * max(total, exposure)
+    ):
+        return (
+            None,
+            f"EXPTIME is {total:g} s and EXPOSURE {exposure:g} s, which contradict each other",
+        )
     value = next(iter(known.values()), None)
     return (value if value is not None and 0.0 < value <= LONGEST_EXPOSURE_S else None), ""
 
@@ -266,7 +273,7 @@ class _NoTime(Exception):
 
 
 @dataclass(frozen=True)
-class _Told:
+class _DateCards:
     """The header with the dates, and the one with what holds for all of them."""
 
     header: Header
@@ -317,7 +324,7 @@ class _Told:
         return f"the header has none of {looked}"
 
     def _role_of_date_obs(self) -> str:
-        """What DATE-OBS is: the start, unless its comment says otherwise (9.5)."""
+        """The role of DATE-OBS: the start, unless its comment says otherwise (9.5)."""
         comment = self.header.comments.get("DATE-OBS", "").lower()
         if re.search(r"\b(start|begin|beginning)\b", comment):
             return "start"
@@ -424,8 +431,8 @@ def _read(text: str, clock: str | None, scale: str) -> Utc | None:
         digits = zone[1:].replace(":", "").ljust(4, "0")
         offset = timedelta(hours=int(digits[:2]), minutes=int(digits[2:]))
         local = datetime(year, month, day, hour, minute, second)
-        there = local - offset if zone[0] == "+" else local + offset
-        return parse_utc(f"{there.isoformat()}{fraction}Z")
+        utc = local - offset if zone[0] == "+" else local + offset
+        return parse_utc(f"{utc.isoformat()}{fraction}Z")
     except (BadInput, ValueError, OverflowError):
         return None
 

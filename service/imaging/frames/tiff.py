@@ -24,7 +24,7 @@ from service.imaging.frames.exif import (
     as_shown,
     bytes_beyond,
     directory,
-    told_exposure,
+    exif_exposure,
 )
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
@@ -61,7 +61,7 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
             page: Any = opened.pages[number]
             _require_readable(page, limits)
             tag = page.tags.valueof(TAG)
-            time, exposure_s = _told(page)
+            time, exposure_s = _page_exposure(page)
             if page.photometric in _BY_PILLOW or page.compression == _JPEG:
                 if page.compression == _JPEG:
                     _require_whole_segments(page, file, limits)
@@ -293,12 +293,12 @@ def _require_whole_segments(page: Any, file: IO[bytes], limits: FrameLimits) -> 
         require_whole(tables + file.read(size)[2:], limits.max_pixels)
 
 
-def _told(page: Any) -> tuple[str | None, float | None]:
+def _page_exposure(page: Any) -> tuple[str | None, float | None]:
     """Time and exposure of a page's EXIF."""
     exif = page.tags.valueof(34665)
     exif = exif if isinstance(exif, dict) else {}
     names = "DateTimeOriginal", "OffsetTimeOriginal", "SubsecTimeOriginal", "ExposureTime"
-    return told_exposure(*(exif.get(name) for name in names))
+    return exif_exposure(*(exif.get(name) for name in names))
 
 
 def _subfiles(file: IO[bytes]) -> list[Subfile]:

@@ -54,14 +54,14 @@ from service.storage.upkeep.reprocessed import merge, name_part, restore_newest,
 from service.storage.upkeep.reprocessing import Reprocessing, now_text, write_reprocessing
 from service.times import DAY_S, bucket_start, parse_utc
 
-TOLD_EVERY_S = 1.0
+REPORT_EVERY_S = 1.0
 """How often the state is written, and `step` called, while nothing comes."""
 
 Step = Callable[[ReprocessProgress], object]
 
 
 @dataclass
-class _Told:
+class _ProgressReporter:
     """Writes and shows how far it is."""
 
     folder: Path
@@ -71,11 +71,11 @@ class _Told:
     started: str = field(default_factory=now_text)
     _last_s: float = 0.0
 
-    def tell(self, *, finished: bool = False, at_once: bool = True) -> None:
+    def report(self, *, finished: bool = False, at_once: bool = True) -> None:
         now_s = time.monotonic()
         if at_once:
             self.step(self.progress)
-        if not finished and now_s - self._last_s < TOLD_EVERY_S:
+        if not finished and now_s - self._last_s < REPORT_EVERY_S:
             return
         if not at_once:
             self.step(self.progress)
@@ -126,12 +126,12 @@ def reprocess_partitions(
         for path, made in unmerged(store, folder, plan.run):
             merge(store, folder, path, made)
         progress = ReprocessProgress(plan.run, 0, 0)
-        told = _Told(folder, plan.stretch.run or "", progress, step)
-        _run_tasks(store, folder, planner, workers, told)
+        reporter = _ProgressReporter(folder, plan.stretch.run or "", progress, step)
+        _run_tasks(store, folder, planner, workers, reporter)
         for spacecraft in sorted(plan.missions):
             restore_newest(store, folder, spacecraft, plan.run)
         remove_unfinished(folder, unfinished)
-        told.tell(finished=True)
+        reporter.report(finished=True)
     return progress
 
 
@@ -141,7 +141,7 @@ def reprocess_partitions(
 # goes on, and every batch comes once.
 
 MOST_BATCHES = 10_000
-"""Of a task made of the record, as of a part of the archive."""
+"""The most batches of a task made of the record, as of a part of the archive."""
 _AT_ONCE = 1_000
 
 
@@ -155,7 +155,7 @@ class Unit:
     part: PlacedPart | None
     batches: int
     before: int = 0
-    """Of the record's: how many the run has."""
+    """How many of the record's batches the run has."""
 
     @property
     def partitions(self) -> int:
@@ -327,9 +327,9 @@ class Planner:
     def _known(self, spacecraft: str, names: Sequence[str]) -> set[str]:
         found: set[str] = set()
         for first in range(0, len(names), _AT_ONCE):
-            some = {(spacecraft, self.plan.run, name) for name in names[first : first + _AT_ONCE]}
+            chunk = {(spacecraft, self.plan.run, name) for name in names[first : first + _AT_ONCE]}
             with self.store.reading() as connection:
-                found |= {name for _, _, name in look_up(connection, some).identities}
+                found |= {name for _, _, name in look_up(connection, chunk).identities}
         return found
 
 
@@ -356,23 +356,23 @@ def _run_tasks(
     folder: Path,
     planner: Planner,
     workers: Callable[[], Workers],
-    told: _Told,
+    reporter: _ProgressReporter,
 ) -> None:
-    progress = told.progress
+    progress = reporter.progress
     units = planner.units()
     progress.total = sum(unit.batches for unit in units)
     progress.partitions = sum(unit.partitions for unit in units)
-    told.tell()
+    reporter.report()
 
     def tasks() -> Iterator[PartitionTask]:
         for unit in units:
             of_unit = planner.tasks_of(unit)
             progress.before += of_unit.before
-            some = False
+            has_tasks = False
             for task in of_unit.tasks:
-                some = True
+                has_tasks = True
                 yield task
-            if not some:
+            if not has_tasks:
                 progress.partitions_done += unit.partitions
 
     # Workers start only if a task is left.
@@ -385,21 +385,21 @@ def _run_tasks(
         for task in left:
             waiting.append(doing.submit(task))
             while len(waiting) >= doing.most_pending:
-                _take(store, folder, _waited(waiting.popleft(), told), told)
+                _take(store, folder, _waited(waiting.popleft(), reporter), reporter)
         while waiting:
-            _take(store, folder, _waited(waiting.popleft(), told), told)
+            _take(store, folder, _waited(waiting.popleft(), reporter), reporter)
 
 
-def _waited(wait: Wait, told: _Told) -> PartitionResult:
-    while (found := wait(TOLD_EVERY_S)) is None:
-        told.tell(at_once=False)
+def _waited(wait: Wait, reporter: _ProgressReporter) -> PartitionResult:
+    while (found := wait(REPORT_EVERY_S)) is None:
+        reporter.report(at_once=False)
     return found
 
 
-def _take(store: Store, folder: Path, found: PartitionResult, told: _Told) -> None:
+def _take(store: Store, folder: Path, found: PartitionResult, reporter: _ProgressReporter) -> None:
     if found.made is not None:
         merge(store, folder, name_part(folder, found.made), found.made)
-    told.progress.recorded += found.batches
-    told.progress.add_refused(found.refused)
-    told.progress.partitions_done += 1
-    told.tell()
+    reporter.progress.recorded += found.batches
+    reporter.progress.add_refused(found.refused)
+    reporter.progress.partitions_done += 1
+    reporter.report()

@@ -34,7 +34,7 @@ from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole
 
 RETRIES = 3
-"""Of a task that raises; one whose worker dies goes to another worker by itself."""
+"""Retries of a task that raises; one whose worker dies goes to another worker by itself."""
 CONNECT_S = 20
 FEWEST_PENDING, PENDING_A_WORKER = 4, 2
 SCHEMES = ("tls://", "tcp://")
@@ -158,7 +158,7 @@ _solvers: dict[bytes, Solver] = {}
 
 
 def versions() -> dict[str, str]:
-    """What the bytes of a part depend on, beside its batches and the processor."""
+    """The versions on which the bytes of a part depend, beside its batches and the processor."""
     return {
         "attitude-acquisition": __version__,
         "numba": numba.__version__,

@@ -44,11 +44,11 @@ from service.storage.upkeep.reprocessed import RunPart, run_part
 from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")
-"""What a task reads of its source."""
+"""The columns that a task reads of its source."""
 AT_ONCE = 1_000
 """Batches that go through the core together."""
 _DIGITS = 24
-"""Of a digest in the name of a file."""
+"""The digits of a digest in the name of a file."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ class PartitionTask:
 
     @property
     def digest(self) -> str:
-        """What the results are made from: the source without what is left out."""
+        """The digest of the results' origin: the source without what is left out."""
         if not self.left_out:
             return self.source.digest
         names = "\0".join((self.source.digest, *sorted(self.left_out)))
@@ -100,10 +100,10 @@ class PartitionTask:
 
 @dataclass(frozen=True)
 class PartitionResult:
-    """What came of a task: its part, and the batches that the settings cannot take."""
+    """The result of a task: its part, and the batches that the settings cannot take."""
 
     made: RunPart | None
-    """None: every batch was refused."""
+    """The part that was made; None: every batch was refused."""
     refused: Sequence[RefusedBatch]
 
     @property
@@ -118,10 +118,10 @@ def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResu
     refused: list[RefusedBatch] = []
     stored = [row for row in _stored(task) if row["batch"] not in task.left_out]
     for start in range(0, len(stored), AT_ONCE):
-        some = stored[start : start + AT_ONCE]
-        submissions = [submission_again(each["input"], each["options"], task.run) for each in some]
+        chunk = stored[start : start + AT_ONCE]
+        submissions = [submission_again(each["input"], each["options"], task.run) for each in chunk]
         several = solver.acquired([each.batch for each in submissions])
-        for row, submission, acquired in zip(some, submissions, several, strict=True):
+        for row, submission, acquired in zip(chunk, submissions, several, strict=True):
             if isinstance(acquired, AcquisitionError):
                 refused.append(RefusedBatch(row["batch"], str(acquired)))
             elif isinstance(acquired, Exception):
@@ -187,7 +187,7 @@ def _rows_of(found: Sequence[UnsavedResult]) -> Rows:
         "results": _table(results, [each.result_row(each.answer) for each in in_order]),
     }
     for name, (table, _, _) in CHILDREN.items():
-        rows[table.name] = _table(table, [row for some in children[name] for row in some])
+        rows[table.name] = _table(table, [row for group in children[name] for row in group])
     return rows
 
 

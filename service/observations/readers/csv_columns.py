@@ -46,9 +46,9 @@ VECTORS = {
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
 READINGS = ("h_counts", "v_counts", "h_times", "v_times")
-"""Of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
+"""Columns of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
 LINES = ("column_counts", "row_counts")
-"""Of a tracker with a raster, in a row by themselves: it has no stars."""
+"""Columns of a tracker with a raster, in a row by themselves: it has no stars."""
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
@@ -136,12 +136,12 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
     """The fields of the batch itself, without its stars; raises `BadCell`."""
     fields: dict[str, Any] = {name: row[name] for name in TEXTS if row.get(name)}
     frame = fields.pop("frame", None)
-    given = {name: _group(row, columns) for name, columns in VECTORS.items()}
-    quaternion, boresight = given.pop("quaternion"), given.pop("boresight")
-    measured = {name: given.pop(name) for name in MEASURED}
+    values = {name: _group(row, columns) for name, columns in VECTORS.items()}
+    quaternion, boresight = values.pop("quaternion"), values.pop("boresight")
+    measured = {name: values.pop(name) for name in MEASURED}
     if any(measured.values()):
         fields["measurement"] = _measurement(row, measured, frame)
-    fields.update({name: value for name, value in given.items() if value is not None})
+    fields.update({name: value for name, value in values.items() if value is not None})
     priors: list[dict[str, Any]] = []
     if quaternion is not None:
         priors.append({"quaternion": quaternion})
@@ -154,10 +154,10 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
             priors.append({"sun_pointed": True, **_numbers(row, ("sun_counts",))})
     if row.get("sun_counts") and "sun_pointed" not in (priors[-1] if priors else ()):
         raise BadCell("sun_counts", "belongs to sun_pointed, which is not true", row["sun_counts"])
-    if told := row.get("a_priori_from", ""):
-        if told != "last":
-            raise BadCell("a_priori_from", "must be last or empty", told)
-        priors.append({"from": told})
+    if source := row.get("a_priori_from", ""):
+        if source != "last":
+            raise BadCell("a_priori_from", "must be last or empty", source)
+        priors.append({"from": source})
     if len(priors) > 1:
         kinds = " and ".join(next(iter(prior)) for prior in priors)
         raise BadCell("batch", f"has more than one a priori attitude: {kinds}", row["batch"])
@@ -177,19 +177,19 @@ def _measurement(
     row: CsvRow, measured: dict[str, list[float] | None], frame: str | None
 ) -> dict[str, Any]:
     """A tracker's own attitude; the cell `tracker` may be empty: then it is that of the body."""
-    told: dict[str, Any] = {
+    fields: dict[str, Any] = {
         name.removeprefix("measured_"): value
         for name, value in measured.items()
         if value is not None
     }
-    if "covariance_arcsec2" in told:
-        p11, p12, p13, p22, p23, p33 = told["covariance_arcsec2"]
-        told["covariance_arcsec2"] = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+    if "covariance_arcsec2" in fields:
+        p11, p12, p13, p22, p23, p33 = fields["covariance_arcsec2"]
+        fields["covariance_arcsec2"] = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
     if row["tracker"]:
-        told["tracker"] = row["tracker"]
+        fields["tracker"] = row["tracker"]
     if frame is not None:
-        told["frame"] = frame
-    return told
+        fields["frame"] = frame
+    return fields
 
 
 def star_of(row: CsvRow) -> dict[str, Any]:

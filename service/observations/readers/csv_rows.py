@@ -53,9 +53,9 @@ class JoinedRows:
     key_columns: ClassVar[tuple[str, ...]]
     """The columns that these rows have in common."""
     may_lack: ClassVar[str]
-    """What may be missing where a row beside these cannot be read."""
+    """The rows that may be missing where a row beside these cannot be read."""
     refuses_faulty_rows: ClassVar[bool]
-    """Whether a row with a fault refuses the rows of its key alone, or those beside it."""
+    """True if a faulty row refuses the rows of its key alone; False: those beside it, too."""
 
     def __init__(self, number: int, key: tuple[str, ...]) -> None:
         self.number, self.key = number, key
@@ -188,14 +188,14 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
         if batch.measurement is not None:
             writer.writerow(common)
         for tracker in batch.observations:
-            here = {**common, "tracker": neutralised(tracker.tracker)}
+            tracker_cells = {**common, "tracker": neutralised(tracker.tracker)}
             if not tracker.stars:
-                writer.writerow({**here, **list_cells(tracker)})
+                writer.writerow({**tracker_cells, **list_cells(tracker)})
             for star in tracker.stars:
                 numbers = star.model_dump(exclude_none=True, include={*STAR_NUMBERS})
                 direction = zip(DIRECTION, star.vector or (), strict=False)
                 cells = {**number_cells(direction), **number_cells(numbers.items())}
-                writer.writerow({**here, **cells, **list_cells(star)})
+                writer.writerow({**tracker_cells, **cells, **list_cells(star)})
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:

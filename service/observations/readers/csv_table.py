@@ -50,7 +50,7 @@ class RowKind:
     check_header: Callable[[list[str], str], None]
     """Raises `BadFile` for names of columns, and the place where they are."""
     ordered_by_time: bool
-    """Whether rows of one batch that lie apart are put in order of time."""
+    """True if rows of one batch that lie apart are put in order of time."""
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Row:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a row is in the file: the end of the row before it, and the number of its line."""
+    """The place of a row in the file: the end of the row before it, and the number of its line."""
 
     offset: int
     number: int

@@ -14,7 +14,7 @@ from service.errors import BadBatch, Fault
 Coding = Literal["identity", "gzip", "zstd"]
 
 MAX_UNPACKED_BYTES = 64 << 30
-"""Beyond what any archive of telemetry holds: a small body that unpacks to more is no telemetry."""
+"""More than any archive of telemetry holds: a body that unpacks to more is no telemetry."""
 MAX_WINDOW_BYTES = 128 << 20
 
 
@@ -130,10 +130,10 @@ class _Zstd(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         while not self._ready and self._more():
             pass
-        given = self._ready[: len(buffer)]
-        self._ready = self._ready[len(given) :]
-        buffer[: len(given)] = given
-        return len(given)
+        part = self._ready[: len(buffer)]
+        self._ready = self._ready[len(part) :]
+        buffer[: len(part)] = part
+        return len(part)
 
     def _more(self) -> bool:
         packed = b""

@@ -73,7 +73,7 @@ def require_telemetry(path: Path) -> None:
 
 
 def _not_telemetry(start: bytes, form: TelemetryFormat) -> str | None:
-    """What a file is instead of telemetry, by its beginning; None for telemetry."""
+    """The kind of a file that is no telemetry, by its beginning; None for telemetry."""
     lines = [line.strip() for line in start.split(b"\n") if line.strip()][:_LOOKED_AT_LINES]
     if not lines:
         # Of a longer file more may follow.

@@ -39,7 +39,7 @@ _NUMBERS = {
 }
 """The types that are read, by version, with the numbers of a state: the quaternion comes first."""
 _NAMES = ("EPOCH", "Q1", "Q2", "Q3", "QC")
-"""Of the elements of an XML state."""
+"""The names of the elements of an XML state."""
 _HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")
 _REQUIRED = (
     "OBJECT_NAME",
@@ -147,41 +147,42 @@ class _Reader:
                 )
         return found
 
-    def _form(self, told: Metadata) -> _Form:
-        told.require(_REQUIRED)
+    def _form(self, metadata: Metadata) -> _Form:
+        metadata.require(_REQUIRED)
         numbers = _NUMBERS[self._version]
-        type = told.one_of("ATTITUDE_TYPE", tuple(numbers))
+        type = metadata.one_of("ATTITUDE_TYPE", tuple(numbers))
         if self._version == 1:
-            told.require(tuple(_V1_ONLY))
-        time_system = told.time_system()
-        told.span(time_system)
-        about = (told.values["OBJECT_NAME"], told.values["OBJECT_ID"])
+            metadata.require(tuple(_V1_ONLY))
+        time_system = metadata.time_system()
+        metadata.span(time_system)
+        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
         if self._object not in (None, about):
-            raise told.fault("OBJECT_ID", "must be the same in every segment")
+            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
         self._object = about
         return _Form(
-            line=told.line,
+            line=metadata.line,
             time_system=time_system,
             numbers=numbers[type],
-            scalar_first=self._v1_keyword(told, "QUATERNION_TYPE") == "FIRST",
-            is_inverse=self._from_body(told) != (self._v1_keyword(told, "ATTITUDE_DIR") == "B2A"),
-            useable_ns=told.useable(time_system),
+            scalar_first=self._v1_keyword(metadata, "QUATERNION_TYPE") == "FIRST",
+            is_inverse=self._from_body(metadata)
+            != (self._v1_keyword(metadata, "ATTITUDE_DIR") == "B2A"),
+            useable_ns=metadata.useable(time_system),
         )
 
-    def _v1_keyword(self, told: Metadata, name: str) -> str:
-        return told.one_of(name, _V1_ONLY[name]) if self._version == 1 else ""
+    def _v1_keyword(self, metadata: Metadata, name: str) -> str:
+        return metadata.one_of(name, _V1_ONLY[name]) if self._version == 1 else ""
 
-    def _from_body(self, told: Metadata) -> bool:
-        """Whether REF_FRAME_A is the body; the other frame must be inertial."""
-        frames = {name: told.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
+    def _from_body(self, metadata: Metadata) -> bool:
+        """True if REF_FRAME_A is the body; the other frame must be inertial."""
+        frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
         is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
         for name, frame in frames.items():
             if not is_body[name] and frame not in INERTIAL:
                 message = f"must be one of {', '.join(INERTIAL)}, or the body as SC_BODY_1"
-                raise told.fault(name, message)
+                raise metadata.fault(name, message)
         if is_body["REF_FRAME_A"] == is_body["REF_FRAME_B"]:
             message = "one of REF_FRAME_A and REF_FRAME_B must be inertial, the other the body"
-            raise told.fault("REF_FRAME_B", message)
+            raise metadata.fault("REF_FRAME_B", message)
         return is_body["REF_FRAME_A"]
 
     def _state(self, token: Token, form: _Form) -> tuple[int, tuple[float, ...]]:

@@ -33,7 +33,7 @@ _UNPACKING = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
     *(EOFError, OSError, RuntimeError, UnicodeDecodeError),
 )
-"""What a damaged zip file raises: a name that is no UTF-8 is among it."""
+"""The errors that a damaged zip file raises: a name that is no UTF-8 is among its causes."""
 _KERNELS = (".tsc", ".tls")
 """Clocks and leap seconds, the kernels that reading takes."""
 
@@ -99,9 +99,9 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitu
         raise BadFile(Fault(name, f"is not read by SPICE within {CHILD_S:g} s")) from None
     if done.returncode:
         raise BadFile(Fault(name, "is no C-kernel: SPICE's reader broke off"))
-    told = json.loads(done.stdout.splitlines()[-1])
-    if "error" in told:
-        raise BadFile(Fault(name, told["error"]))
+    answer = json.loads(done.stdout.splitlines()[-1])
+    if "error" in answer:
+        raise BadFile(Fault(name, answer["error"]))
     records = np.fromfile(place / "records").reshape(-1, 5)
     spans = np.fromfile(place / "segments", dtype=np.int64).reshape(-1, 2)
     time_ns = np.ascontiguousarray(records[:, 0]).view(np.int64)
@@ -115,8 +115,8 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitu
     for first, count in spans.tolist():
         times = time_ns[first : first + count]
         if np.any(np.diff(times) <= 0):
-            place_told = f"{name}, record {first + 1}"
-            raise BadFile(Fault(place_told, "times must increase within an interval"))
+            record_name = f"{name}, record {first + 1}"
+            raise BadFile(Fault(record_name, "times must increase within an interval"))
         segments.append(
             Segment(
                 f"record {first + 1}",
@@ -126,4 +126,4 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitu
                 int(times[-1]),
             )
         )
-    return known_attitudes(name, told["object"], segments)
+    return known_attitudes(name, answer["object"], segments)

@@ -19,7 +19,7 @@ READ = (
     "AEM (CCSDS 504.0-B, KVN or XML), C-kernel (.bc with its clock beside it, or .zip), or the "
     "truth that `acquire simulate telemetry` writes (NDJSON)"
 )
-"""What is read, for people."""
+"""The formats that are read, for people."""
 
 
 def read_attitudes(file: Path, field: str) -> KnownAttitudes:

@@ -30,9 +30,9 @@ class Segment:
 
     place: str
     time_ns: Integers
-    """In ascending order; `Utc.tai_ns`."""
+    """Times in ascending order; `Utc.tai_ns`."""
     quaternion: Vector
-    """Of shape (n, 4), of norm 1."""
+    """Quaternions (n, 4) of norm 1."""
     first_ns: int
     last_ns: int
 
@@ -60,7 +60,7 @@ class Segment:
 
 @dataclass(frozen=True)
 class KnownAttitudes:
-    """What a file says of one object: segments in order of time that do not overlap."""
+    """The attitudes of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[Segment]
@@ -92,11 +92,11 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
 
 
 class Span(Protocol):
-    """What is valid from one time to another, `Utc.tai_ns`; `place` names it in messages."""
+    """A span that is valid from one time to another, `Utc.tai_ns`; `place` names it in messages."""
 
     @property
     def place(self) -> str:
-        """Where it stands in its file."""
+        """The place of an attitude in its file."""
 
     @property
     def first_ns(self) -> int:
@@ -130,7 +130,7 @@ Interpolation = Literal["HERMITE", "LAGRANGE"]
 
 
 class Ephemeris(Protocol):
-    """What a file says of the motion of one object."""
+    """The motion of one object, as a file describes it."""
 
     @property
     def object_name(self) -> str:
@@ -151,9 +151,9 @@ class StateSegment:
 
     place: str
     time_ns: Integers
-    """In ascending order; `Utc.tai_ns`."""
+    """Times in ascending order; `Utc.tai_ns`."""
     state: Vector
-    """Of shape (n, 6): km and km/s."""
+    """States (n, 6) in km and km/s."""
     first_ns: int
     last_ns: int
     method: Interpolation
@@ -195,7 +195,7 @@ class StateSegment:
 
 @dataclass(frozen=True)
 class KnownStates:
-    """What a file says of one object: segments in order of time that do not overlap."""
+    """The states of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[StateSegment]

@@ -56,10 +56,10 @@ _METHODS: dict[str, Interpolation] = {
 MOST_DEGREE = 19
 """Polynomials of higher degree follow the rounding of the states."""
 DEFAULT_DEGREE = 7
-"""Of Hermite's interpolation, where the file names none."""
+"""The degree of Hermite's interpolation, where the file names none."""
 EARTH_GM_KM3_PER_S2 = 398600.4418
 LONGEST_STEP_OF_PERIOD = 1 / 12
-"""Between states of a file that names no interpolation: a longer step would cost kilometres."""
+"""The longest step between states if no interpolation is named: a longer one costs kilometres."""
 SHORT_NS = 10**9
 """The states must reach START_TIME and STOP_TIME this near, else the file was cut short."""
 MAX_KM, MAX_KM_PER_S = 1e9, 100.0
@@ -68,7 +68,7 @@ _NAMES = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 @dataclass
 class _Form:
-    """What the metadata of a segment say of its states, and the states read so far."""
+    """The form of a segment's states by its metadata, and the states read so far."""
 
     line: int
     time_system: str
@@ -127,37 +127,37 @@ class _Reader:
                 return
         raise self._source.bad(line, "COVARIANCE_STOP", "is missing: the file was cut short")
 
-    def _form(self, told: Metadata) -> _Form:
-        told.require(_REQUIRED)
-        told.one_of("CENTER_NAME", ("EARTH",))
-        told.one_of("REF_FRAME", INERTIAL)
-        time_system = told.time_system()
-        about = (told.values["OBJECT_NAME"], told.values["OBJECT_ID"])
+    def _form(self, metadata: Metadata) -> _Form:
+        metadata.require(_REQUIRED)
+        metadata.one_of("CENTER_NAME", ("EARTH",))
+        metadata.one_of("REF_FRAME", INERTIAL)
+        time_system = metadata.time_system()
+        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
         if self._object not in (None, about):
-            raise told.fault("OBJECT_ID", "must be the same in every segment")
+            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
         self._object = about
-        method, degree = self._interpolation(told)
+        method, degree = self._interpolation(metadata)
         return _Form(
-            line=told.line,
+            line=metadata.line,
             time_system=time_system,
-            span_ns=told.span(time_system),
-            useable_ns=told.useable(time_system),
+            span_ns=metadata.span(time_system),
+            useable_ns=metadata.useable(time_system),
             method=method,
             degree=degree,
         )
 
-    def _interpolation(self, told: Metadata) -> tuple[Interpolation, int | None]:
+    def _interpolation(self, metadata: Metadata) -> tuple[Interpolation, int | None]:
         """The method, and the degree where one is given."""
-        if "INTERPOLATION" not in told.values:
+        if "INTERPOLATION" not in metadata.values:
             return "HERMITE", None
-        name = told.one_of("INTERPOLATION", tuple(_METHODS))
+        name = metadata.one_of("INTERPOLATION", tuple(_METHODS))
         if name == "LINEAR":
             return "LAGRANGE", 1
-        told.require(("INTERPOLATION_DEGREE",))
-        text = told.values["INTERPOLATION_DEGREE"]
+        metadata.require(("INTERPOLATION_DEGREE",))
+        text = metadata.values["INTERPOLATION_DEGREE"]
         if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MOST_DEGREE):
             message = f"must be a whole number from 1 to {MOST_DEGREE}"
-            raise told.fault("INTERPOLATION_DEGREE", message)
+            raise metadata.fault("INTERPOLATION_DEGREE", message)
         return _METHODS[name], int(text)
 
     def _add(self, form: _Form, token: Token) -> None:

@@ -197,41 +197,43 @@ class _XmlReader:
         return tokens
 
     @property
-    def _here(self) -> int:
+    def _line_number(self) -> int:
         return self._parser.CurrentLineNumber
 
     def _doctype(self, *_: Any) -> None:
-        raise self._source.bad(self._here, "DOCTYPE", "is not read: a message has none")
+        raise self._source.bad(self._line_number, "DOCTYPE", "is not read: a message has none")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
         if not self._path:
             kind = self._form.kind
             if tag.upper() != kind:
                 message = f"must be the element {kind.lower()}"
-                raise self._source.bad(self._here, "XML", message, tag)
+                raise self._source.bad(self._line_number, "XML", message, tag)
             version = attributes.get("version", "")
-            self._tokens.append(Token(self._here, "key", f"CCSDS_{kind}_VERS", version))
+            self._tokens.append(Token(self._line_number, "key", f"CCSDS_{kind}_VERS", version))
         elif tag in self._form.parts:
-            self._tokens.append(Token(self._here, "mark", self._form.parts[tag][0]))
+            self._tokens.append(Token(self._line_number, "mark", self._form.parts[tag][0]))
         elif tag == self._form.state:
-            self._state, self._line = [], self._here
+            self._state, self._line = [], self._line_number
         self._path.append(tag)
         if len(self._path) > _MOST_DEPTH:
-            raise self._source.bad(self._here, tag, f"lies in more than {_MOST_DEPTH} others")
+            raise self._source.bad(
+                self._line_number, tag, f"lies in more than {_MOST_DEPTH} others"
+            )
         self._text, self._size, self._is_leaf = [], 0, True
 
     def _characters(self, text: str) -> None:
         self._size += len(text)
         if self._size > MAX_LINE_BYTES:
             raise self._source.bad(
-                self._here, self._path[-1], f"must have at most {MAX_LINE_BYTES} bytes"
+                self._line_number, self._path[-1], f"must have at most {MAX_LINE_BYTES} bytes"
             )
         self._text.append(text)
 
     def _end(self, tag: str) -> None:
         self._path.pop()
         if tag in self._form.parts:
-            self._tokens.append(Token(self._here, "mark", self._form.parts[tag][1]))
+            self._tokens.append(Token(self._line_number, "mark", self._form.parts[tag][1]))
         elif tag == self._form.state:
             names, words = zip(*self._state or [("", "")], strict=True)
             self._tokens.append(
@@ -241,7 +243,7 @@ class _XmlReader:
         elif self._is_leaf and tag != "COMMENT":
             value = "".join(self._text).strip()
             if self._state is None:
-                self._tokens.append(Token(self._here, "key", tag, value))
+                self._tokens.append(Token(self._line_number, "key", tag, value))
             elif len(self._state) < 32:
                 self._state.append((tag, value))
         self._is_leaf = False

@@ -45,8 +45,8 @@ def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
             f"{name}.tf": frame_kernel(about),
         }
         texts[f"{name}.tm"] = list_of_kernels([*texts, f"{name}.bc"])
-        told = (f"{key}: {value}\n" for key, value in about.provenance().items())
-        texts["README.txt"] = "".join(told)
+        lines = (f"{key}: {value}\n" for key, value in about.provenance().items())
+        texts["README.txt"] = "".join(lines)
         for file, text in texts.items():
             (place / file).write_text(text, encoding="utf-8", newline="")
         _keep_records(series, place)

@@ -40,11 +40,11 @@ LOCK = "archive.lock"
 UNFINISHED = ".part"
 """The end of the name of a file that is being written."""
 COMPRESSION_LEVEL = 1
-"""Of zstd: higher levels take longer, and those up to 9 make nothing smaller."""
+"""The level of zstd: higher ones take longer, and those up to 9 make nothing smaller."""
 ROWS_TOGETHER = 2_048
-"""Of a row group, the least that is read of a text column."""
+"""The rows of a row group, the least that is read of a text column."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
-"""What file systems without hard links say."""
+"""The errors of file systems without hard links."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
@@ -65,9 +65,9 @@ class Part(Struct, frozen=True, kw_only=True):
     """Digests of the settings in `settings/`."""
     catalogs: list[str]
     source: str | None = None
-    """Of a reprocessed partition: the digest of what it was made from."""
+    """The digest of what a reprocessed partition was made from."""
     tracked: bool = False
-    """Whether its run was reprocessed with tracking; see `runs`."""
+    """True if its run was reprocessed with tracking; see `runs`."""
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
@@ -90,7 +90,7 @@ class Settings(Struct, frozen=True, kw_only=True):
 
     digest: str
     row: dict[str, Any]
-    """As the database has it."""
+    """The row as the database has it."""
 
 
 @contextmanager
@@ -121,7 +121,7 @@ def is_locked(folder: Path) -> bool:
 
 
 def day_folder(folder: Path, spacecraft: str, day: str) -> Path:
-    """Where the partitions of a spacecraft's day are."""
+    """The folder of the partitions of a spacecraft's day."""
     return folder / f"spacecraft={quote(spacecraft, safe='')}" / f"day={day}"
 
 
@@ -216,7 +216,7 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path, digest: str) -> Settings:
-    """What a digest stands for."""
+    """The settings for which a digest stands."""
     return _decoded(settings_file(folder, digest), Settings)
 
 

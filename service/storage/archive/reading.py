@@ -31,7 +31,7 @@ log = logging.getLogger(__name__)
 
 
 CACHE_BYTES = 64 << 20
-"""Of opened results, which are those of a few row groups."""
+"""The size of opened results, which are those of a few row groups."""
 
 
 @dataclass(frozen=True)
@@ -261,7 +261,7 @@ def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]
 
 
 def holds_any(connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc) -> bool:
-    """Whether batches of a period may be archived: whether a part reaches into it."""
+    """True if a part reaches into a period, so that batches of it may be archived."""
     c = archived_parts.c
     query = select(c.id).where(
         c.spacecraft == spacecraft,

@@ -38,7 +38,7 @@ from service.storage.sql.tables import (
 )
 
 Rows = dict[str, pa.Table]
-"""By the name of the SQL table: batches in order of time, the rest in the order of its batches."""
+"""Tables by the name of the SQL table: batches in order of time, the rest in their order."""
 
 CHILDREN = {
     "stars": (star_results, "result_id", ("tracker", "position")),
@@ -47,7 +47,7 @@ CHILDREN = {
     "frame": (frames, "batch_id", ()),
     "keys": (idempotency_keys, "result_id", ("token_id", "key")),
 }
-"""Of a partition's list columns: the table, what names its result, and its order within one.
+"""A partition's list columns: the table, what names its result, and its order within one.
 
 The first result of a batch has the batch's id, and so the rows of a batch are those of a result.
 """

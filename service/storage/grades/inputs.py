@@ -1,4 +1,4 @@
-"""What is filtered and predicted from: recorded attitudes, lone stars, and gyro samples."""
+"""The input of filters and predictions: recorded attitudes, lone stars, and gyro samples."""
 
 import hashlib
 import json
@@ -59,7 +59,7 @@ def days_with_batches(
 def recorded_in(
     connection: Connection, sky: SkyModel, spacecraft: str, run: str, start: Utc, end: Utc
 ) -> Recorded:
-    """What was recorded from `start` to before `end`: good attitudes, lone stars, gyro samples."""
+    """The record from `start` to before `end`: good attitudes, lone stars, gyro samples."""
     selected = ResultFilter(run, spacecraft, start, end)
     query = _ATTITUDES.where(*selected.conditions(), results.c.status == "good").order_by(*PLACE)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=object)

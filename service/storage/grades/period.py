@@ -35,7 +35,7 @@ from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_
 from service.times import DAY_S, Utc, shifted
 
 PARTS = 600
-"""Of a period, of each of which one sample is kept: as many as a chart shows."""
+"""The parts of a period, of each of which one sample is kept: as many as a chart shows."""
 MOST_BLOCKS = 48
 """That are read of each grade: two days at 1 Hz.  Of a longer period they are spread evenly."""
 MOST_DAYS = 40
@@ -275,7 +275,7 @@ _COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
 
 
 def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
-    """What each measured attitude of a period adds to the share, in order of time."""
+    """The samples that measured attitudes of a period add to the share, in order of time."""
     found: list[Sample] = []
     for part in latest_innovations(connection, selected):
         counted = np.isin(part.outcome, _COUNTED)

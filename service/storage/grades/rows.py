@@ -162,7 +162,7 @@ class LiveAttitude(Record, frozen=True, kw_only=True):
 
 
 def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:
-    """What is answered of the last epoch; None where there is no attitude, or it is lost."""
+    """The answer about the last epoch; None where there is no attitude, or it is lost."""
     if carried is None or (word := STATUS.get(Status(int(carried.sample.status[0])))) is None:
         return None
     sample = carried.sample

@@ -126,7 +126,7 @@ class RunTransition(Record, frozen=True, kw_only=True):
 
     @property
     def is_change(self) -> bool:
-        """Whether the outcome differs, or the named star."""
+        """True if the outcome differs, or the named star."""
         return self.before != self.after or (self.before == "unique" and not self.same_star)
 
 
@@ -189,9 +189,9 @@ class RunRates:
 
     run: str
     totals: Mapping[str, int]
-    """Of a rollup's counts, such as `observed`."""
+    """The totals of a rollup's counts, such as `observed`."""
     shares: Mapping[str, Vector]
-    """Of the observed stars: `ambiguous` and `unmatched` in each cell; NaN without a star."""
+    """Shares of the observed stars: `ambiguous`, `unmatched` in each cell; NaN without a star."""
 
 
 @dataclass(frozen=True)

@@ -138,7 +138,7 @@ class FleetRow:
     name: str
     description: str
     retired: bool
-    """Whether no mission file describes it any more."""
+    """True if no mission file describes it any more."""
     state: str
     """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
     latest_batch: Summary | None
@@ -151,7 +151,7 @@ class FleetRow:
     """Since the service received its latest batch."""
     last_hour: WindowCounts | None
     alarms: tuple[Alarm, ...]
-    """Those that are not cleared, worst first."""
+    """The alarms that are not cleared, worst first."""
 
     @property
     def alarms_now(self) -> list[Alarm]:
@@ -165,7 +165,7 @@ class FleetRow:
 
     @property
     def has_attitude(self) -> bool:
-        """Whether the latest batch has an attitude of its own."""
+        """True if the latest batch has an attitude of its own."""
         return self.state in ("good", "suspect")
 
 
@@ -177,7 +177,7 @@ class FleetCells:
     """POSIX time at which the first cell begins."""
     width_s: int
     counts: Mapping[str, Matrix]
-    """Of a rollup's counts, such as `observed`; 0 where there was no batch."""
+    """A rollup's counts, such as `observed`; 0 where there was no batch."""
 
     @property
     def columns(self) -> int:

@@ -54,7 +54,7 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
 
 
 def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
-    """Those of some runs whose limits are evaluated: the live one, and others that ask for it."""
+    """The runs whose limits are evaluated: the live one, and others that ask for it."""
     others = names - {LIVE}
     if not others:
         return names
@@ -161,7 +161,7 @@ class LimitEvaluator:
 
     @staticmethod
     def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:
-        """What each of the results adds to the value of a subject; None: nothing."""
+        """The contribution of each result to the value of a subject; None: nothing."""
         sample_of = sampler(subject)
         for each in new:
             trackers = each.trackers and _by_tracker(each)
@@ -299,7 +299,7 @@ def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], n
 
 
 def is_due_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> bool:
-    """Whether `evaluate_by_clock` would change anything; it only reads."""
+    """True if `evaluate_by_clock` would change anything; it only reads."""
     if connection.execute(_expired(now).limit(1)).first() is not None:
         return True
     return bool(_silent(connection, missions, now))
@@ -383,11 +383,11 @@ class ActiveAlarms:
         self._unsaved: set[Subject] = set()
 
     def has(self, subject: Subject) -> bool:
-        """Whether a subject has an active alarm."""
+        """True if a subject has an active alarm."""
         return subject in self._alarms
 
     def is_out(self, subject: Subject) -> bool:
-        """Whether a subject has an active alarm and is out of limits."""
+        """True if a subject has an active alarm and is out of limits."""
         return self.has(subject) and self._alarms[subject]["current_severity"] is not None
 
     def observe(

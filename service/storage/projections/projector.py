@@ -42,13 +42,13 @@ def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
     for each in new:
         if each.is_first:
             of_owner.setdefault(each.owner, []).append(each)
-    for (run, spacecraft), some in of_owner.items():
-        latest = max(some, key=lambda each: (each.result["time_ns"], each.seq)).result
+    for (run, spacecraft), group in of_owner.items():
+        latest = max(group, key=lambda each: (each.result["time_ns"], each.seq)).result
         newest: Row = {name: latest[name] for name in ("id", "batch", "time", "status", "reason")}
         newest["counts"] = {name: latest[name] for name in STARS}
-        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(some), "latest": newest}
+        note: Row = {"spacecraft": spacecraft, "run": run, "batches": len(group), "latest": newest}
         events.add_event(connection, "batches", note, run=run, spacecraft=spacecraft)
-        _note_states(connection, spacecraft, run, some)
+        _note_states(connection, spacecraft, run, group)
 
 
 def _note_states(
@@ -96,15 +96,15 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
 """Each adds new results, in the order of the record, to tables that it alone fills."""
 MOST_AT_ONCE = 500
 LONGEST_S = 0.05
-"""Of one transaction; the next one takes fewer results where this one took longer."""
+"""The duration of one transaction; the next one takes fewer results where this one took longer."""
 EVERY_S = 0.1
-"""Between the beginnings of two transactions, unless a reader waits."""
+"""The time between the beginnings of two transactions, unless a reader waits."""
 LOOK_S = 1.0
-"""Between two looks for what other processes recorded, and for where another one projects."""
+"""The time between two looks for what other processes recorded, and for another projector."""
 SHARED_LOOK_S = 0.1
 """The same on PostgreSQL in the process that projects: other services record all the time."""
 POLL_S = 0.02
-"""Between two looks of a reader for where another process projects."""
+"""The time between two looks of a reader for where another process projects."""
 GAP_S = 0.01
 """The pause before a gap in the record is looked at again."""
 WAIT_S = 1.0
@@ -112,7 +112,7 @@ WAIT_S = 1.0
 MOST_BEHIND = 20_000
 """Results; bulk loads, replays and reprocessing wait while there are more."""
 HOURS_AT_ONCE = 24
-"""Of trends that are counted anew, in one transaction."""
+"""The hours of trends that are counted anew in one transaction."""
 CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
 
@@ -124,7 +124,7 @@ _NEWEST_AND_POSITION = (
 
 @dataclass(frozen=True)
 class _Step:
-    """What a transaction of the projector came to."""
+    """The outcome of a transaction of the projector."""
 
     position: int
     is_all: bool
@@ -427,9 +427,9 @@ def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
     with store.reading_record() as connection:
         hours = sorted(rollups.hours_of_all(connection))
     for first in range(0, len(hours), HOURS_AT_ONCE):
-        some = hours[first : first + HOURS_AT_ONCE]
-        store.writer.change(partial(rollups.renew, hours=some)).result()
-        step(first + len(some), len(hours))
+        chunk = hours[first : first + HOURS_AT_ONCE]
+        store.writer.change(partial(rollups.renew, hours=chunk)).result()
+        step(first + len(chunk), len(hours))
     return len(hours)
 
 

@@ -47,11 +47,11 @@ BucketKey = tuple[str, str, int]
 TrackerKey = tuple[str, str, str, int]
 """(spacecraft, run, tracker, bucket)."""
 Rollups = dict[Any, Row]
-"""By `BucketKey`, or by `TrackerKey`."""
+"""Rows by `BucketKey`, or by `TrackerKey`."""
 _KEY = ("spacecraft", "run", "bucket")
 _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
 MAX_RATES = 20_000
-"""Of one answer: two years of hours, or half a century of days."""
+"""The most buckets of one answer: two years of hours, or half a century of days."""
 
 
 @dataclass(frozen=True)
@@ -283,10 +283,10 @@ def rates(
         query = query.where(table.c.bucket <= last)
     rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
     if len(rows) > MAX_RATES:
-        given = "nothing" if start is None else start.text
+        value = "nothing" if start is None else start.text
         shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
         wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
-        raise BadInput(Fault("start", wrong, given))
+        raise BadInput(Fault("start", wrong, value))
     return [
         {
             "start": bucket_start(number, trend.width_s).text,
@@ -366,7 +366,7 @@ def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
 # recorded ones, the share that is kept here is added.
 
 WHOLE = ""
-"""In place of a tracker: the spacecraft as a whole."""
+"""The tracker that stands for the spacecraft as a whole."""
 _NOTHING: Row = dict.fromkeys((*COUNTS, *SUMS), 0) | dict.fromkeys((*MINIMA, *MAXIMA))
 
 

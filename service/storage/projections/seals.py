@@ -16,7 +16,7 @@ from service.storage.sql.tables import projector, results, seals
 
 HOUR_NS = 3_600_000_000_000
 SUMMED_BITS = (1 << 40) - 1
-"""Of each digest: eight million of them add up within 63 bits."""
+"""The bits of each digest that are summed: eight million add up within 63 bits."""
 
 Seal = tuple[str, str, int]
 """(spacecraft, run, hour of TAI)."""

@@ -223,7 +223,7 @@ MOST = 200
 """Alarms of a period that are read, the newest: more could not be told apart on a chart."""
 _LEFT, _RETURNED = ("raised", "left_again"), "returned"
 TimeOut = tuple[str, str | None]
-"""From when to when; None: it still is."""
+"""A span from when to when; None: it still lasts."""
 
 
 def alarm_spans(

@@ -273,7 +273,7 @@ _AT_ONCE = 1_000
 
 
 def is_archived_in_part(connection: Connection, selected: ResultFilter, other: str) -> bool:
-    """Whether the archive has batches of the period in one of the runs."""
+    """True if the archive has batches of the period in one of the runs."""
     return any(
         parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
         for run in (selected.run, other)
@@ -329,8 +329,8 @@ def _named(
     c = table.c
     found: list[str] = []
     for first in range(0, len(names), _AT_ONCE):
-        some = names[first : first + _AT_ONCE]
-        query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(some))
+        chunk = names[first : first + _AT_ONCE]
+        query = select(c.id).where(c.run == run, tuple_(c.spacecraft, c.batch).in_(chunk))
         found += connection.scalars(query)
     return found
 
@@ -355,8 +355,8 @@ def _add_archived(
 def _places(connection: Connection, ids: Sequence[str]) -> dict[str, list[str]]:
     found: dict[str, list[str]] = {}
     for first in range(0, len(ids), _AT_ONCE):
-        for path, some in places(connection, ids[first : first + _AT_ONCE]).items():
-            found.setdefault(path, []).extend(some)
+        for path, added in places(connection, ids[first : first + _AT_ONCE]).items():
+            found.setdefault(path, []).extend(added)
     return found
 
 
@@ -374,7 +374,7 @@ def run_rates(
     start: Utc | None,
     end: Utc | None,
 ) -> RatesOfRuns | None:
-    """What became of all stars of each run, in total and over time.
+    """The rates of all stars of each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
     where there are none.

@@ -100,7 +100,7 @@ def fleet(
 
 
 class _Facts:
-    """What is known of every spacecraft, by name or by the id of its latest result."""
+    """The facts of every spacecraft, by name or by the id of its latest result."""
 
     def __init__(
         self, connection: Connection, names: list[str], run: str, as_of: Utc, now: Utc

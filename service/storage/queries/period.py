@@ -140,7 +140,7 @@ def _rows(connection: Connection, query: Select[tuple[str, str, int, str, str]])
 
 
 LEAST_EXPECTED = 0.1
-"""Of a star's sigma.  A star that the attitude all but follows says nothing of the noise."""
+"""Share of a star's sigma.  A star that the attitude all but follows says nothing of the noise."""
 ALIGNED_DEG = 0.01
 _UNKNOWN_DIRECTION = (np.nan, np.nan, np.nan)
 
@@ -227,7 +227,7 @@ def _presumed(batch: ObservationBatch, answer: Answer, mission: Mission) -> Prio
 def _boresight(
     tracker: Tracker, answer: Answer, presumed: PriorAttitude | None, mission: Mission
 ) -> Vector:
-    """Where a tracker looked, inertial; NaN where neither stars nor a priori knowledge tell."""
+    """The direction in which a tracker looked, inertial; NaN where nothing tells it."""
     if answer.attitude is not None:
         attitude = matrix_from_quaternion(answer.attitude.quaternion)
     elif presumed is None or not _knows(tracker, presumed, mission):
@@ -238,7 +238,7 @@ def _boresight(
 
 
 def _knows(tracker: Tracker, presumed: PriorAttitude, mission: Mission) -> bool:
-    """Whether a priori knowledge tells where a tracker looks: with the roll, or without it."""
+    """True if a priori knowledge tells where a tracker looks: with the roll, or without it."""
     off_deg = angle_between_deg(tracker.boresight_body, mission.axis_body)
     return presumed.roll_known or bool(off_deg <= ALIGNED_DEG)
 

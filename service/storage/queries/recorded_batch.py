@@ -37,7 +37,7 @@ class BatchSample:
     first: str | None
     last: str | None
     rows: tuple[Row, ...] = ()
-    """Of each batch, in the same order: result id, input and options as they are stored."""
+    """Rows of the batches, in the same order: result id, input and options as they are stored."""
 
 
 def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, Answer]:

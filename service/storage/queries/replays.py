@@ -24,7 +24,7 @@ MAX_LISTED = 100
 CANCELLED: ReplayStateName = "cancelled"
 UNFINISHED: tuple[ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
-"""Of packets that an earlier version counted."""
+"""The gyro counts of packets that an earlier version counted."""
 _NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
 
 
@@ -119,7 +119,7 @@ def _errors(errors: list[RefusedLine]) -> dict[str, str]:
 
 
 def is_cancelled(connection: Connection, id: str) -> bool:
-    """Whether the table says that a replay is cancelled, perhaps by another process."""
+    """True if the table says that a replay is cancelled, perhaps by another process."""
     return connection.scalar(select(replays.c.state).where(replays.c.id == id)) == CANCELLED
 
 

@@ -40,7 +40,7 @@ _QUERY: Select[Any] = (
 
 
 class _Rates(msgspec.Struct):
-    """Of a recorded input, the rates alone."""
+    """The rates of a recorded input."""
 
     body_rates_deg_per_s: tuple[float, float, float] | None = None
 

@@ -184,8 +184,8 @@ _ANSWERS = msgspec.json.Decoder(Answer)
 
 
 def _frame_of(row: Any) -> FrameWithStars:
-    told = json.loads(row["summary"]) | json.loads(row["detections"])
-    return msgspec.convert(told, FrameWithStars)
+    fields = json.loads(row["summary"]) | json.loads(row["detections"])
+    return msgspec.convert(fields, FrameWithStars)
 
 
 def frame_of_result(connection: Connection, id: str) -> Row:
@@ -251,7 +251,7 @@ def measured(row: Any) -> dict[str, float | None]:
 
 
 @dataclass(frozen=True)
-class Here:
+class ResultPlace:
     """A result: its spacecraft, run and time, and the id of the current one of its batch."""
 
     spacecraft: str
@@ -260,24 +260,24 @@ class Here:
     current: str | None
 
 
-def here_of(connection: Connection, id: str) -> Here:
-    """Where a result is."""
+def place_of(connection: Connection, id: str) -> ResultPlace:
+    """The spacecraft, run and time of a result."""
     row = connection.execute(select(results).where(results.c.id == id)).one()
     standing = select(results.c.id).where(results.c.batch_id == row.batch_id, results.c.current)
-    return Here(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
+    return ResultPlace(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
 
 
-def neighbours(connection: Connection, archive: Archive, here: Here) -> Neighbours:
+def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> Neighbours:
     """The results before and after one in time, of its spacecraft and run."""
-    sides = (_next(connection, archive, here, newest_first=side) for side in (True, False))
-    return Neighbours(here.current, *sides)
+    sides = (_next(connection, archive, place, newest_first=side) for side in (True, False))
+    return Neighbours(place.current, *sides)
 
 
 def _next(
-    connection: Connection, archive: Archive, here: Here, *, newest_first: bool
+    connection: Connection, archive: Archive, place: ResultPlace, *, newest_first: bool
 ) -> Summary | None:
-    selected = ResultFilter(here.run, here.spacecraft)
-    beyond = here.time_ns, FIRST_ID if newest_first else LAST_ID
+    selected = ResultFilter(place.run, place.spacecraft)
+    beyond = place.time_ns, FIRST_ID if newest_first else LAST_ID
     query = summary_query().where(*selected.conditions())
     try:
         found = first_rows(

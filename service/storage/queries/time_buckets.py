@@ -33,9 +33,9 @@ Level = Literal["hour", "day"]
 Columns = dict[str, Vector]
 """`unix_s`, at which each bucket begins, and columns of a rollup."""
 Names = tuple[str, ...]
-"""Of columns of a rollup."""
+"""Names of columns of a rollup."""
 MAX_BATCHES_SUMMED = 10_000
-"""Of a period of hours, for one answer; one with more is shown by the hour at the finest."""
+"""The most batches of a period of hours in one answer; a longer one is shown by the hour."""
 
 _WIDTH_S: dict[Level, int] = {"hour": HOUR_S, "day": DAY_S}
 _ROLLUPS: dict[Level, Table] = {"hour": rollups_hourly, "day": rollups_daily}
@@ -72,7 +72,7 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
 
 
 def has_archived(connection: Connection, span: BucketFilter) -> bool:
-    """Whether a span has archived batches, which only the rollups count."""
+    """True if a span has archived batches, which only the rollups count."""
     c = archived_parts.c
     query = select(c.id).where(
         c.spacecraft == span.spacecraft,

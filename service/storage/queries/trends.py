@@ -68,7 +68,7 @@ PAGE = 1_000
 LEAST_OF_CUT = 10
 """Batches of a bucket that the span cuts, from which on it has a rate."""
 MAX_HOURS_READ = 1_500
-"""Of one answer; a period with more is drawn from days at the finest."""
+"""The most hours of one answer; a longer period is drawn from days at the finest."""
 
 WIDTHS_S = (
     *(1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800),
@@ -79,13 +79,13 @@ WIDTHS_S = (
 
 @dataclass(frozen=True)
 class HistoryRequest:
-    """Which history: the quantities, how they are thinned out, and to how many points."""
+    """The wanted history: the quantities, how they are thinned out, and to how many points."""
 
     quantities: Sequence[QuantityName]
     strategy: Strategy
     size: int
     tracker: str | None = None
-    """Of a spacecraft with several: the one whose values they are."""
+    """The tracker whose values they are, of a spacecraft with several."""
 
 
 def history(

@@ -35,7 +35,7 @@ class Found:
 
     @property
     def place(self) -> Place:
-        """Where it stands in the order of time."""
+        """Its place in the order of time."""
         return self.row.time_ns, self.row.batch_id
 
     @property
@@ -79,8 +79,8 @@ def first_rows(
     The query has no order and, of the filter, all conditions.
     """
     if beyond is not None:
-        here, there = tuple_(*PLACE), tuple_(*beyond)
-        query = query.where(here < there if newest_first else here > there)
+        place, bound = tuple_(*PLACE), tuple_(*beyond)
+        query = query.where(place < bound if newest_first else place > bound)
     order = [column.desc() if newest_first else column for column in PLACE]
     query = query.order_by(*order).limit(limit)
     found = [Found(row, False) for row in connection.execute(query)]
@@ -88,7 +88,7 @@ def first_rows(
     last_ns = found[limit - 1].place[0] if len(found) >= limit else None
     waiting = _Waiting(parts_of(connection, use, selected, newest_first, beyond, last_ns), sign)
     opened = 0
-    while waiting.some:
+    while waiting.any_left:
         begins = waiting.begins
         if len(found) >= limit and sign * found[limit - 1].place[0] < begins:
             break
@@ -191,8 +191,8 @@ def all_rows(
 
 def count(connection: Connection, archive: Archive, selected: ResultFilter, most: int) -> int:
     """How many current results are selected; no more than `most` are counted."""
-    some = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
-    query = select(func.count()).select_from(some)
+    bounded = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
+    query = select(func.count()).select_from(bounded)
     found = int(connection.scalar(query) or 0)
     for part in parts_of(connection, ArchiveUse(archive), selected):
         if found >= most:
@@ -229,12 +229,12 @@ class _Waiting:
         self.add(parts)
 
     @property
-    def some(self) -> bool:
+    def any_left(self) -> bool:
         return bool(self._heap)
 
     @property
     def begins(self) -> int:
-        """Where the first begins, in the order of the list: no row of any comes before it."""
+        """The begin of the first, in the order of the list: no row of any comes before it."""
         return self._heap[0][0]
 
     def add(self, more: Iterable[PlacedPart | Block]) -> None:
@@ -275,7 +275,7 @@ def parts_of(
 def _reaches(
     each: PlacedPart | Block, selected: ResultFilter, newest_first: bool, beyond: Place | None
 ) -> bool:
-    """Whether it may have rows of the filter beyond a place."""
+    """True if it may have rows of the filter beyond a place."""
     if selected.start is not None and each.last_ns < selected.start.tai_ns:
         return False
     if selected.end is not None and each.first_ns >= selected.end.tai_ns:

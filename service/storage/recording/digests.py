@@ -66,7 +66,7 @@ def made_later(digest: int) -> int:
 
 
 def agrees(stored: int | None, digest: int) -> bool:
-    """Whether a digest that is kept, if any, is this one, whenever it was made."""
+    """True if a digest that is kept, if any, is this one, whenever it was made."""
     return stored in (None, digest, made_later(digest))
 
 

@@ -59,10 +59,10 @@ class Event:
     spacecraft: str | None
     data: str
     at: str | None
-    """None: an earlier version recorded it."""
+    """The time of the event; None: an earlier version recorded it."""
 
     def concerns(self, run: str | None, spacecraft: Collection[str] | None) -> bool:
-        """Whether the event passes a filter by run and spacecraft; None: every one passes.
+        """True if the event passes a filter by run and spacecraft; None: every one passes.
 
         An event without a run concerns every run, an annotation without a spacecraft every
         spacecraft.  A replay names no spacecraft: its lines may be about any, and its id gives
@@ -230,7 +230,7 @@ def _add_annotation_event(connection: Connection, shown: Annotation, *, deleted:
 
 CHANNEL = "acquire_events"
 WAIT_S = 0.5
-"""Between two looks whether the thread is to end."""
+"""The time between two looks at whether the thread is to end."""
 RECONNECT_S = 1.0
 
 

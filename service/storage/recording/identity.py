@@ -72,7 +72,7 @@ class ExistingResult(Struct, frozen=True):
     result_id: str
     fingerprint: str
     archived: bool = False
-    """Whether its batch is in the archive."""
+    """True if its batch is in the archive."""
 
 
 class PredictionOutdated(Busy):

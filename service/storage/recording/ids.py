@@ -64,5 +64,5 @@ def unguessable_ulid() -> str:
 
 
 def is_ulid(text: str) -> bool:
-    """Whether a text has the form of an identifier made here."""
+    """True if a text has the form of an identifier made here."""
     return len(text) == LENGTH and all(letter in _ALPHABET for letter in text)

@@ -51,10 +51,10 @@ def rolled_up(results: Sequence[Row]) -> Row:
     )
     shares = [[value for value in map(of, results) if value is not None] for of in _SHARES_OF]
     values = [[value for value in map(of, results) if value is not None] for of in _VALUES_OF]
-    sums = chain.from_iterable((len(there), sum(there, 0.0)) for there in values)
+    sums = chain.from_iterable((len(present), sum(present, 0.0)) for present in values)
     extremes = shares + values
-    least = [min(there, default=None) for there in extremes]
-    most = [max(there, default=None) for there in extremes]
+    least = [min(present, default=None) for present in extremes]
+    most = [max(present, default=None) for present in extremes]
     # In the order of the columns: to put their names together takes longer than all of this.
     return dict(zip(ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
 
@@ -126,4 +126,4 @@ SUMMED = _summed(results)
 SUMMED_OF_TRACKERS = _summed(tracker_values)
 """The same over `tracker_values`."""
 OF_TRACKERS = results.join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
-"""What a query over `tracker_values` reads, so that it can choose current results."""
+"""The source of a query over `tracker_values`, so that it can choose current results."""

@@ -42,7 +42,7 @@ _LOCK_SEQUENCE = (
     "SELECT pg_advisory_xact_lock(hashtextextended(%(pair)s, 'batches'::regclass::oid::int8))"
 )
 _RUNS = "runs"
-"""Where a connection remembers the runs that it has inserted, or found there."""
+"""The key under which a connection remembers the runs that it has inserted, or found there."""
 _REMEMBERED = 1_000
 """Runs: their names are the clients' own."""
 
@@ -144,7 +144,7 @@ def record(
 def _outdated(
     connection: Connection, unsaved_results: Sequence[UnsavedResult]
 ) -> Mapping[str, PredictionOutdated]:
-    """By id, an error for each result whose prediction is not from the last attitude any more.
+    """Errors by id, one for each result whose prediction is not from the last attitude any more.
 
     Until the transaction ends no other service records one that asks for the last attitude of
     the same spacecraft and run.  All locks are taken first, and in order.

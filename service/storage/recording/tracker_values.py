@@ -1,4 +1,4 @@
-"""What each tracker of a batch contributes: its stars by outcome, residuals and magnitudes.
+"""The contribution of each tracker of a batch: its stars by outcome, residuals and magnitudes.
 
 Rows of `tracker_values`, which exist where the spacecraft has several trackers:
 of one alone the result itself has the same values.
@@ -130,7 +130,7 @@ def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
 
 
 def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
-    """What brings the expected squares to the sum that the answer predicts; 1 for QUEST.
+    """The factor that brings the expected squares to the sum that the answer predicts; 1 for QUEST.
 
     TRIAD's attitude takes its own part of the noise, which its answer says of all stars only.
     """
@@ -151,7 +151,7 @@ def _rms(squares: float, count: int) -> float | None:
 
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
-    """Whether batches of a spacecraft's run are still to be split."""
+    """True if batches of a spacecraft's run are still to be split."""
     query = select(tracker_splits.c.run).where(
         tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
     )

@@ -42,9 +42,9 @@ class QueuedJob:
     unsaved_results: Sequence[UnsavedResult] = ()
     change: Callable[[Connection], Any] | None = None
     low_priority: bool = False
-    """As a bulk load has: it is written by itself, after what else waits."""
+    """True for a bulk load: it is written by itself, after what else waits."""
     needs_lock: bool = False
-    """For a step of the projector: only the session that holds its lock may run it."""
+    """True for a step of the projector: only the session that holds its lock may run it."""
     pending: Any = None
     since_s: float = field(default_factory=time.monotonic)
 
@@ -136,13 +136,13 @@ def _savepoint(connection: Connection) -> Iterator[None]:
 
 
 def is_of_the_database(error: BaseException) -> bool:
-    """Whether an error is the database's, its disk's or its connection's, and no single row's."""
+    """True if an error is the database's, its disk's or its connection's, and no single row's."""
     about_a_row = (IntegrityError, DataError, ProgrammingError)
     return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)
 
 
 def may_pass(error: DBAPIError) -> bool:
-    """Whether the trouble is with the database's disk or connection, and not with what was asked.
+    """True if the trouble is with the database's disk or connection, and not with what was asked.
 
     SQLite says of a table that is missing, and of a write through a connection
     for readers, that they are operational errors too.

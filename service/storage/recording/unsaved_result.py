@@ -34,14 +34,14 @@ STARS = ("observed", "unique", "ambiguous", "unmatched")
 
 _RECORD = b'"record":'
 _NOT_RECORDED = _RECORD + b"null"
-"""Of `timings_us`; within a text of the client's there would be a backslash before its quotes."""
+"""It stands in `timings_us`; within a client's text a backslash would precede its quotes."""
 
 
 class Answered(Struct, frozen=True):
     """An answer as it is stored and sent; `replayed` where it was stored before this request."""
 
     id: str | None
-    """None for a what-if that was not to be recorded."""
+    """The id, or None for a what-if that was not to be recorded."""
     body: bytes
     replayed: bool
 
@@ -183,8 +183,8 @@ def _unsaved_result(
 
 def _frame_of(frame: FrameRecord) -> FrameSummary:
     """The summary of the frame in the answer."""
-    told = frame.summary()
-    return FrameSummary(**(told | {"timings_us": FrameTimings(**told["timings_us"])}))
+    summary = frame.summary()
+    return FrameSummary(**(summary | {"timings_us": FrameTimings(**summary["timings_us"])}))
 
 
 def _frame_row(frame: FrameRecord, batch_id: str) -> Row:

@@ -47,7 +47,7 @@ STALLED_S = 20.0
 """Posts that are not solved by then are a failure; a look-up takes at most five seconds."""
 RETRY_AFTER_S = 5
 PROBE_BYTES = 1 << 20
-"""What readiness writes after a write that failed: as much as a batch of many stars."""
+"""The probe that readiness writes after a failed write: as much as a batch of many stars."""
 PROBE_TABLE = "probe_of_room"
 
 # PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
@@ -61,7 +61,7 @@ class WriterState:
     queued: int
     oldest_s: float
     succeeded: bool
-    """Whether the last write did."""
+    """True if the last write did."""
     failed: int
     """Batches and changes that could not be written since the start."""
 

@@ -88,7 +88,7 @@ class PersistentConnection:
 
         After `RolledBack` it is not: nothing is wrong with it.
         """
-        with self._given() as connection:
+        with self._exclusive() as connection:
             self._start(connection)
             log = self._log
             try:
@@ -109,7 +109,7 @@ class PersistentConnection:
     @contextmanager
     def lookup(self) -> Iterator[Connection]:
         """A connection for look-ups; on SQLite each prepared statement sees its own snapshot."""
-        with self._given() as connection:
+        with self._exclusive() as connection:
             if not self._is_sqlite:
                 connection.begin()
             yield connection
@@ -118,7 +118,7 @@ class PersistentConnection:
                 connection.rollback()
 
     @contextmanager
-    def _given(self) -> Iterator[Connection]:
+    def _exclusive(self) -> Iterator[Connection]:
         if not self._lock.acquire(timeout=self._turn_s):
             raise Busy("too many requests wait for the database", 1)
         try:
@@ -147,7 +147,7 @@ class PersistentConnection:
         self._keep(connection)
 
     def _is_idle(self, connection: Connection) -> bool:
-        """Whether a server says that its session is outside of any transaction, after an error.
+        """True if a server says that its session is outside of any transaction, after an error.
 
         The session may hold a lock, which would be lost with it.
         """

@@ -32,7 +32,7 @@ class DatabaseFile:
         self.path = path
         self._log_path = f"{path}-wal"
         self.identity: FileIdentity | None = None
-        self._told = False
+        self._is_loss_logged = False
 
     def create(self) -> int:
         """Open the file; one that is missing is made so that its owner alone can read it.
@@ -49,9 +49,9 @@ class DatabaseFile:
 
     @property
     def is_read_only(self) -> bool:
-        """Whether this process cannot write to the file, or make SQLite's log beside it."""
-        there = self.path.exists()
-        return there and not (
+        """True if this process cannot write to the file, or make SQLite's log beside it."""
+        exists = self.path.exists()
+        return exists and not (
             os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)
         )
 
@@ -78,10 +78,10 @@ class DatabaseFile:
     def require(self) -> None:
         """Raise `Busy` unless the path still leads to the file that was opened."""
         if self.identity is None or _identity(self.path) == self.identity:
-            self._told = False
+            self._is_loss_logged = False
             return
-        if not self._told:
-            self._told = True
+        if not self._is_loss_logged:
+            self._is_loss_logged = True
             log.error("%s was moved, replaced or deleted while it is being served", self.path)
         raise Busy(
             "the database file was moved, replaced or deleted while the service runs; nothing is "
@@ -90,7 +90,7 @@ class DatabaseFile:
         )
 
     def log_identity(self) -> FileIdentity | None:
-        """Which file is SQLite's write-ahead log: it stays the same while a connection is open."""
+        """The identity of SQLite's write-ahead log: it is constant while a connection is open."""
         return _identity(self._log_path)
 
     def require_log(self, opened: FileIdentity | None) -> None:

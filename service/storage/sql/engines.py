@@ -24,7 +24,7 @@ from service.storage.sql.database_file import DatabaseFile
 
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
-"""Of pages: the inner ones of every index are read with each batch."""
+"""The size of the cache of pages: the inner ones of every index are read with each batch."""
 TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
 """How SQLite begins a transaction of the one connection that writes, and of a reader."""
 MAX_READERS = 16
@@ -46,9 +46,9 @@ class Timeouts:
     lock_s: float
     statement_s: float
     idle_s: float = 0.0
-    """After so long a server ends a transaction whose client asks nothing, and frees its locks."""
+    """The idle time after which a server ends an open transaction, and frees its locks."""
     lost_s: int = 0
-    """After so long without a sign of life from the client's machine a server ends the session."""
+    """The time without a sign of life from a client after which a server ends its session."""
 
 
 # A post waits at most 5 s for its turn, then for one look-up, for the turn to write and for one
@@ -56,9 +56,9 @@ class Timeouts:
 TO_LOOK_UP = Timeouts(lock_s=2.0, statement_s=3.0)
 TO_COMMIT = Timeouts(lock_s=2.0, statement_s=4.0, idle_s=30.0, lost_s=6)
 TO_SHOW = Timeouts(lock_s=2.0, statement_s=12.0)
-"""For pages and lists, some of which read much."""
+"""Timeouts for pages and lists, some of which read much."""
 PATIENT_S = 60.0
-"""For a statement of a bulk load, which has time: posts do not wait for it."""
+"""The timeout of a statement of a bulk load, which has time: posts do not wait for it."""
 MORE_S = 1.0
 CONNECT_S, TCP_USER_TIMEOUT_S = 2, 8
 FREE_S = 10.0
@@ -67,7 +67,7 @@ LONGEST_WAIT_S = 2.0
 """The longest wait of a look-up, or of what is to be written, before it begins."""
 
 SECRETS = ("password", "sslpassword")
-"""Of the query part of a URL of PostgreSQL."""
+"""Secrets in the query part of a URL of PostgreSQL."""
 
 _DRIVERS = {
     "sqlite": "sqlite",
@@ -183,11 +183,11 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
         options += ["-c tcp_keepalives_count=2", f"-c tcp_user_timeout={1000 * timeouts.lost_s}"]
     own = url.query.get("options", ())
     options += [own] if isinstance(own, str) else own
-    given: dict[str, Any] = {
+    defaults: dict[str, Any] = {
         "connect_timeout": CONNECT_S,
         "tcp_user_timeout": 1000 * TCP_USER_TIMEOUT_S,
     }
-    arguments = {name: value for name, value in given.items() if name not in url.query}
+    arguments = {name: value for name, value in defaults.items() if name not in url.query}
     arguments["options"] = " ".join(options)
     engine = create_engine(url, pool_pre_ping=True, connect_args=arguments, **pool)
 

@@ -169,8 +169,8 @@ def reported(url: URL) -> Iterator[None]:
     try:
         yield
     except (SQLAlchemyError, UnicodeDecodeError) as error:
-        said = str(getattr(error, "orig", None) or error).strip()
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {said}") from error
+        reason = str(getattr(error, "orig", None) or error).strip()
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {reason}") from error
 
 
 @contextmanager

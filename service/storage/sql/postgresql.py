@@ -8,7 +8,7 @@ from psycopg.abc import PQGen
 RV = TypeVar("RV")
 
 PING_S = 2.0
-"""For the question whether a pooled connection is still there."""
+"""The timeout of the question whether a pooled connection is still there."""
 
 
 class BoundedConnection(psycopg.Connection[tuple[object, ...]]):

@@ -35,7 +35,7 @@ class NotProjecting(Busy):
 
 
 class ProjectorLock:
-    """Whether the session that writes holds the lock; used by the writer's thread."""
+    """Knows if the session that writes holds the lock; used by the writer's thread."""
 
     def __init__(self) -> None:
         self._session: object | None = None
@@ -49,7 +49,7 @@ class ProjectorLock:
 
     @property
     def is_held(self) -> bool:
-        """Whether this service projects, as far as is known without asking the database."""
+        """True if this service projects, as far as is known without asking the database."""
         return self._session is not None
 
     def require(self) -> None:
@@ -89,7 +89,7 @@ class ProjectorLock:
 
 
 def left_behind(connection: Connection, ids: Collection[str]) -> set[str]:
-    """Those of the replays and calibrations that no session holds the lock of."""
+    """The replays and calibrations that no session holds the lock of."""
     return {id for id in ids if execute(connection, _IS_FREE, {"id": id})[0][0]}
 
 

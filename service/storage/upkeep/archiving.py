@@ -65,7 +65,7 @@ from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
 Integers = npt.NDArray[np.int64]
 
 MOST_BATCHES = 10_000
-"""Of a part: what is held in memory, and deleted in one transaction."""
+"""The most batches of a part: it is held in memory, and deleted in one transaction."""
 
 MAX_ATTEMPTS = 5
 
@@ -325,10 +325,10 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
             continue
         rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
         with store.reading() as connection:
-            there = read_rows(connection, rows["batches"]["id"].to_pylist())
-        if not len(there["results"]):
+            present = read_rows(connection, rows["batches"]["id"].to_pylist())
+        if not len(present["results"]):
             continue
-        own, recorded = (set(each["results"]["id"].to_pylist()) for each in (rows, there))
+        own, recorded = (set(each["results"]["id"].to_pylist()) for each in (rows, present))
         if not own <= recorded:
             raise BadConfiguration(
                 f"{folder / path}: the database has some of its batches and lacks others: restore "

@@ -119,16 +119,16 @@ def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
     from psycopg.conninfo import make_conninfo
     from psycopg.pq import Conninfo
 
-    given = dialect.create_connect_args(url)[1]
-    password = given.pop("password", None)
-    if "sslpassword" in given:
+    options = dialect.create_connect_args(url)[1]
+    password = options.pop("password", None)
+    if "sslpassword" in options:
         raise BadConfiguration(
             "ACQUIRE_DATABASE: sslpassword: every user of the machine could read it while "
             "PostgreSQL's programs run; name a key without a passphrase"
         )
     # What else is given is for psycopg alone.
     known = {option.keyword.decode() for option in Conninfo.get_defaults()}
-    named = make_conninfo(**{name: value for name, value in given.items() if name in known})
+    named = make_conninfo(**{name: value for name, value in options.items() if name in known})
     secret = {} if password is None else {"PGPASSWORD": str(password)}
     return ["--no-password", f"--dbname={named}"], secret
 
@@ -147,8 +147,8 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
             f"{command[0]} was not found: backups of PostgreSQL need its client tools"
         ) from None
     if done.returncode:
-        said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {about}: {said}")
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {about}: {reason}")
     return done.stdout
 
 
@@ -160,7 +160,7 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
 SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
 """How the files begin."""
 BESIDE = ("-wal", "-shm", "-journal")
-"""What SQLite keeps beside a file: of another database it would be taken for this one's."""
+"""The files that SQLite keeps beside a file: another database's would be taken for this one's."""
 
 
 def restore(database: str, source: Path, step: Step = lambda left, total: None) -> str:
@@ -194,10 +194,10 @@ def _check_kind(source: Path, url: URL) -> None:
 
 
 def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
-    for there in (target, *(target.with_name(target.name + part) for part in BESIDE)):
-        if there.exists():
+    for path in (target, *(target.with_name(target.name + part) for part in BESIDE)):
+        if path.exists():
             raise BadConfiguration(
-                f"ACQUIRE_DATABASE: {there}: exists already; move it away, or name another file"
+                f"ACQUIRE_DATABASE: {path}: exists already; move it away, or name another file"
             )
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
@@ -265,12 +265,12 @@ def _restore_postgresql(source: Path, url: URL) -> str:
 
 
 def _entry(line: str) -> str:
-    """What a line of a backup's contents is about: of `5; 2615 2200 SCHEMA - public me` the end."""
+    """The subject of a line in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
     return " ".join(line.partition(";")[2].split(" ")[3:])
 
 
 def _makes_schema(line: str, schema: str) -> bool:
-    """Whether a line of a backup's contents makes a schema that the database has already."""
+    """True if a line of a backup's contents makes a schema that the database has already."""
     return _entry(line).startswith((f"SCHEMA - {schema} ", f"COMMENT - SCHEMA {schema} "))
 
 

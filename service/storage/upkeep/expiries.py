@@ -1,4 +1,4 @@
-"""What ends on a known day while the service runs: its table of leap seconds, and tokens."""
+"""Dates on which something ends while the service runs: its table of leap seconds, and tokens."""
 
 import logging
 from collections.abc import Callable
@@ -15,7 +15,7 @@ from service.times import LAST_YEAR, Utc, parse_utc, recorded_utc, shifted, utc_
 log = logging.getLogger(__name__)
 
 SOON_DAYS = 30
-"""From here on the service warns when it starts; the alert rules begin at the same time."""
+"""Days before an end from which the service warns when it starts; alert rules begin then, too."""
 DAY_S = 86_400.0
 _FIRST_YEAR = 2017
 
@@ -72,7 +72,7 @@ class ExpiryDates:
         self._now = now
 
     def dates(self) -> Expiries:
-        """What ends when."""
+        """The dates on which something ends."""
         with self._reading() as connection:
             return Expiries(leap_seconds_end().text, _tokens(connection, self._now().text))
 
@@ -80,20 +80,20 @@ class ExpiryDates:
         """Log a warning about each thing that ends soon, or has ended."""
         found, now = self.dates(), self._now()
         soon = shifted(now, SOON_DAYS * DAY_S).text
-        said = []
+        warnings = []
         if found.leap_seconds <= soon:
-            said.append(
+            warnings.append(
                 f"the table of leap seconds is certain until {found.leap_seconds} only: "
                 "install a newer pyerfa"
             )
-        said += [
+        warnings += [
             f"the token {each.name} expires at {each.expires}: create another and revoke this one"
             for each in found.tokens
             if each.ends_soon(now)
         ]
-        for each in said:
+        for each in warnings:
             log.warning(each)
-        return said
+        return warnings
 
 
 def _tokens(connection: Connection, moment: str) -> tuple[TokenTerm, ...]:

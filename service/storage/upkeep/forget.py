@@ -42,7 +42,7 @@ MOST_NAMES = 1_000
 
 @dataclass(frozen=True)
 class ForgetFilter:
-    """What is forgotten of a run: all of it, or only the named batches and gyro blocks."""
+    """The part of a run that is forgotten: all of it, or only the named batches and gyro blocks."""
 
     run: str
     spacecraft: str | None = None
@@ -51,7 +51,7 @@ class ForgetFilter:
 
     @property
     def is_whole(self) -> bool:
-        """Whether no batch and no block is named."""
+        """True if no batch and no block is named."""
         return not (self.batches or self.gyro_blocks)
 
     def of(self, table: Table, names: Collection[str] = (), name: str = "") -> list[Any]:
@@ -73,7 +73,7 @@ class ForgetFilter:
 
 
 def found(connection: Connection, selected: ForgetFilter) -> Forgotten:
-    """What is selected; raises `NotFound` where nothing is, or a name is not there."""
+    """The selected data; raises `NotFound` where nothing is, or a name is not there."""
     _require_names(connection, selected)
     counts = {
         name: int(connection.scalar(select(func.count()).select_from(table).where(*chosen)) or 0)

@@ -28,12 +28,12 @@ from service.times import HOUR_S, Utc, bucket_start
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
 MOST_BATCHES = 10_000
-"""Of one transaction: others that write the same hour, and on SQLite all others, wait for it."""
+"""The most batches that one transaction deletes: other writers of the hour, on SQLite all, wait."""
 _AT_ONCE = 1_000
 _BLOCKS_AT_ONCE = 100
-"""Of up to 240 kB each."""
+"""Blocks that one transaction deletes, of up to 240 kB each."""
 _DAYS_AT_ONCE = 10
-"""Of about 12 MB each."""
+"""Days that one transaction deletes, of about 12 MB each."""
 
 
 @dataclass
@@ -86,10 +86,10 @@ def prune(
     if dry_run:
         return pruned
     for hour, spacecraft, name in keys:
-        some = _of_an_hour(spacecraft, name, hour, before)
+        deletion = _of_an_hour(spacecraft, name, hour, before)
         deleted = MOST_BATCHES
         while deleted == MOST_BATCHES:
-            deleted = store.writer.change(some).result()
+            deleted = store.writer.change(deletion).result()
             pruned.batches += deleted
             step(pruned)
     while deleted := store.writer.change(partial(delete_blocks, chosen=old_blocks)).result():
@@ -123,14 +123,14 @@ def delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -
 
 def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
     """Delete some of the blocks that are chosen; how many."""
-    some = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
-    ids = list(connection.scalars(some))
+    chunk = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
+    ids = list(connection.scalars(chunk))
     connection.execute(delete(gyro_blocks).where(gyro_blocks.c.id.in_(ids)))
     return len(ids)
 
 
 def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[Connection], int]:
-    """What deletes the oldest batches of an hour, and returns how many."""
+    """A change that deletes the oldest batches of an hour, and returns how many."""
     start = bucket_start(hour, HOUR_S).tai_ns
     end = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
 

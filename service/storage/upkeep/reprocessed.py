@@ -65,11 +65,11 @@ class RunPart:
     shares: Mapping[int, Mapping[str, Row]]
     """The rollups by hour, of each tracker and of the `WHOLE`."""
     latest: Row
-    """What an event tells of the latest batch."""
+    """The latest batch, as an event tells it."""
 
 
 def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
-    """What there is to know of a part with these rows, whose file has this content."""
+    """The description of a part with these rows, whose file has this content."""
     found = rows["batches"]
     first = found.slice(0, 1).to_pylist()[0]
     part = msgspec.structs.replace(described(name, first["run"], rows, content), source=source)
@@ -85,7 +85,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """As `projections.projector` has it."""
+    """The latest batch, chosen as `projections.projector` does."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
@@ -106,8 +106,8 @@ def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
     for row in rows["tracker_values"].to_pylist():
         of.setdefault((of_batch[row["batch_id"]], row["tracker"]), []).append(row)
     found: dict[int, dict[str, Row]] = {}
-    for (hour, tracker), some in of.items():
-        found.setdefault(hour, {})[tracker] = rolled_up(some)
+    for (hour, tracker), group in of.items():
+        found.setdefault(hour, {})[tracker] = rolled_up(group)
     return found
 
 
@@ -139,8 +139,8 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     if connection.scalar(recorded.limit(1)) is not None:
         names = made.identities["batch"].to_pylist()
         for first in range(0, len(names), _AT_ONCE):
-            some = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
-            if known := look_up(connection, some).identities:
+            wanted = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
+            if known := look_up(connection, wanted).identities:
                 raise _taken(made, next(iter(known))[2])
     number = note_part(connection, spacecraft, made.part, path, made.identities)
     # Whoever counts an hour anew locks its rollup and then reads the shares.
@@ -150,9 +150,9 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
         content = whole_content(folder, path, made.part.sha256)
         for some_results in _as_recorded(from_partition(read_partition(content))):
             alarms.apply(connection, some_results)
-    told = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
-    told |= {"latest": made.latest}
-    events.add_event(connection, "batches", told, run=run, spacecraft=spacecraft)
+    fields = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
+    fields |= {"latest": made.latest}
+    events.add_event(connection, "batches", fields, run=run, spacecraft=spacecraft)
 
 
 def _taken(made: RunPart, what: str) -> BadConfiguration:
@@ -203,7 +203,7 @@ def _is_known(store: Store, path: str) -> bool:
 
 
 def _has_some(store: Store, ids: Sequence[str]) -> bool:
-    """Whether some batches are recorded, others of them perhaps pruned, or are archived."""
+    """True if some batches are recorded, others of them perhaps pruned, or are archived."""
     with store.reading() as connection:
         return any(
             connection.scalar(

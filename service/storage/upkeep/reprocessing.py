@@ -31,9 +31,9 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
     partitions: int
     partitions_done: int
     batches: int
-    """Of the selected period."""
+    """The number of batches of the selected period."""
     before: int
-    """Of them in the run before the command began."""
+    """How many of them were in the run before the command began."""
     recorded: int
     refused: int
     started: str

@@ -56,7 +56,7 @@ class PartFilter:
     end: Utc | None = None
 
     def takes(self, manifest: Manifest, part: Part) -> bool:
-        """Whether a part is selected."""
+        """True if a part is selected."""
         return (
             self.spacecraft in (None, manifest.spacecraft)
             and self.run in (None, part.run)
@@ -115,8 +115,8 @@ def restore(
 def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
     """Insert the rows of a part; False: they are there."""
     ids = rows["batches"]["id"].to_pylist()
-    some = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
-    if connection.scalar(some) is not None:
+    query = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
+    if connection.scalar(query) is not None:
         return False
     part_id = connection.scalar(
         select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
@@ -209,7 +209,7 @@ def _unnamed(day: Path, named: Container[str]) -> Iterator[str]:
 
 
 def _is_own(input: str, fingerprint: str) -> bool:
-    """Whether a fingerprint is that of an input; of one that cannot be read it is not."""
+    """True if a fingerprint is that of an input; of one that cannot be read it is not."""
     try:
         return fingerprint_of(input) == fingerprint
     except BadInput:

@@ -49,7 +49,7 @@ log = logging.getLogger(__name__)
 
 AT_ONCE = 50
 PAUSE_S = 0.25
-"""Between two steps of the service, each of which takes the writer some milliseconds."""
+"""The pause between two steps of the service, each of which takes the writer some milliseconds."""
 RETRY_S = 30.0
 LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
@@ -165,14 +165,14 @@ class BackgroundUpgrade:
         self._finish(self.digests.give, "older results were given digests")
         self._finish(self.splitter.split, "older batches were looked at and split by tracker")
 
-    def _finish(self, work: Callable[..., int], told: str) -> None:
+    def _finish(self, work: Callable[..., int], outcome: str) -> None:
         logged_s = time.monotonic()
 
         def log_progress(done: int) -> None:
             nonlocal logged_s
             if time.monotonic() - logged_s > LOG_EVERY_S:
                 logged_s = time.monotonic()
-                log.info("%d %s so far", done, told)
+                log.info("%d %s so far", done, outcome)
 
         while not self._stopping.is_set():
             try:
@@ -182,10 +182,10 @@ class BackgroundUpgrade:
                 continue
             except Exception:
                 # What is missing stays so, and is told of; everything else goes on.
-                log.exception("not all %s", told)
+                log.exception("not all %s", outcome)
                 return
             if done and not self._stopping.is_set():
-                log.info("%d %s", done, told)
+                log.info("%d %s", done, outcome)
             return
 
 
@@ -237,11 +237,11 @@ def _write(
     query = select(results.c.id, results.c.seq).where(results.c.id.in_(ids), results.c.current)
     current = dict(map(tuple, connection.execute(query)))
     of_batches = tracker_values.c.batch_id.in_([row["batch_id"] for row in rows])
-    there = set(connection.scalars(select(tracker_values.c.batch_id).where(of_batches)))
+    present = set(connection.scalars(select(tracker_values.c.batch_id).where(of_batches)))
     new = [
         (row["id"], values)
         for row in rows
-        if row["id"] in current and row["batch_id"] not in there
+        if row["id"] in current and row["batch_id"] not in present
         for values in split[row["id"]]
     ]
     insert_all(connection, tracker_values, [values for _, values in new])
@@ -266,7 +266,7 @@ class OlderDigests:
     store: Store
 
     def waiting(self) -> bool:
-        """Whether any is missing."""
+        """True if any is missing."""
         with self.store.reading_record() as connection:
             return any(
                 connection.execute(select(column).where(digest.is_(None)).limit(1)).first()
@@ -290,8 +290,8 @@ class OlderDigests:
         """
         self.store.writer.change(_give_to_settings).result()
         done = 0
-        while not is_stopped() and (given := self.store.writer.change(_give).result()):
-            done += given
+        while not is_stopped() and (made := self.store.writer.change(_give).result()):
+            done += made
             step(done)
             time.sleep(pause_s)
         return done
@@ -312,7 +312,7 @@ def _give(connection: Connection) -> int:
     solved = {row["result_id"]: row for row in _rows(connection, solutions, "result_id", ids)}
     sent = {row["id"]: row for row in _rows(connection, batches, "id", ids)}
     framed = {row["batch_id"]: row for row in _rows(connection, frames, "batch_id", ids)}
-    given = [
+    digests = [
         {
             "of": id,
             "given": made_later(
@@ -324,9 +324,9 @@ def _give(connection: Connection) -> int:
     chosen = results.c.id.in_(ids)
     seals.add(connection, chosen, -1)
     one = update(results).where(results.c.id == bindparam("of"))
-    connection.execute(one.values(digest=bindparam("given")), given)
+    connection.execute(one.values(digest=bindparam("given")), digests)
     seals.add(connection, chosen)
-    return len(given)
+    return len(digests)
 
 
 def _give_to_settings(connection: Connection) -> None:

@@ -122,8 +122,8 @@ def _of_the_file(engine: Engine) -> list[str]:
     found = []
     try:
         with engine.begin() as connection:
-            said = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
-            found = [f"the file is damaged: {each}" for each in said if each != "ok"]
+            lines = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
+            found = [f"the file is damaged: {each}" for each in lines if each != "ok"]
     except DatabaseError as error:
         found.append(f"the file is damaged: {error.orig}")
     return found
@@ -298,11 +298,11 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", is_solved: bool) -
         yield f"{name}: its attitude is missing, or there is one that its status denies"
     try:
         answer = msgspec.json.decode(row["answer"])
-        told = answer["id"], answer["counts"], (answer["attitude"] or {}).get("status")
+        stated = answer["id"], answer["counts"], (answer["attitude"] or {}).get("status")
     except (msgspec.DecodeError, KeyError, TypeError, AttributeError):
         yield f"{name}: its answer cannot be read"
         return
-    if told != (row["id"], {"observed": row["observed"], **counts}, row["status"]):
+    if stated != (row["id"], {"observed": row["observed"], **counts}, row["status"]):
         yield f"{name}: its answer says otherwise than its row"
 
 
@@ -337,8 +337,8 @@ def _of_the_missions(engine: Engine) -> Iterator[str]:
     """Settings and catalogs that are not what was recorded, under the digests that results name."""
     with engine.begin() as connection:
         rows = {t: connection.execute(select(t)).mappings().all() for t in SETTINGS}
-    for table, some in rows.items():
-        for row in some:
+    for table, table_rows in rows.items():
+        for row in table_rows:
             if not agrees(row["row_digest"], digest_of_row(table, dict(row))):
                 yield f"{table.name}, {row['digest']}: the row is not what was recorded"
     # See `Mission.digest`.
@@ -483,8 +483,8 @@ def of_the_gyro_blocks(engine: Engine) -> Iterator[str]:
             continue
         if block.fingerprint != row["fingerprint"]:
             yield f"{name}: its samples are not those that were fingerprinted"
-        told = row["start_ns"], row["end_ns"], row["end"]
-        if not rising or told != (int(times_ns[0]), int(times_ns[-1]), block.end.text):
+        stated = row["start_ns"], row["end_ns"], row["end"]
+        if not rising or stated != (int(times_ns[0]), int(times_ns[-1]), block.end.text):
             yield f"{name}: its times are not those of its samples"
         near = row["start_ns"] - SAME_TIME_NS
         place = row["spacecraft"], row["run"]

@@ -21,7 +21,7 @@ DEAD_KEPT = 10_000
 """Dead letters of one webhook; of more the oldest are deleted."""
 
 NUMBERS_AT_ONCE = 500
-"""In one statement."""
+"""The numbers in one statement."""
 
 _row = webhook_deliveries.c
 

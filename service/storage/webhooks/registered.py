@@ -246,7 +246,7 @@ def _counts() -> Any:
 
 
 def _state(row: Any, now: str, is_open: bool) -> tuple[WebhookStateName, str | None]:
-    """Whether anything is sent, and why not."""
+    """The state of a webhook, and the reason where nothing is sent."""
     if row["gone_at"] is not None:
         return "disabled", f"the receiver answered 410 Gone at {row['gone_at']}"
     if not row["enabled"]:

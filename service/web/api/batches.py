@@ -211,7 +211,7 @@ def what_if(
 compare_router = APIRouter(prefix="/api/v1", tags=["batches"])
 
 COMPARISON_S = 10.0
-"""Of one comparison; the rest is left out, and the answer says so."""
+"""The duration of one comparison; the rest is left out, and the answer says so."""
 
 SideOptions = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
 

@@ -84,8 +84,8 @@ class FrameQuery(Query):
 
     def known(self) -> FrameIn:
         """The same, checked as a batch's fields are; raises `BadBatch` with every fault."""
-        given = {name: text for name, text in self.asked().items() if text is not None}
-        return read_known({name: _value(name, text) for name, text in given.items()})
+        texts = {name: text for name, text in self.asked().items() if text is not None}
+        return read_known({name: _value(name, text) for name, text in texts.items()})
 
 
 _TEXTS = ("batch", "time", "run", "tracker", "aberration", "centroid", "image")

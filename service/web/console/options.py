@@ -47,7 +47,7 @@ class FormField:
 
     @property
     def changed(self) -> bool:
-        """Whether the value in the form differs from the setting."""
+        """True if the value in the form differs from the setting."""
         return bool(self.value != self.before)
 
 

@@ -106,16 +106,16 @@ class Layout:
     """The name of the signed-in token; None while access is open."""
     may_operate: bool = False
     address: str = ""
-    """Of the service, as the reader's browser has it."""
+    """The service's address, as the reader's browser has it."""
     alarms: "AlarmCounts | None" = None
     """Alarms of the run, which every page counts; None: of a page that shows no run."""
-    """Whether another service writes to the database."""
+    """True if another service writes to the database."""
     behind_s: float = 0.0
     """How far trends and alarms are behind the record, where they could not be waited for."""
 
     @property
     def is_live(self) -> bool:
-        """Whether live batches are shown and not those of a named run."""
+        """True if live batches are shown and not those of a named run."""
         return self.run == LIVE
 
     @property
@@ -131,7 +131,7 @@ class Layout:
 
 OFF = "off"
 EMPTY_LAYOUT = Layout(LIVE, (RunChoice(LIVE, None),), "", "", present())
-"""Of pages without a reader: sign in, and errors."""
+"""The layout of pages without a reader: sign in, and errors."""
 
 
 def open_layout(run: str, title: str, section: str) -> Layout:

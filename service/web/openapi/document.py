@@ -138,7 +138,7 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
 
 
 def _webhook(kind: str, data: type[Record]) -> dict[str, Any]:
-    """What a webhook sends of an event; the event stream has the same data."""
+    """The body that a webhook sends for an event; the event stream has the same data."""
     text = {"type": ["string", "null"]}
     fields = {
         "type": {"const": kind},

@@ -104,9 +104,9 @@ class ResponseDoc:
     also: str | None = None
     """Another media type that the client can ask for, as plain text or bytes."""
     tables: bool = False
-    """Whether the client can ask for it as a table in each of the output formats."""
+    """True if the client can ask for it as a table in each of the output formats."""
     attitudes: bool = False
-    """Whether the client can ask for it in each format of attitudes."""
+    """True if the client can ask for it in each format of attitudes."""
 
 
 def route_docs(

@@ -226,12 +226,12 @@ async def is_open(access: Access) -> bool:
     return await _within_deadline(access, lambda: access.is_open)
 
 
-async def _within_deadline(access: Access, ask: Callable[..., T], *given: object) -> T:
+async def _within_deadline(access: Access, ask: Callable[..., T], *arguments: object) -> T:
     """Run a look-up in a thread; raises `Busy` where it takes too long, or just did."""
     access.require_database()
     try:
         with fail_after(_LOOK_UP_S):
-            return await run_sync(ask, *given, limiter=_CALLER_THREADS, abandon_on_cancel=True)
+            return await run_sync(ask, *arguments, limiter=_CALLER_THREADS, abandon_on_cancel=True)
     except TimeoutError:
         access.database_timed_out()
         access.require_database()

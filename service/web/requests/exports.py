@@ -19,7 +19,7 @@ from service.products.tables import Table
 
 MAX_OF_ONE_TOKEN = 2
 MAX_EXPORTS = 8
-"""At a time, of all callers: each occupies a thread while it is written."""
+"""The most exports at a time, of all callers: each occupies a thread while it is written."""
 RETRY_AFTER_S = 5
 
 

@@ -224,7 +224,7 @@ def _unix_s(moment: str) -> float:
 
 
 def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
-    """What waits for each webhook, and whether anything is sent to it."""
+    """The number that waits for each webhook, and whether anything is sent to it."""
     labels = ("webhook", "name")
     active = GaugeMetricFamily(
         "starid_webhook_active",
@@ -255,7 +255,7 @@ def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
 
 
 def _of_attempts(counts: Mapping[tuple[str, str, Result], int]) -> Metric:
-    """What came of the attempts to deliver."""
+    """The outcomes of the attempts to deliver."""
     family = CounterMetricFamily(
         "starid_webhook_attempts",
         "Attempts to deliver an event to a webhook; of dead ones it was the last.",

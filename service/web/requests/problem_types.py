@@ -21,7 +21,7 @@ from service.gyro import SampleTaken
 
 @dataclass(frozen=True)
 class ProblemType:
-    """What all problems of one type share; a `slug` gives the type a page of its own.
+    """The common part of all problems of one type; a `slug` gives the type a page of its own.
 
     The page says what the problem means and what the client should do.
     """

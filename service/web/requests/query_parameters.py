@@ -240,7 +240,7 @@ class HistoryQuery(PeriodQuery):
 
     @property
     def of_every_batch(self) -> bool:
-        """Whether a table of all batches of the period is asked for."""
+        """True if a table of all batches of the period is asked for."""
         return self.format != JSON_FORMAT and self.size is None and self.strategy != "minmax"
 
     @field_validator("quantity")
@@ -359,7 +359,7 @@ async def require_no_query(request: Request) -> None:
 
 
 NO_QUERY = Depends(require_no_query)
-"""For a route that takes no parameter."""
+"""The dependency of a route that takes no parameter."""
 
 
 SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]

@@ -53,7 +53,7 @@ class BodyLimits:
 
     json_bytes: int = MAX_JSON_BYTES
     session_bytes: int = 4 << 10
-    """Of `POST /session`, which asks for no token."""
+    """The bytes of `POST /session`, which asks for no token."""
     small_bytes: int = 8 << 10
     """Bytes of each body that `budget_bytes` leaves out: a batch of 60 stars is never
     refused because of others."""
@@ -327,12 +327,12 @@ def _no_idempotency_key(message: str) -> Any:
 NO_IDEMPOTENCY_KEY = _no_idempotency_key(
     "belongs to new batches: a what-if that is recorded twice is there twice"
 )
-"""For a route where a repeat makes another result."""
+"""The dependency of a route where a repeat makes another result."""
 NO_KEY_OF_MANY = _no_idempotency_key(
     "belongs to one batch: of an array, each batch is recognised by its own batch id"
 )
-"""For a route that takes several batches."""
+"""The dependency of a route that takes several batches."""
 NO_KEY_OF_A_BLOCK = _no_idempotency_key(
     "belongs to batches: a gyro block is recognised by its own name"
 )
-"""For a route that takes gyro blocks."""
+"""The dependency of a route that takes gyro blocks."""

@@ -63,8 +63,8 @@ def least_spread(rows: Array, variance: float, count: int) -> float:
     prior = np.diag(1.0 / np.square(PRIOR))
     found = math.inf
     for chosen in combinations(range(len(rows)), count):
-        some = rows[list(chosen)]
-        covariance = np.linalg.inv(prior + some.T @ some / variance)
+        subset = rows[list(chosen)]
+        covariance = np.linalg.inv(prior + subset.T @ subset / variance)
         found = min(found, float(covariance[0, 0] + covariance[1, 1]))
     return found
 
@@ -83,7 +83,7 @@ class LearningEstimate:
     measurements: int = 0
 
     def updated(self, row: Array, value: float) -> "LearningEstimate":
-        """After one more measurement of noise as large as all others' (6.19, with sigma = 1)."""
+        """One more measurement added, of noise as large as all others' (6.19, with sigma = 1)."""
         surprise = value - float(row @ self.estimate.state)
         expected = 1.0 + float(row @ self.estimate.covariance @ row)
         return LearningEstimate(
@@ -114,7 +114,7 @@ def learning(unknowns: int) -> LearningEstimate:
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """Of 6.1 (4)."""
+    """The claims of 6.1 (4)."""
     rng = study.rng(61)
     u, v = grid_points(7)
     rows = HUMP.rows(u, v)
@@ -163,7 +163,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def _needed(rows: Array) -> float:
-    """After how many rows both errors together are as small as wanted."""
+    """The number of rows after which both errors together are as small as wanted."""
     spreads = spreads_along(rows, SIGMA**2)
     enough = np.flatnonzero(spreads < 2.0 * WANTED_SIGMA**2)
     return float(enough[0] + 1) if len(enough) else math.inf
@@ -191,7 +191,7 @@ def _learned(rng: np.random.Generator, trials: int) -> tuple[float, float, float
 
 
 def pictures() -> dict[str, Picture]:
-    """Of 6.1 (4)."""
+    """The figures of 6.1 (4)."""
     return {
         "imaging-order": Picture(
             "One sigma of the place after so many points, by the order in which they are measured.",

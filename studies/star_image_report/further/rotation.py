@@ -111,7 +111,7 @@ def _changes(reference: Array, state: Array) -> Array:
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """Of 3.2."""
+    """The claims of 3.2."""
     rng = study.rng(31)
     reference = field_image()
     off = 0.0
@@ -197,7 +197,7 @@ def _scatter(rng: np.random.Generator, reference: Array, trials: int) -> list[fl
 
 
 def pictures() -> dict[str, Picture]:
-    """Of 3.2."""
+    """The figures of 3.2."""
     return {
         "imaging-rotation": Picture(
             "phi of a field of four stars as one of k and theta moves alone; circles: by the "

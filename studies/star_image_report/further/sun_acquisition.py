@@ -29,7 +29,7 @@ class ThreeDetectors:
     acquire_arcmin: float = 48.0
     samples: int = 41
     threshold: float = 0.5
-    """Of the sun's light in the middle, from which on the sun counts as there."""
+    """The share of the sun's light in the middle from which on the sun counts as acquired."""
 
     @cached_property
     def nominal(self) -> tuple[float, float]:
@@ -50,13 +50,13 @@ class ThreeDetectors:
         less one: brightness of the sun and age of the screen cancel.
         """
         middle, flank = self.nominal
-        there = self.acquired_light(p_arcmin, q_arcmin)
-        if there < self.threshold * middle:
+        acquired = self.acquired_light(p_arcmin, q_arcmin)
+        if acquired < self.threshold * middle:
             return None
         # The tail along q tells p, and the other way round.
         return (
-            self.flank_light(q_arcmin, p_arcmin) / flank * middle / there - 1.0,
-            self.flank_light(p_arcmin, q_arcmin) / flank * middle / there - 1.0,
+            self.flank_light(q_arcmin, p_arcmin) / flank * middle / acquired - 1.0,
+            self.flank_light(p_arcmin, q_arcmin) / flank * middle / acquired - 1.0,
         )
 
     def slope_per_arcmin(self, step_arcmin: float = 0.5) -> float:
@@ -69,11 +69,11 @@ class ThreeDetectors:
     def direct_onflank_light(self) -> float:
         """Light on a flank's detector from a sun that shines on it directly, over its own light."""
         tracker = self.tracker
-        here = self.flank_light(tracker.out_arcmin, tracker.aside_arcmin)
-        return here / self.nominal[1]
+        light = self.flank_light(tracker.out_arcmin, tracker.aside_arcmin)
+        return light / self.nominal[1]
 
     def steered(self, p_arcmin: float, q_arcmin: float) -> tuple[float, float, int] | None:
-        """Where the loop leaves a sun at (p, q), and how many places the search looked at.
+        """The place where the loop leaves a sun at (p, q), and the number of places searched.
 
         A square spiral until the middle detector sees the sun, then steps along both signals.
         """
@@ -118,7 +118,7 @@ def _spiral(step_arcmin: float, reach_arcmin: float) -> list[tuple[float, float]
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """Of 5.3."""
+    """The claims of 5.3."""
     rng = study.rng(53)
     three = ThreeDetectors()
     slope = three.slope_per_arcmin()
@@ -160,7 +160,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def pictures() -> dict[str, Picture]:
-    """Of 5.3."""
+    """The figures of 5.3."""
     return {
         "imaging-three-detectors": Picture(
             "Three photodiodes: the two signals as the sun moves along p. They end where the "
@@ -174,9 +174,9 @@ def pictures() -> dict[str, Picture]:
 def _draw(figure: Any) -> None:
     three, axis = ThreeDetectors(), figure.subplots()
     off = np.linspace(-30.0, 30.0, 121)
-    told = [three.signals(float(p), 0.0) or (math.nan, math.nan) for p in off]
+    errors_pq = [three.signals(float(p), 0.0) or (math.nan, math.nan) for p in off]
     for name, color, signals in zip(
-        "pq", ("#0b5394", "#b45309"), zip(*told, strict=True), strict=True
+        "pq", ("#0b5394", "#b45309"), zip(*errors_pq, strict=True), strict=True
     ):
         axis.plot(off, signals, color=color, label=f"signal of {name}")
     light = [three.acquired_light(float(p), 0.0) / three.nominal[0] for p in off]

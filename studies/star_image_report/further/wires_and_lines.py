@@ -116,7 +116,7 @@ def contrast_of_orders(spectrum: Spectrum) -> float:
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """Of 4.3."""
+    """The claims of 4.3."""
     cells = 1200 if study.quick else 1500
     p = np.linspace(0.8 * LASER_M / THICK_M, 2.6 * LASER_M / THIN_M, 240)
     fringe = 2.0 * LASER_M / DIAMETER_M
@@ -173,7 +173,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def pictures() -> dict[str, Picture]:
-    """Of 4.3."""
+    """The figures of 4.3."""
     return {
         "imaging-third-wire": Picture(
             "The tail of two and of three wires in laser light, and of three in the light of six "

@@ -40,7 +40,7 @@ class ZoneEdge:
 
 @dataclass(frozen=True)
 class Track:
-    """Where one tracker looked: a line through its boresights, and marks by outcome."""
+    """The directions of one tracker: a line through its boresights, and marks by outcome."""
 
     tracker: str
     line: Path

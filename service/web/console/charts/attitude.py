@@ -100,7 +100,7 @@ def _sigma_rad(covariance_arcsec2: Vector) -> Vector:
 
 
 def _is_near(time_ns: npt.NDArray[np.int64], follows: Flags) -> Flags:
-    """Which moments are no farther from the one before than is usual among neighbours."""
+    """Marks of the moments as near to the one before as is usual among neighbours."""
     step = np.diff(time_ns, prepend=time_ns[0])
     usual = float(np.median(step[follows])) if follows.any() else 0.0
     return np.asarray(step <= GAP * usual)
@@ -212,7 +212,7 @@ def band_path(
             k = int(part[0])
             text.append(f"M{x[k] - 1} {upper[k]}h2V{lower[k]}h-2z")
             continue
-        there = line_path(x[part], upper[part])
+        forward = line_path(x[part], upper[part])
         back = line_path(x[part][::-1], lower[part][::-1])
-        text.append(f"{there}L{back[1:]}z")
+        text.append(f"{forward}L{back[1:]}z")
     return "".join(text)

@@ -17,7 +17,7 @@ from service.web.console.charts.attitude import HEIGHT, PAD, WIDTH, band_path, l
 
 Mask = npt.NDArray[np.bool_]
 FINE_HEIGHT = 10 * HEIGHT
-"""Of panels whose values are read to a thousandth of their range."""
+"""The height of panels whose values are read to a thousandth of their range."""
 DAY_S = 86_400
 TIME_STEPS_S = (
     *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
@@ -107,7 +107,7 @@ class TimeAxis:
 
 @dataclass(frozen=True)
 class Scale:
-    """From values to heights; logarithmic or linear, between `low` and `high`."""
+    """A scale from values to heights; logarithmic or linear, between `low` and `high`."""
 
     low: float
     high: float
@@ -189,7 +189,7 @@ def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> 
 
 
 def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
-    """Which moments (n,) belong together with the one before.
+    """Marks of the moments (n,) that belong together with the one before.
 
     They do unless they are farther apart than three parts of the period and three times what
     is usual, or `same` (n,) says that they are not of the same stretch.
@@ -235,7 +235,7 @@ class Strip:
 
 
 def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
-    """Which model the filter had, and what both grades are worth."""
+    """Strips of the filter's model, and of the quality of both grades."""
     drawn = [
         Strip(
             "model",

@@ -310,7 +310,7 @@ def _median(values: Vector) -> float:
 
 DEGREES = 3
 INSIDE = 0.95
-"""Of the measurements are between the lower two bounds, where the covariances are right."""
+"""The share of measurements between the lower two bounds, where the covariances are right."""
 
 
 @lru_cache(maxsize=1)

@@ -19,7 +19,7 @@ LONGEST_ARROW = 70.0
 """Pixels of the longest residual arrow."""
 ROUND = (1.0, 2.0, 5.0)
 MARK_RADIUS = 13.0
-"""Of the mark about an observed star; a triangle's corners reach a little farther."""
+"""The radius of the mark about an observed star; a triangle's corners reach a little farther."""
 RIVAL_MARGIN = 6.0
 
 
@@ -37,7 +37,7 @@ Circle = tuple[float, float, float]
 GAPS = (14.0, 22.0, 32.0, 44.0, 60.0)
 """Pixels from a star to its text, the nearest first."""
 ASIDE = 0.75
-"""Of the gap, where the text stands diagonally from its star."""
+"""The share of the gap, where the text stands diagonally from its star."""
 ABOUT_NUMBERS = ((-1, -1), (1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0), (0, -1), (0, 1))
 ABOUT_NAMES = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
 """Directions from a star, to the right and downwards, the best first."""
@@ -167,7 +167,7 @@ AXES: tuple[Box, ...] = (
     (SIZE - 30.0, SIZE / 2 - 20.0, SIZE, SIZE / 2 - 2.0),
     (SIZE / 2, 0.0, SIZE / 2 + 34.0, 18.0),
 )
-"""Where the names of the axes stand."""
+"""The boxes of the names of the axes."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ class Ring:
 
     @property
     def label_at(self) -> tuple[float, float]:
-        """Where the label begins: at the top of the circle."""
+        """The point where the label begins: at the top of the circle."""
         return SIZE / 2 + 3, SIZE / 2 - self.radius - 3
 
 

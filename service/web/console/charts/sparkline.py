@@ -11,7 +11,7 @@ from service.vectors import Matrix, Vector
 WIDTH, HEIGHT = 128, 22
 PAD = 2
 TOPS = (0.05, 0.1, 0.25, 0.5, 1.0)
-"""What the top of a sparkline may stand for: a handful of stars shall not look like a lot."""
+"""Values for the top of a sparkline: a handful of stars shall not look like a lot."""
 
 
 @dataclass(frozen=True)

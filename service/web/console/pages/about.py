@@ -23,7 +23,7 @@ from service.web.requests.access import Policy
 LEAST_FREE = 0.1
 """The share of the disk, and of the memory, below which there is little room left."""
 MEMORY, OWN_MEMORY = Path("/proc/meminfo"), Path("/proc/self/statm")
-"""Of Linux alone; elsewhere the page has no line about memory."""
+"""Files of Linux alone; elsewhere the page has no line about memory."""
 SLOW_QUEUE_S = 5.0
 ENDS_SOON_S = 30 * 86_400.0
 
@@ -40,7 +40,7 @@ class Check:
 
 @console_page("/about", "Service", Policy("read", "nothing"), position=80)
 def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
-    """Whether the service is well, its version, catalog, missions, database and credits."""
+    """The service's health, version, catalog, missions, database and credits."""
     about = context.app.service.about(context.caller.spacecraft)
     # Queues and machine tell what others send: a token of some spacecraft does not see them.
     checks = list(_checks(context)) if context.caller.spacecraft is None else []

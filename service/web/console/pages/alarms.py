@@ -162,7 +162,7 @@ def _matches(alarm: Alarm, query: AlarmsQuery) -> bool:
 
 
 def _sorted(lines: list[AlarmLine], query: AlarmsQuery) -> list[AlarmLine]:
-    """In the asked order; of equals, those that left their limits last come first."""
+    """The alarms in the asked order; of equals, those that left their limits last come first."""
     keys: dict[Order, Callable[[AlarmLine], Any]] = {
         "last": lambda line: (line.last[1] is None, line.last_ns),
         "severity": lambda line: Severity[line.alarm.severity.upper()],
@@ -239,7 +239,7 @@ def alarm_page(
 
 
 def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
-    """Whether the alarm is about a tracker that has a history of its own."""
+    """True if the alarm is about a tracker that has a history of its own."""
     known = alarm.spacecraft in context.app.context.known
     return known and alarm.tracker in context.app.context.trackers(alarm.spacecraft)
 

@@ -97,7 +97,7 @@ class Field:
     text: Markup
     is_required: bool
     place: str = ""
-    """Of a parameter: `path`, `query` or `header`."""
+    """Where a parameter stands: `path`, `query` or `header`."""
 
 
 @dataclass(frozen=True)

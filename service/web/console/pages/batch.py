@@ -43,7 +43,7 @@ VIEWS = ("all", "field")
 """The content of the chart: all candidates of the answer, or the field of view alone."""
 
 SCALE = 3.0
-"""What the bars of the trackers' residuals reach to at least, in predicted residuals."""
+"""The least range of the bars of the trackers' residuals, in predicted residuals."""
 
 ResultId = Annotated[str, Path()]
 
@@ -61,7 +61,7 @@ class VoteRow:
 
     @property
     def changed(self) -> bool:
-        """Whether a what-if identifies it differently."""
+        """True if a what-if identifies it differently."""
         return self.before is not None and (
             (self.found.outcome, self.found.star) != (self.before.outcome, self.before.star)
         )
@@ -108,7 +108,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         measured=record.input.get("measurement"),
         charts=[sky_chart(each, field.through, view) for each in field.trackers],
         view=view,
-        here=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
+        link_to=lambda **more: f"/batches/{id}?{urlencode(query | more)}",
         field=field,
         fields=fields,
         options=options.model_dump(exclude_none=True, exclude_unset=True),
@@ -123,7 +123,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
 
 
 def _adoption(before: Answer, after: Answer) -> list[str]:
-    """What adopting a what-if will change, in sentences."""
+    """The changes that adopting a what-if will make, in sentences."""
     words = ("unique", "ambiguous", "unmatched")
     changes = [
         f"{word} stars {getattr(before.counts, word)} to {getattr(after.counts, word)}"

@@ -53,7 +53,7 @@ class DrawnRates:
 
     @property
     def cells(self) -> str:
-        """What a point of a sparkline counts, in words."""
+        """The unit that a point of a sparkline counts, in words."""
         days = self.rates.cell_s // DAY_S
         return {0: "hours", 1: "days"}.get(days, f"periods of {days} days")
 

@@ -65,7 +65,7 @@ class GradeOfFile:
 
     @property
     def is_shattered(self) -> bool:
-        """Whether a file falls into more stretches than a tenth of its attitudes."""
+        """True if a file falls into more stretches than a tenth of its attitudes."""
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
 

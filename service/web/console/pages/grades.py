@@ -27,14 +27,14 @@ JOBS = 8
 
 @dataclass(frozen=True)
 class Drawn:
-    """What the page draws of a period."""
+    """The drawings of a period."""
 
     found: GradesOfPeriod
     charts: list[GradeChart]
     innovations: list[GradeChart]
     strips: list[Strip]
     ticks: list[tuple[float, str]]
-    """Of the time: percent from the left, and their text."""
+    """The ticks of the time axis: percent from the left, and their text."""
 
 
 @console_page(

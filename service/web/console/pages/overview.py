@@ -41,9 +41,9 @@ SHOWN: dict[Shown, str] = {
     "no_batches": "no batches",
 }
 MARKED_SHARE = 0.15
-"""Of ambiguous or unmatched stars in the last hour: as shipped, the bound of `watch`."""
+"""The share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
 _STATES = ("good", "suspect", "no_attitude")
-"""From the best to the worst."""
+"""States from the best to the worst."""
 SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
@@ -73,12 +73,12 @@ class OverviewLine:
 
     @property
     def is_silent(self) -> bool:
-        """Whether the service has received no live batch of it for long."""
+        """True if the service has received no live batch of it for long."""
         return self.is_live and not self.item.retired and _is_long(self.item.received_age_s)
 
     @property
     def is_stale(self) -> bool:
-        """Whether it is silent or behind the run; a retired one sends nothing any more."""
+        """True if it is silent or behind the run; a retired one sends nothing any more."""
         return self.is_silent or (not self.item.retired and _is_long(self.item.age_s))
 
     @property
@@ -88,7 +88,7 @@ class OverviewLine:
 
     @property
     def in_trouble(self) -> bool:
-        """Whether it needs a look: out of limits, without a good attitude, or behind."""
+        """True if it needs a look: out of limits, without a good attitude, or behind."""
         item = self.item
         return bool(item.alarms_now) or self.is_stale or item.state in ("suspect", "no_attitude")
 
@@ -108,7 +108,7 @@ class OverviewLine:
         return float(getattr(counts, outcome)) / counts.observed
 
     def is_marked(self, outcome: str) -> bool:
-        """Whether the share of an outcome needs attention."""
+        """True if the share of an outcome needs attention."""
         return outcome != "unique" and self.share(outcome) > MARKED_SHARE
 
 
@@ -209,7 +209,7 @@ def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
 
 
 def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:
-    """In the asked order; the worst or the greatest first, names from A on."""
+    """The spacecraft in the asked order; the worst or the greatest first, names from A on."""
     ordered = sorted(lines, key=lambda line: line.item.name)
     if query.sort == "name":
         return ordered[::-1] if query.descending else ordered

@@ -81,7 +81,7 @@ class SpacecraftQuery(PageQuery):
 
     @property
     def kept(self) -> dict[str, str | None]:
-        """What stays in the address while the period changes."""
+        """The query parameters that stay in the address while the period changes."""
         return {
             "by": self.by,
             "tracker": self.tracker,
