@@ -322,6 +322,18 @@ def in_a_tiff(data):
     return head.ljust(512, b"\0") + data
 
 
+@pytest.mark.parametrize(("tag", "value"), [(278, 40), (278, 15), (278, 17), (278, 8), (257, 70)])
+def test_strips_of_jpeg_data_out_of_their_places_are_refused(rng, tag, value):
+    """With other rows a strip, or more rows of all, libtiff leaves rows out without an error."""
+    greys = np.kron(rng.integers(60, 190, (15, 16)), np.ones((4, 4))).astype(np.uint8)
+    file = io.BytesIO()
+    Image.fromarray(greys).save(file, "TIFF", compression="jpeg", strip_size=64 * 16)
+    data = file.getvalue()
+    assert read(data).counts.shape == (60, 64)
+    with pytest.raises(BadFile, match="strips"):
+        read(with_tag(data, tag, value))
+
+
 def test_a_jpeg_may_end_in_zeros_where_ones_are_usual(rng):
     read_ones = 0
     for _ in range(8):

@@ -197,18 +197,33 @@ def _colours(page: Any) -> int:
     raise bad_frame("has samples that are not named as colours", f"{samples} samples a pixel")
 
 
+def _segment_size(page: Any) -> tuple[int, int, int]:
+    """Rows and columns of a strip or tile, and how many stand below each other.
+
+    Raises `BadFile` where there are more or fewer than the size of the page needs, or where
+    they lie over each other.
+    """
+    planes, _, rows, columns, _ = page.shaped
+    tall, wide = (
+        (page.tilelength, page.tilewidth) if page.is_tiled else (page.rowsperstrip, columns)
+    )
+    down, across = -(-rows // tall), -(-columns // wide)
+    if not len(page.dataoffsets) == len(page.databytecounts) == planes * down * across:
+        message = "has another number of strips or tiles than its size needs"
+        raise bad_frame(
+            message, f"{len(page.dataoffsets)} where {planes * down * across} are needed"
+        )
+    _require_apart(page)
+    return tall, wide, down
+
+
 def _segments(page: Any, file: IO[bytes], packed: Any) -> Iterator[tuple[int, bytes]]:
     """Each strip or tile by its number, unpacked; raises `BadFile` for one of another size."""
-    planes, _, rows, columns, contiguous = page.shaped
+    _, _, rows, _, contiguous = page.shaped
     item = contiguous * page.dtype.itemsize
     tiled = page.is_tiled
-    tall, wide = (page.tilelength, page.tilewidth) if tiled else (page.rowsperstrip, columns)
-    down, across = -(-rows // tall), -(-columns // wide)
+    tall, wide, down = _segment_size(page)
     offsets, sizes = page.dataoffsets, page.databytecounts
-    if not len(offsets) == len(sizes) == planes * down * across:
-        message = "has another number of strips or tiles than its size needs"
-        raise bad_frame(message, f"{len(offsets)} where {planes * down * across} are needed")
-    _require_apart(page)
     end = file.seek(0, os.SEEK_END)
     for index, (at, size) in enumerate(zip(offsets, sizes, strict=True)):
         high = tall if tiled else min(tall, rows - index % down * tall)
@@ -286,11 +301,33 @@ def _by_pillow(file: IO[bytes], number: int) -> tuple[CountArray, float]:
 
 
 def _require_whole_segments(page: Any, file: IO[bytes], limits: FrameLimits) -> None:
-    """Raise `BadFile` for a page whose strips or tiles of JPEG data are damaged."""
+    """Raise `BadFile` for a page whose strips or tiles of JPEG data are damaged or out of place."""
     tables = page.jpegtables[:-2] if page.jpegtables else b"\xff\xd8"
-    for at, size in zip(page.dataoffsets, page.databytecounts, strict=True):
+    tall, wide, down = _segment_size(page)
+    for index, (at, size) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
         file.seek(at)
-        require_whole(tables + file.read(size)[2:], limits.max_pixels)
+        data = tables + file.read(size)[2:]
+        require_whole(data, limits.max_pixels)
+        # The last strip may be as tall as the others, or hold its own rows alone.
+        left = page.imagelength - index % down * tall
+        if _jpeg_size(data) not in (
+            (wide, tall),
+            (wide, tall if page.is_tiled else min(tall, left)),
+        ):
+            raise bad_frame(
+                "has strips or tiles of JPEG data that are of another size than it says"
+            )
+
+
+def _jpeg_size(data: bytes) -> tuple[int, int]:
+    """Columns and rows that the header of JPEG data states."""
+    at = 2
+    while True:
+        marker, length = struct.unpack_from(">HH", data, at)
+        if 0xFFC0 <= marker <= 0xFFCF and marker not in (0xFFC4, 0xFFC8, 0xFFCC):
+            rows, columns = struct.unpack_from(">HH", data, at + 5)
+            return columns, rows
+        at += 2 + length
 
 
 def _page_exposure(page: Any) -> tuple[str | None, float | None]:
