@@ -283,4 +283,4 @@ def no_changes_text(advice: Advice) -> str:
         return "No line of the mission file corrects these findings: each sentence says what to do."
     if "wait" in actions:
         return "The batches so far give no reason to change the mission file."
-    return "Nothing in the mission file needs to change."
+    return "The mission file needs no change."

@@ -87,10 +87,10 @@ class _Sink:
         return self._size
 
     def flush(self) -> None:
-        """Nothing waits."""
+        """Do nothing: this file holds no data back."""
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: this file holds no resource."""
 
 
 # Tables as a FITS binary table (FITS standard 4.0).

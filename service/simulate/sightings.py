@@ -92,7 +92,7 @@ class RealSky:
             known.pm_dec_mas_per_year[row],
             time.julian_year - J2000_YEAR,
         )
-        # What is not known, or measured below zero, is as good as at infinity.
+        # A star whose parallax is unknown, or was measured below zero, counts as infinitely far.
         parallax = np.fmax(known.parallax_mas[row], 0.0) / (1000.0 * ARCSEC_PER_RADIAN)
         seen = unit(geometric - parallax[:, None] * observer_position_au(time, position_km))
         return unit(np.add.reduceat(self.light[place, None] * seen, start) if len(star) else seen)

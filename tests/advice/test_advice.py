@@ -96,7 +96,7 @@ def test_a_tracker_whose_noise_grows_does_not_fit_and_no_sigma_is_advised(
     assert "Look at the tracker first" in noise.text
     assert row.changes == []
     text = advice_text(row)
-    assert "Nothing in the mission file needs to change" not in text
+    assert "The mission file needs no change" not in text
     assert "sigma_arcsec =" not in text
 
 

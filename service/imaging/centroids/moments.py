@@ -197,8 +197,8 @@ BLEND_SHARE = 0.01
 def is_blended(found: Fit, psf: Psf) -> bool:
     """True if pixels hold light beside the star that its shape does not explain.
 
-    What is left after the star is taken off, at its best place, is searched for a
-    second one of the same shape about every pixel.
+    The model of the star at its best place is subtracted; then each pixel is tried as the place
+    of a second star of the same shape.
     """
     region = found.region
     du, dv = region.du - (found.u_px - region.column), region.dv - (found.v_px - region.row)

@@ -340,11 +340,12 @@ class _DateCards:
         value = self.header.cards[key]
         scale = self._scale()
         if key.startswith("MJD"):
-            is_number = isinstance(value, (int, float)) and not isinstance(value, bool)
-            if not is_number or not 41317.0 <= float(value) <= 88069.0:  # type: ignore[arg-type]
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
                 return None
-            day = int(float(value))  # type: ignore[arg-type]
-            return _converted(2400000.5 + day, float(value) - day, scale)  # type: ignore[arg-type]
+            if not 41317.0 <= value <= 88069.0:
+                return None
+            day = int(value)
+            return _converted(2400000.5 + day, float(value) - day, scale)
         if not isinstance(value, str):
             return None
         clock = next((self.header.cards[k] for k in TIMES_OF_DAY if k in self.header.cards), None)

@@ -59,7 +59,9 @@ class FrameSummary(Record, frozen=True, kw_only=True):
     hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
     timings_us: FrameTimings
     remarks: (
-        Annotated[list[str], doc("What was fitted, chosen of the file, or turned, in words.")]
+        Annotated[
+            list[str], doc("What the service fitted, chose of the file, or turned, in words.")
+        ]
         | UnsetType
     ) = UNSET
 

@@ -194,7 +194,7 @@ class Projector:
         try:
             return self._waited()
         except Busy:
-            # What is recorded cannot be read now, what is projected perhaps can.
+            # The database does not give the record now; the projections may still be readable.
             return time.monotonic() - self._up_to_date_s
 
     def _waited(self) -> float:

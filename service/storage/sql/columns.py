@@ -69,7 +69,8 @@ def pack(text: str) -> bytes:
 def unpack(stored: str | bytes) -> str:
     """The text of what is stored, which an earlier version left as it was.
 
-    What was damaged gives some other text: whoever reads it finds no JSON, `verify` no digest.
+    Damaged bytes give another text: its reader finds that it is no JSON, and `verify` that its
+    digest is wrong.
     """
     if isinstance(stored, str):
         return stored

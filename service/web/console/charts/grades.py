@@ -321,7 +321,8 @@ def chi_square_bounds() -> tuple[float, float, float]:
 
     tail = (1.0 - INSIDE) / 2.0
     gate = FilterSettings().gate_tail
-    return tuple(float(chdtri(DEGREES, each)) for each in (1.0 - tail, tail, gate))  # type: ignore[return-value]
+    low, high, most = (float(chdtri(DEGREES, each)) for each in (1.0 - tail, tail, gate))
+    return low, high, most
 
 
 def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[GradeChart]:
