@@ -7,6 +7,7 @@ the same JSON as that of an NDJSON file, so that the same checks hold for it.
 
 import csv
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, TextIO
 
@@ -47,7 +48,7 @@ BATCH_ROWS = RowKind(
 )
 
 
-class JoinedRows:
+class JoinedRows(ABC):
     """The rows of one batch or gyro block as they come in; a bad cell refuses all of them."""
 
     key_columns: ClassVar[tuple[str, ...]]
@@ -70,13 +71,13 @@ class JoinedRows:
             except BadCell as bad:
                 self.refuse(number, bad.fault(number))
 
+    @abstractmethod
     def take(self, row: CsvRow) -> None:
         """Take the cells of a row; raises `BadCell`."""
-        raise NotImplementedError
 
+    @abstractmethod
     def body(self) -> Mapping[str, Any]:
         """The JSON object of all rows."""
-        raise NotImplementedError
 
     def refuse(self, number: int, fault: Fault) -> None:
         """Refuse all rows for a fault, unless they are refused already."""
