@@ -18,7 +18,6 @@ from service.storage.archive.reading import holds_any
 from service.storage.grades.days import (
     DayKey,
     DefinitiveJob,
-    DefinitiveJobList,
     GradedDayRow,
     Innovation,
     current_day,
@@ -237,16 +236,16 @@ class DefinitiveAttitudes:
             self._worker.submit(self._make, job.id, _Wanted(spacecraft, run, start, end))
         return job
 
-    def all(self, spacecraft: str) -> DefinitiveJobList:
+    def all(self, spacecraft: str) -> list[DefinitiveJob]:
         """The jobs of a spacecraft, the newest first."""
         self._context.mission(spacecraft)
         with self._lock:
             found = [each for each in self._jobs.values() if each.spacecraft == spacecraft]
-        return DefinitiveJobList(items=found[::-1])
+        return found[::-1]
 
     def get(self, spacecraft: str, id: str) -> DefinitiveJob:
         """One job; raises `NotFound`."""
-        for job in self.all(spacecraft).items:
+        for job in self.all(spacecraft):
             if job.id == id:
                 return job
         raise NotFound(f"{spacecraft} has no job {id[:40]!r} since the start of the service")

@@ -162,6 +162,7 @@ class CalibrationResult(Record, frozen=True, kw_only=True):
 class CalibrationProgress(Record, frozen=True, kw_only=True):
     """What every calibration has from its start on."""
 
+    component: ClassVar[str] = ""
     id: Id
     spacecraft: str
     version: Annotated[Count, doc("From 1 for each spacecraft.")]

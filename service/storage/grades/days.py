@@ -4,10 +4,11 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 import numpy as np
+from msgspec import Struct
 from pydantic import Field
 from sqlalchemy import Connection, delete, func, insert, select, update
 
@@ -33,6 +34,8 @@ from service.storage.models.base import (
     Record,
     Stamp,
     doc,
+    list_record,
+    page_record,
 )
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
@@ -56,7 +59,7 @@ class DayKey:
         return [c.spacecraft == self.spacecraft, c.run == self.run, c.day == self.day]
 
 
-class GradedStretchInfo(Record, frozen=True, kw_only=True):
+class GradedStretchInfo(Struct, frozen=True, kw_only=True):
     """An unbroken stretch of a day."""
 
     model: Annotated[
@@ -68,7 +71,7 @@ class GradedStretchInfo(Record, frozen=True, kw_only=True):
     good: Annotated[dict[str, int], doc("Samples of each grade whose status is good.")]
 
 
-class DaySummary(Record, frozen=True, kw_only=True):
+class DaySummary(Struct, frozen=True, kw_only=True):
     """What became of what was recorded of a day."""
 
     stretches: list[GradedStretchInfo]
@@ -86,7 +89,7 @@ class DaySummary(Record, frozen=True, kw_only=True):
     ]
 
 
-class GradedDayRow(Record, frozen=True, kw_only=True):
+class GradedDayRow(Struct, frozen=True, kw_only=True):
     """A day of filtered and smoothed attitudes."""
 
     id: Id
@@ -104,7 +107,6 @@ class GradedDayRow(Record, frozen=True, kw_only=True):
 class Innovation(Record, frozen=True, kw_only=True):
     """How a measured attitude met the filter, and how it differs from the smoothed attitude."""
 
-    component: ClassVar[str] = "Innovation"
     time: Moment
     outcome: Annotated[
         str,
@@ -134,18 +136,12 @@ class Innovation(Record, frozen=True, kw_only=True):
     revision: Annotated[int, Field(ge=1), doc("Of the day.")]
 
 
-class InnovationPage(Record, frozen=True, kw_only=True):
-    """A page of innovations."""
-
-    component: ClassVar[str] = "InnovationPage"
-    items: list[Innovation]
-    next_cursor: str | None
+InnovationPage = page_record("InnovationPage", Innovation, "A page of innovations.")
 
 
 class DefinitiveJob(Record, frozen=True, kw_only=True):
     """The making of a definitive attitude: filtered and smoothed attitudes of recorded days."""
 
-    component: ClassVar[str] = "DefinitiveJob"
     id: Id
     spacecraft: str
     run: str
@@ -163,11 +159,9 @@ class DefinitiveJob(Record, frozen=True, kw_only=True):
     fault: str | None
 
 
-class DefinitiveJobList(Record, frozen=True, kw_only=True):
-    """Jobs since the start of the service, the newest first."""
-
-    component: ClassVar[str] = "DefinitiveJobList"
-    items: list[DefinitiveJob]
+DefinitiveJobList = list_record(
+    "DefinitiveJobList", DefinitiveJob, "Jobs since the start of the service, the newest first."
+)
 
 
 def current_day(connection: Connection, key: DayKey) -> GradedDayRow | None:

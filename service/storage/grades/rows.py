@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
@@ -143,7 +143,6 @@ def _repeated(value: str | None, n: int) -> Any:
 class LiveAttitude(Record, frozen=True, kw_only=True):
     """The filtered attitude of a spacecraft at the last epoch of its live data."""
 
-    component: ClassVar[str] = "LiveAttitude"
     spacecraft: str
     time: Annotated[Moment, doc("Of the last gyro sample or, without a gyro, measurement.")]
     quaternion: Quaternion

@@ -2,7 +2,7 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from service.storage.models.base import Id, Record, Stamp, doc
+from service.storage.models.base import Id, Record, Stamp, doc, list_record, page_record
 
 Scope = Literal["read", "submit", "operate"]
 
@@ -10,7 +10,6 @@ Scope = Literal["read", "submit", "operate"]
 class Session(Record, frozen=True, kw_only=True):
     """The caller and its scopes."""
 
-    component: ClassVar[str] = "Session"
     name: Annotated[
         str | None, doc("The token's name, which the audit list records with each change.")
     ]
@@ -26,7 +25,6 @@ TokenState = Literal["good", "expired", "revoked"]
 class Token(Record, frozen=True, kw_only=True):
     """A token without its secret, of which only a digest is stored."""
 
-    component: ClassVar[str] = "Token"
     name: Annotated[str, doc("The audit list records changes under it; never used again.")]
     scopes: list[Scope]
     spacecraft: Annotated[
@@ -42,15 +40,10 @@ class Token(Record, frozen=True, kw_only=True):
 class NewToken(Token, frozen=True, kw_only=True):
     """A new token with its secret, which is shown this once."""
 
-    component: ClassVar[str] = "NewToken"
     token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
 
 
-class TokenList(Record, frozen=True, kw_only=True):
-    """All tokens, the oldest first."""
-
-    component: ClassVar[str] = "TokenList"
-    items: list[Token]
+TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
 
 
 class AuditEntry(Record, frozen=True, kw_only=True):
@@ -66,9 +59,4 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
 
 
-class AuditPage(Record, frozen=True, kw_only=True):
-    """A page of changes."""
-
-    component: ClassVar[str] = "AuditPage"
-    items: list[AuditEntry]
-    next_cursor: str | None
+AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")

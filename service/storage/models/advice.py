@@ -18,7 +18,6 @@ Size = Literal["too_small", "fits", "too_large", "no_verdict"]
 class Estimate(Record, frozen=True, kw_only=True):
     """An estimate with its 95 % interval; null if the sample does not bound it."""
 
-    component: ClassVar[str] = "Estimate"
     value: float
     low: float | None
     high: float | None
@@ -27,7 +26,6 @@ class Estimate(Record, frozen=True, kw_only=True):
 class ToleranceAdvice(Record, frozen=True, kw_only=True):
     """A tolerance, compared with the differences between measurements and catalog."""
 
-    component: ClassVar[str] = "ToleranceAdvice"
     tolerance: Annotated[str, doc("The name in the mission file.")]
     symbol: Annotated[str, doc("The symbol of Fink & Shoup (1994).")]
     unit: Literal["deg", "mag"]
@@ -52,7 +50,6 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
 class GroupAdvice(Record, frozen=True, kw_only=True):
     """Findings that no setting can correct: two groups of stars, mirrored axes."""
 
-    component: ClassVar[str] = "GroupAdvice"
     action: Action
     text: Text
 
@@ -60,7 +57,6 @@ class GroupAdvice(Record, frozen=True, kw_only=True):
 class ZoneAdvice(Record, frozen=True, kw_only=True):
     """A finding on the size of the zone, or on the largest separation of its pairs."""
 
-    component: ClassVar[str] = "ZoneAdvice"
     action: Action
     text: Text
 
@@ -68,7 +64,6 @@ class ZoneAdvice(Record, frozen=True, kw_only=True):
 class NoisePeriodAdvice(Record, frozen=True, kw_only=True):
     """A tracker's noise over consecutive batches."""
 
-    component: ClassVar[str] = "NoisePeriodAdvice"
     sigma_arcsec: Estimate
     batches: Count
     first: Annotated[Moment, doc("Time of the first batch of the period.")]
@@ -78,7 +73,6 @@ class NoisePeriodAdvice(Record, frozen=True, kw_only=True):
 class NoiseAdvice(Record, frozen=True, kw_only=True):
     """A tracker's noise, one standard deviation per tangent axis."""
 
-    component: ClassVar[str] = "NoiseAdvice"
     tracker: str
     now_arcsec: float
     sigma_arcsec: Estimate | None
@@ -95,7 +89,6 @@ class NoiseAdvice(Record, frozen=True, kw_only=True):
 class MagnitudeAdvice(Record, frozen=True, kw_only=True):
     """observed = catalog + offset + (scale - 1) (catalog - pivot)."""
 
-    component: ClassVar[str] = "MagnitudeAdvice"
     tracker: str
     pivot_mag: Annotated[float | None, doc("The median of the catalog magnitudes.")]
     offset_mag: Annotated[
@@ -114,7 +107,6 @@ class MagnitudeAdvice(Record, frozen=True, kw_only=True):
 class AlignmentAdvice(Record, frozen=True, kw_only=True):
     """Rotation of a tracker from its place in the mission file, relative to the first tracker."""
 
-    component: ClassVar[str] = "AlignmentAdvice"
     tracker: str
     reference: str
     rotation_arcsec: Annotated[
@@ -134,7 +126,6 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
 class InnovationAdvice(Record, frozen=True, kw_only=True):
     """Noise by the innovations of the filter and how they follow each other."""
 
-    component: ClassVar[str] = "InnovationAdvice"
     subject: Annotated[
         Literal["gyro", "attitudes"],
         doc("`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."),
@@ -175,7 +166,6 @@ class Trial(Record, frozen=True, kw_only=True):
 class Change(Record, frozen=True, kw_only=True):
     """A line for the mission's file."""
 
-    component: ClassVar[str] = "Change"
     table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
@@ -184,7 +174,6 @@ class Change(Record, frozen=True, kw_only=True):
 class Advice(Record, frozen=True, kw_only=True):
     """Recommended settings of a mission, from recorded batches."""
 
-    component: ClassVar[str] = "Advice"
     spacecraft: str
     run: str
     first: Annotated[Moment | None, doc("Time of the first batch of the sample.")]

@@ -28,6 +28,8 @@ from service.storage.models.base import (
     Stamp,
     Status,
     doc,
+    list_record,
+    page_record,
 )
 
 
@@ -58,12 +60,10 @@ class FrameSummary(Record, frozen=True, kw_only=True):
     used: Annotated[Count, doc("Of these, the stars in the batch.")]
     hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
     timings_us: FrameTimings
-    remarks: (
-        Annotated[
-            list[str], doc("What the service fitted, chose of the file, or turned, in words.")
-        ]
-        | UnsetType
-    ) = UNSET
+    remarks: Annotated[
+        list[str] | UnsetType,
+        doc("What the service fitted, chose of the file, or turned, in words."),
+    ] = UNSET
 
 
 class Detection(Record, frozen=True, kw_only=True):
@@ -115,7 +115,6 @@ class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
 class StarRef(Record, frozen=True, kw_only=True):
     """A star of the catalog."""
 
-    component: ClassVar[str] = "StarRef"
     catalog: Annotated[str, Field(examples=["HIP"])]
     id: Annotated[str, Field(examples=["HIP 26311"])]
 
@@ -128,23 +127,17 @@ class Star(Record, frozen=True, kw_only=True):
     star: StarRef | None
     votes: Annotated[Count, doc("Highest number of votes (STARID).")]
     runner_up: Annotated[Count, doc("Second highest number of votes; equal to `votes` in a tie.")]
-    rivals: (
-        Annotated[
-            list[str],
-            doc(
-                "Catalog stars that it can be, if it is not unique: those with equal votes or, "
-                "with probabilities, the probable ones, most probable first."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
-    rival_probabilities: (
-        Annotated[
-            list[float],
-            doc("Probability of each entry of `rivals`, if the identifier gives probabilities."),
-        ]
-        | UnsetType
-    ) = UNSET
+    rivals: Annotated[
+        list[str] | UnsetType,
+        doc(
+            "Catalog stars that it can be, if it is not unique: those with equal votes or, "
+            "with probabilities, the probable ones, most probable first."
+        ),
+    ] = UNSET
+    rival_probabilities: Annotated[
+        list[float] | UnsetType,
+        doc("Probability of each entry of `rivals`, if the identifier gives probabilities."),
+    ] = UNSET
     probability: Annotated[
         float | None,
         doc(
@@ -169,7 +162,6 @@ ZonePairCount = Annotated[Count, doc("Number of pairs (NTOT).")]
 class ZoneSummary(Record, frozen=True, kw_only=True):
     """The part of the sky in which the service searched for stars."""
 
-    component: ClassVar[str] = "ZoneSummary"
     kind: ZoneKind
     ra_deg: ZoneRightAscension
     dec_deg: float
@@ -256,15 +248,12 @@ class Attitude(Record, frozen=True, kw_only=True):
     triad: Quaternion | None
     quest: Quaternion | None
     triad_quest_angle_arcsec: float | None
-    trackers: Annotated[list[TrackerFit], doc("If there are several trackers.")] | UnsetType = UNSET
-    outlier: Annotated[str | None, doc("The tracker that disagrees.")] | UnsetType = UNSET
-    rival: (
-        Annotated[
-            Rival | None,
-            doc("If two groups of stars give two attitudes: the less probable one."),
-        ]
-        | UnsetType
-    ) = UNSET
+    trackers: Annotated[list[TrackerFit] | UnsetType, doc("If there are several trackers.")] = UNSET
+    outlier: Annotated[str | UnsetType | None, doc("The tracker that disagrees.")] = UNSET
+    rival: Annotated[
+        Rival | UnsetType | None,
+        doc("If two groups of stars give two attitudes: the less probable one."),
+    ] = UNSET
 
 
 class Timings(Record, frozen=True, kw_only=True):
@@ -325,7 +314,6 @@ class Tracking(Record, frozen=True, kw_only=True):
 class Answer(Record, frozen=True, kw_only=True):
     """The answer to a batch, as it is recorded."""
 
-    component: ClassVar[str] = "Answer"
     id: Annotated[Id | None, doc("null for a what-if that was not recorded.")]
     spacecraft: str
     batch: str
@@ -350,22 +338,16 @@ class Answer(Record, frozen=True, kw_only=True):
     warnings: list[str]
     timings_us: Timings
     provenance: Provenance
-    parent: (
-        Annotated[
-            Id | None,
-            doc("Only for a what-if: the result that it started from."),
-        ]
-        | UnsetType
-    ) = UNSET
-    recorded: Annotated[bool, doc("For a what-if: whether it was recorded.")] | UnsetType = UNSET
-    frame: (
-        Annotated[FrameSummary | None, doc("Only for a batch that was made from a frame.")]
-        | UnsetType
-    ) = UNSET
-    tracking: (
-        Annotated[Tracking | None, doc("Only for a batch that asks for the last attitude.")]
-        | UnsetType
-    ) = UNSET
+    parent: Annotated[
+        Id | UnsetType | None, doc("Only for a what-if: the result that it started from.")
+    ] = UNSET
+    recorded: Annotated[bool | UnsetType, doc("For a what-if: whether it was recorded.")] = UNSET
+    frame: Annotated[
+        FrameSummary | UnsetType | None, doc("Only for a batch that was made from a frame.")
+    ] = UNSET
+    tracking: Annotated[
+        Tracking | UnsetType | None, doc("Only for a batch that asks for the last attitude.")
+    ] = UNSET
 
 
 class _MeasuresShape:
@@ -392,7 +374,6 @@ Measures = Annotated[dict[str, float | None], DescribedAs(_MeasuresShape)]
 class Summary(Record, frozen=True, kw_only=True):
     """A result in a list, without its stars and its attitude."""
 
-    component: ClassVar[str] = "Summary"
     id: Id
     spacecraft: str
     batch: str
@@ -411,12 +392,7 @@ class Summary(Record, frozen=True, kw_only=True):
     archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
 
 
-class BatchPage(Record, frozen=True, kw_only=True):
-    """A page of results."""
-
-    component: ClassVar[str] = "BatchPage"
-    items: list[Summary]
-    next_cursor: str | None
+BatchPage = page_record("BatchPage", Summary, "A page of results.")
 
 
 class Result(Record, frozen=True, kw_only=True):
@@ -444,13 +420,9 @@ class Result(Record, frozen=True, kw_only=True):
     parent: Id | None
     archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
-    frame: (
-        Annotated[
-            FrameWithStars | None,
-            doc("Only for a batch that was made from a frame."),
-        ]
-        | UnsetType
-    ) = UNSET
+    frame: Annotated[
+        FrameWithStars | UnsetType | None, doc("Only for a batch that was made from a frame.")
+    ] = UNSET
 
 
 class Neighbours(Struct, frozen=True):
@@ -464,7 +436,6 @@ class Neighbours(Struct, frozen=True):
 class BatchOutcome(Record, frozen=True, kw_only=True):
     """The outcome of one batch of an array: its answer or its problem, the other is null."""
 
-    component: ClassVar[str] = "BatchOutcome"
     status: Annotated[
         int,
         doc(
@@ -476,8 +447,8 @@ class BatchOutcome(Record, frozen=True, kw_only=True):
     problem: Problem | None
 
 
-class BatchOutcomes(Record, frozen=True, kw_only=True):
-    """One outcome for each batch of an array, in the order in which they were sent."""
-
-    component: ClassVar[str] = "BatchOutcomes"
-    items: list[BatchOutcome]
+BatchOutcomes = list_record(
+    "BatchOutcomes",
+    BatchOutcome,
+    "One outcome for each batch of an array, in the order in which they were sent.",
+)

@@ -15,12 +15,13 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
 )
 
-from msgspec import NODEFAULT, UNSET, Struct, UnsetType, structs
+from msgspec import NODEFAULT, UNSET, Struct, UnsetType, defstruct, structs
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
@@ -105,7 +106,10 @@ Reason = Annotated[
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """A record; `component` is its name in the OpenAPI document, empty where no answer has it."""
+    """A record of the OpenAPI document; `component` is its name there if not that of the class.
+
+    An empty `component` says that only records derived from it are in the document.
+    """
 
     component: ClassVar[str] = ""
 
@@ -115,6 +119,7 @@ class Record(Struct, frozen=True, kw_only=True):
         return handler(described(cls))
 
 
+R = TypeVar("R", bound=Record)
 R_co = TypeVar("R_co", covariant=True)
 
 
@@ -156,9 +161,35 @@ def described(record: type[Record]) -> type[BaseModel]:
 
 
 def _without_unset(kind: Any) -> Any:
+    if get_origin(kind) is Annotated:
+        return Annotated[(_without_unset(kind.__origin__), *kind.__metadata__)]
     if get_origin(kind) not in (Union, UnionType):
         return kind
     return Union[tuple(each for each in get_args(kind) if each is not UnsetType)]  # noqa: UP007
+
+
+class Items(Record, frozen=True, kw_only=True):
+    """A whole list."""
+
+    component: ClassVar[str] = ""
+    items: list[Any]
+
+
+def list_record(name: str, item: type[Record], description: str) -> type[Items]:
+    """The record of a whole list."""
+    return _defined(name, [("items", list[item])], Items, description)  # type: ignore[valid-type]
+
+
+def page_record(name: str, item: type[Record], description: str) -> type[Record]:
+    """The record that describes a `Page` of a list."""
+    fields = [("items", list[item]), ("next_cursor", str | None)]  # type: ignore[valid-type]
+    return _defined(name, fields, Record, description)
+
+
+def _defined(name: str, fields: Any, base: type[R], description: str) -> type[R]:
+    content = {"__doc__": description}
+    record = defstruct(name, fields, bases=(base,), namespace=content, frozen=True, kw_only=True)
+    return cast(type[R], record)
 
 
 class FieldFault(Record, frozen=True, kw_only=True):
@@ -173,10 +204,9 @@ class FieldFault(Record, frozen=True, kw_only=True):
 class Problem(Record, frozen=True, kw_only=True):
     """A problem (RFC 9457)."""
 
-    component: ClassVar[str] = "Problem"
     type: Annotated[str, doc("The type of problem; `about:blank` if the status says everything.")]
     title: str
     status: int
     detail: str
     instance: Annotated[str, doc("The path of the request.")]
-    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET
+    errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET

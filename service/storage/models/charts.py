@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from msgspec import Struct
 
 from service.sky.zones import SearchRegion
-from service.storage.models.base import Record
 from service.times import Utc
 from service.vectors import Vector
 
@@ -83,14 +83,14 @@ class PeriodStars:
 # Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in the tracker's axes.
 
 
-class Boresight(Record, frozen=True, kw_only=True):
+class Boresight(Struct, frozen=True, kw_only=True):
     """The boresight in the inertial frame."""
 
     ra_deg: float
     dec_deg: float
 
 
-class CatalogStarPlace(Record, frozen=True, kw_only=True):
+class CatalogStarPlace(Struct, frozen=True, kw_only=True):
     """A catalog star in the field of view."""
 
     id: str
@@ -99,7 +99,7 @@ class CatalogStarPlace(Record, frozen=True, kw_only=True):
     v_deg: float
 
 
-class ObservedStarPlace(Record, frozen=True, kw_only=True):
+class ObservedStarPlace(Struct, frozen=True, kw_only=True):
     """An observed star with its outcome; `residual_arcsec` is observed minus predicted.
 
     The residual is along h and along v, None if the attitude does not use the star.
@@ -114,7 +114,7 @@ class ObservedStarPlace(Record, frozen=True, kw_only=True):
     residual_arcsec: tuple[float, float] | None
 
 
-class TrackerField(Record, frozen=True, kw_only=True):
+class TrackerField(Struct, frozen=True, kw_only=True):
     """The view of one tracker; `zone_edges` are lines of [h, v] in degrees."""
 
     tracker: str
@@ -127,7 +127,7 @@ class TrackerField(Record, frozen=True, kw_only=True):
     observed: list[ObservedStarPlace]
 
 
-class StarField(Record, frozen=True, kw_only=True):
+class StarField(Struct, frozen=True, kw_only=True):
     """The views of all trackers of a batch.
 
     `through` is "quest", "triad" or "a_priori": the attitude by which catalog stars are drawn.

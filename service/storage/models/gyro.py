@@ -4,7 +4,7 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
-from service.storage.models.base import Components, Id, Moment, Record, Stamp, doc
+from service.storage.models.base import Components, Id, Moment, Record, Stamp, doc, page_record
 
 
 class GyroBlockRow(Record, frozen=True, kw_only=True):
@@ -24,18 +24,12 @@ class GyroBlockRow(Record, frozen=True, kw_only=True):
     received: Stamp
 
 
-class GyroBlockPage(Record, frozen=True, kw_only=True):
-    """A page of gyro blocks."""
-
-    component: ClassVar[str] = "GyroBlockPage"
-    items: list[GyroBlockRow]
-    next_cursor: str | None
+GyroBlockPage = page_record("GyroBlockPage", GyroBlockRow, "A page of gyro blocks.")
 
 
 class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
     """A recorded gyro block with its samples."""
 
-    component: ClassVar[str] = "GyroSamples"
     times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
     rates_rad_per_s: Annotated[
         list[Components],

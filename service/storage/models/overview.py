@@ -15,7 +15,16 @@ from service.storage.models.answers import (
     ZoneStarCount,
     ZoneSummary,
 )
-from service.storage.models.base import Components, Count, Digest, Moment, Record, Stamp, doc
+from service.storage.models.base import (
+    Components,
+    Count,
+    Digest,
+    Moment,
+    Record,
+    Stamp,
+    doc,
+    list_record,
+)
 from service.storage.models.spacecraft import SpacecraftRow
 from service.times import Utc
 from service.vectors import Matrix
@@ -41,7 +50,6 @@ class WindowCounts(Record, frozen=True, kw_only=True):
 class Sparkline(Record, frozen=True, kw_only=True):
     """Shares of stars in time steps; steps without batches are omitted."""
 
-    component: ClassVar[str] = "Sparkline"
     bucket_s: int
     unix_s: Annotated[list[float], doc("POSIX time of the beginning of each step.")]
     batches: list[Count]
@@ -53,7 +61,6 @@ class Sparkline(Record, frozen=True, kw_only=True):
 class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
     """The state of one spacecraft; null without a batch in the run."""
 
-    component: ClassVar[str] = "OverviewRow"
     sigma_arcsec: Annotated[
         Components | None,
         doc("Standard deviations of `last_attitude` about the body axes."),
@@ -72,7 +79,6 @@ class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
 class Overview(Record, frozen=True, kw_only=True):
     """Every spacecraft in a run."""
 
-    component: ClassVar[str] = "Overview"
     run: str
     default_run: Annotated[str, doc("`live`; while it is empty, the newest run.")]
     as_of: Annotated[Moment | None, doc("The time of the run's latest batch.")]
@@ -84,7 +90,6 @@ class Overview(Record, frozen=True, kw_only=True):
 class CatalogAbout(Record, frozen=True, kw_only=True):
     """The star catalog."""
 
-    component: ClassVar[str] = "CatalogAbout"
     digest: Digest
     name: str
     stars: Count
@@ -93,7 +98,6 @@ class CatalogAbout(Record, frozen=True, kw_only=True):
 class MissionAbout(Record, frozen=True, kw_only=True):
     """A mission of this service."""
 
-    component: ClassVar[str] = "MissionAbout"
     name: str
     description: str
     digest: Digest
@@ -102,7 +106,6 @@ class MissionAbout(Record, frozen=True, kw_only=True):
 class About(Record, frozen=True, kw_only=True):
     """The service and its data."""
 
-    component: ClassVar[str] = "About"
     version: str
     started: Stamp
     database: Annotated[str, Field(examples=["sqlite", "postgresql"])]
@@ -200,7 +203,6 @@ class Fleet:
 class CacheUse(Record, frozen=True, kw_only=True):
     """Cost and use of a cache entry."""
 
-    component: ClassVar[str] = "CacheUse"
     bytes: Count
     hits: Count
     build_us: Count
@@ -209,7 +211,6 @@ class CacheUse(Record, frozen=True, kw_only=True):
 class CachedZone(CacheUse, frozen=True, kw_only=True):
     """A zone in the cache."""
 
-    component: ClassVar[str] = "CachedZone"
     kind: ZoneKind
     ra_deg: ZoneRightAscension
     dec_deg: float
@@ -223,7 +224,6 @@ class CachedZone(CacheUse, frozen=True, kw_only=True):
 class CachedRunCatalog(CacheUse, frozen=True, kw_only=True):
     """A run catalog in the cache."""
 
-    component: ClassVar[str] = "CachedRunCatalog"
     digest: Digest
     epoch_year: float
     stars: Count
@@ -236,7 +236,6 @@ class ZoneCache(Record, frozen=True, kw_only=True):
     both; each entry has its own.
     """
 
-    component: ClassVar[str] = "ZoneCache"
     items: list[CachedZone]
     run_catalogs: list[CachedRunCatalog]
     bytes: Count
@@ -247,15 +246,10 @@ class ZoneCache(Record, frozen=True, kw_only=True):
     build_us: Count
 
 
-class ZoneList(Record, frozen=True, kw_only=True):
-    """Zones."""
-
-    component: ClassVar[str] = "ZoneList"
-    items: list[ZoneSummary]
+ZoneList = list_record("ZoneList", ZoneSummary, "Zones.")
 
 
 class Dropped(Record, frozen=True, kw_only=True):
     """How many zones were dropped."""
 
-    component: ClassVar[str] = "Dropped"
     dropped: Count

@@ -31,7 +31,6 @@ class PictureAttitudeFound(Record, frozen=True, kw_only=True):
 class PictureLens(Record, frozen=True, kw_only=True):
     """The lens that fits a picture; a sigma of a parameter that was not fitted is null."""
 
-    component: ClassVar[str] = "PictureLens"
     field_deg: Annotated[list[float], doc("Of the width and of the height.")]
     focal_px: float
     focal_sigma_px: float | None
@@ -56,7 +55,6 @@ class PictureStarFound(Record, frozen=True, kw_only=True):
 class Picture(Record, frozen=True, kw_only=True):
     """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
 
-    component: ClassVar[str] = "Picture"
     width_px: Count
     height_px: Count
     candidates: Annotated[Count, doc("Points of light.")]

@@ -1,6 +1,6 @@
 """Attitudes as products: series with stretches and rates, and the attitude at a moment."""
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from msgspec import UNSET, UnsetType
 
@@ -28,7 +28,6 @@ ContinuousQuaternion = Annotated[
 class ProductAttitude(Record, frozen=True, kw_only=True):
     """An attitude of a series."""
 
-    component: ClassVar[str] = "ProductAttitude"
     time: Moment
     quaternion: ContinuousQuaternion
     covariance_arcsec2: Covariance
@@ -55,46 +54,34 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
     batch: Annotated[str | None, doc("null unless the grade is `raw`.")]
     id: Annotated[Id, doc("Of the result; unless the grade is `raw`, of the day's revision.")]
-    model: (
-        Annotated[
-            Literal["gyro", "constant_rate"],
-            doc(
-                "What the filter knows of the motion: the rates of a gyro, or that the rate is "
-                "constant but for a random walk. Absent if the grade is `raw`."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
-    revision: (
-        Annotated[int, doc("Of the day's attitudes, from 1. Absent if the grade is `raw`.")]
-        | UnsetType
-    ) = UNSET
-    bias_deg_per_h: (
-        Annotated[
-            Components | None,
-            doc(
-                "Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is "
-                "`raw`."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
-    bias_sigma_deg_per_h: (
-        Annotated[
-            Components,
-            doc(
-                "One sigma of the bias or, at a constant rate, of the rate. Absent if the grade "
-                "is `raw`."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
+    model: Annotated[
+        Literal["gyro", "constant_rate"] | UnsetType,
+        doc(
+            "What the filter knows of the motion: the rates of a gyro, or that the rate is "
+            "constant but for a random walk. Absent if the grade is `raw`."
+        ),
+    ] = UNSET
+    revision: Annotated[
+        int | UnsetType, doc("Of the day's attitudes, from 1. Absent if the grade is `raw`.")
+    ] = UNSET
+    bias_deg_per_h: Annotated[
+        Components | UnsetType | None,
+        doc(
+            "Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is `raw`."
+        ),
+    ] = UNSET
+    bias_sigma_deg_per_h: Annotated[
+        Components | UnsetType,
+        doc(
+            "One sigma of the bias or, at a constant rate, of the rate. Absent if the grade "
+            "is `raw`."
+        ),
+    ] = UNSET
 
 
 class AttitudeProduct(Record, frozen=True, kw_only=True):
     """Attitudes in order of time."""
 
-    component: ClassVar[str] = "AttitudeProduct"
     about: Annotated[dict[str, str], doc("Where the attitudes come from: filters and origin.")]
     items: list[ProductAttitude]
 
@@ -102,7 +89,6 @@ class AttitudeProduct(Record, frozen=True, kw_only=True):
 class AttitudeAtMoment(Record, frozen=True, kw_only=True):
     """The attitude at a moment, with its error."""
 
-    component: ClassVar[str] = "AttitudeAtMoment"
     time: Moment
     method: Literal["nearest", "interpolated"]
     quaternion: ContinuousQuaternion

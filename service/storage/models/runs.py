@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import UNSET, UnsetType
 from pydantic import Field
 
-from service.storage.models.base import Count, FieldFault, Id, Record, Stamp, doc
+from service.storage.models.base import Count, FieldFault, Id, Record, Stamp, doc, list_record
 
 ReplayStateName = Literal["running", "waiting", "done", "interrupted", "failed", "cancelled"]
 """A replay that is `waiting` goes on by itself as soon as the service is ready after a restart."""
@@ -24,17 +24,12 @@ class Run(Record, frozen=True, kw_only=True):
     last_day: str
 
 
-class RunList(Record, frozen=True, kw_only=True):
-    """Every run with batches."""
-
-    component: ClassVar[str] = "RunList"
-    items: list[Run]
+RunList = list_record("RunList", Run, "Every run with batches.")
 
 
 class Forgotten(Record, frozen=True, kw_only=True):
     """What is removed from a run."""
 
-    component: ClassVar[str] = "Forgotten"
     run: str
     spacecraft: Annotated[str | None, doc("null: of every spacecraft.")]
     batches: Annotated[Count, doc("Batches in the database, with their results.")]
@@ -52,7 +47,6 @@ class Forgotten(Record, frozen=True, kw_only=True):
 class ReplayLines(Record, frozen=True, kw_only=True):
     """The lines of a replay."""
 
-    component: ClassVar[str] = "ReplayLines"
     total: Annotated[int | None, doc("null if the number is not known in advance.")]
     done: Count
     refused: Count
@@ -61,7 +55,6 @@ class ReplayLines(Record, frozen=True, kw_only=True):
 class ReplayCounts(Record, frozen=True, kw_only=True):
     """Results of the lines so far."""
 
-    component: ClassVar[str] = "ReplayCounts"
     new: Annotated[Count, doc("Batches that this replay recorded.")]
     repeated: Annotated[Count, doc("Batches that were already recorded.")]
     observed: Annotated[
@@ -78,7 +71,6 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
 class ApidPackets(Record, frozen=True, kw_only=True):
     """The packets of one APID."""
 
-    component: ClassVar[str] = "ApidPackets"
     apid: Annotated[int, Field(ge=0, le=2047)]
     packets: Count
     described: Annotated[bool, doc("Whether the XTCE file describes them.")]
@@ -94,7 +86,6 @@ class ApidPackets(Record, frozen=True, kw_only=True):
 class ReplayPackets(Record, frozen=True, kw_only=True):
     """The space packets of a replay so far."""
 
-    component: ClassVar[str] = "ReplayPackets"
     packets: Count
     bytes: Count
     batches: Annotated[Count, doc("Batches that the packets hold.")]
@@ -125,15 +116,13 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
 class LineProblem(Record, frozen=True, kw_only=True):
     """The faults of a line."""
 
-    component: ClassVar[str] = "LineProblem"
     detail: str
-    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET
+    errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET
 
 
 class RefusedLine(Record, frozen=True, kw_only=True):
     """A refused line; the replay continues with the next one."""
 
-    component: ClassVar[str] = "RefusedLine"
     line: Annotated[int, doc("Number of the line, or of the packet in its file, from 1.")]
     problem: LineProblem
 
@@ -168,16 +157,11 @@ class Replay(ReplayProgress, frozen=True, kw_only=True):
         return ReplayProgress(**{name: getattr(self, name) for name in names})
 
 
-class ReplayList(Record, frozen=True, kw_only=True):
-    """The latest replays, newest first."""
-
-    component: ClassVar[str] = "ReplayList"
-    items: list[Replay]
+ReplayList = list_record("ReplayList", Replay, "The latest replays, newest first.")
 
 
 class RunState(Record, frozen=True, kw_only=True):
     """A run, and whether its batches can raise alarms."""
 
-    component: ClassVar[str] = "RunState"
     run: str
     alarms: bool

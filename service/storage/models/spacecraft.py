@@ -21,13 +21,14 @@ from service.storage.models.base import (
     Stamp,
     Status,
     doc,
+    list_record,
+    page_record,
 )
 
 
 class AttitudeRow(Record, frozen=True, kw_only=True):
     """An attitude in a history."""
 
-    component: ClassVar[str] = "AttitudeRow"
     id: Id
     batch: str
     time: Moment
@@ -43,18 +44,12 @@ class AttitudeRow(Record, frozen=True, kw_only=True):
     status: Status
 
 
-class AttitudePage(Record, frozen=True, kw_only=True):
-    """A page of attitudes."""
-
-    component: ClassVar[str] = "AttitudePage"
-    items: list[AttitudeRow]
-    next_cursor: str | None
+AttitudePage = page_record("AttitudePage", AttitudeRow, "A page of attitudes.")
 
 
 class SpacecraftRow(Record, frozen=True, kw_only=True):
     """The state of a spacecraft in a run."""
 
-    component: ClassVar[str] = "SpacecraftRow"
     name: str
     description: str
     retired: Annotated[bool, doc("True if no mission file describes it any more.")]
@@ -77,17 +72,12 @@ class SpacecraftRow(Record, frozen=True, kw_only=True):
     ]
 
 
-class SpacecraftList(Record, frozen=True, kw_only=True):
-    """Every spacecraft."""
-
-    component: ClassVar[str] = "SpacecraftList"
-    items: list[SpacecraftRow]
+SpacecraftList = list_record("SpacecraftList", SpacecraftRow, "Every spacecraft.")
 
 
 class MissionNow(Record, frozen=True, kw_only=True):
     """The present settings of a mission."""
 
-    component: ClassVar[str] = "MissionNow"
     digest: Digest
     settings: MissionSettings
 
@@ -95,14 +85,12 @@ class MissionNow(Record, frozen=True, kw_only=True):
 class MissionThen(MissionNow, frozen=True, kw_only=True):
     """The settings of a mission at some time."""
 
-    component: ClassVar[str] = "MissionThen"
     since: Stamp
 
 
 class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
     """The state of a spacecraft, and its mission's settings with their history."""
 
-    component: ClassVar[str] = "SpacecraftState"
     mission: MissionNow
     history: Annotated[
         list[MissionThen],
@@ -113,7 +101,6 @@ class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
 class Rates(Record, frozen=True, kw_only=True):
     """Sums over the batches of a bucket."""
 
-    component: ClassVar[str] = "Rates"
     start: Moment
     batches: Count
     observed: Count
@@ -124,11 +111,7 @@ class Rates(Record, frozen=True, kw_only=True):
     suspect: Annotated[Count, doc("Batches with a suspect attitude.")]
 
 
-class RateList(Record, frozen=True, kw_only=True):
-    """The buckets with batches, oldest first."""
-
-    component: ClassVar[str] = "RateList"
-    items: list[Rates]
+RateList = list_record("RateList", Rates, "The buckets with batches, oldest first.")
 
 
 Numbers = list[float | None]
@@ -137,34 +120,29 @@ Numbers = list[float | None]
 class Series(Record, frozen=True, kw_only=True):
     """A quantity. `minmax`: mean, least and greatest of each bucket; `latest`: single values."""
 
-    component: ClassVar[str] = "Series"
     unit: Annotated[str, Field(examples=["arcsec"])]
-    count: Annotated[list[Count], doc("`minmax`: batches with a value.")] | UnsetType = UNSET
-    mean: (
-        Annotated[Numbers, doc("`minmax`: for shares, over all stars or batches.")] | UnsetType
-    ) = UNSET
-    min: Annotated[Numbers, doc("Least value of a batch.")] | UnsetType = UNSET
-    max: Annotated[Numbers, doc("Greatest value of a batch.")] | UnsetType = UNSET
-    value: Annotated[Numbers, doc("`latest`: the value of each batch.")] | UnsetType = UNSET
+    count: Annotated[list[Count] | UnsetType, doc("`minmax`: batches with a value.")] = UNSET
+    mean: Annotated[
+        Numbers | UnsetType, doc("`minmax`: for shares, over all stars or batches.")
+    ] = UNSET
+    min: Annotated[Numbers | UnsetType, doc("Least value of a batch.")] = UNSET
+    max: Annotated[Numbers | UnsetType, doc("Greatest value of a batch.")] = UNSET
+    value: Annotated[Numbers | UnsetType, doc("`latest`: the value of each batch.")] = UNSET
 
 
 class History(Record, frozen=True, kw_only=True):
     """Quantities over a period of time, oldest first; null: unknown."""
 
-    component: ClassVar[str] = "History"
     spacecraft: str
     run: str
-    tracker: Annotated[str, doc("If the request names one.")] | UnsetType = UNSET
-    not_split: (
-        Annotated[
-            bool,
-            doc(
-                "With `tracker`: true while older batches of the run are not split by tracker yet, "
-                "and so are missing here."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
+    tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
+    not_split: Annotated[
+        bool | UnsetType,
+        doc(
+            "With `tracker`: true while older batches of the run are not split by tracker yet, "
+            "and so are missing here."
+        ),
+    ] = UNSET
     start: Moment | None
     end: Moment | None
     strategy: Literal["minmax", "latest"]
@@ -181,8 +159,8 @@ class History(Record, frozen=True, kw_only=True):
             "omitted."
         ),
     ]
-    batches: Annotated[list[Count], doc("`minmax`: batches in each bucket.")] | UnsetType = UNSET
-    time: Annotated[list[Moment], doc("`latest` only, like the next two fields.")] | UnsetType = (
+    batches: Annotated[list[Count] | UnsetType, doc("`minmax`: batches in each bucket.")] = UNSET
+    time: Annotated[list[Moment] | UnsetType, doc("`latest` only, like the next two fields.")] = (
         UNSET
     )
     id: list[Id] | UnsetType = UNSET
@@ -202,9 +180,8 @@ class Ranking(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "WorstList"
     by: QuantityName
-    tracker: Annotated[str, doc("If the request names one.")] | UnsetType = UNSET
-    not_split: (
-        Annotated[bool, doc("With `tracker`: true while older batches are not split by tracker.")]
-        | UnsetType
-    ) = UNSET
+    tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
+    not_split: Annotated[
+        bool | UnsetType, doc("With `tracker`: true while older batches are not split by tracker.")
+    ] = UNSET
     items: list[RankedBatch]

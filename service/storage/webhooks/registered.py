@@ -3,14 +3,14 @@
 import json
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 from sqlalchemy import Connection, case, delete, func, insert, select, update
 
 from service.errors import NotFound, shown_value
 from service.storage.models.alarms import SeverityName
-from service.storage.models.base import Count, Id, Record, Stamp, doc
+from service.storage.models.base import Count, Id, Record, Stamp, doc, list_record, page_record
 from service.storage.recording.events import EventKind
 from service.storage.sql.access_tables import access_tokens, webhook_deliveries, webhooks
 from service.storage.sql.columns import Row
@@ -42,7 +42,6 @@ Fault = Annotated[str | None, doc("null: it succeeded, or was not tried yet.")]
 class Webhook(Record, frozen=True, kw_only=True):
     """A receiver of events, and how its deliveries go."""
 
-    component: ClassVar[str] = "Webhook"
     id: Id
     name: str
     url: str
@@ -76,21 +75,15 @@ class Webhook(Record, frozen=True, kw_only=True):
 class WebhookWithSecret(Webhook, frozen=True, kw_only=True):
     """A webhook with the secret that signs its deliveries: it is shown this once."""
 
-    component: ClassVar[str] = "WebhookWithSecret"
     secret: Annotated[str, Field(pattern=r"^whsec_[A-Za-z0-9+/]+=*$")]
 
 
-class WebhookList(Record, frozen=True, kw_only=True):
-    """All webhooks, the oldest first."""
-
-    component: ClassVar[str] = "WebhookList"
-    items: list[Webhook]
+WebhookList = list_record("WebhookList", Webhook, "All webhooks, the oldest first.")
 
 
 class WebhookDelivery(Record, frozen=True, kw_only=True):
     """An event that waits to be delivered, or a dead letter."""
 
-    component: ClassVar[str] = "WebhookDelivery"
     event: Annotated[int, doc("The number of the event.")]
     message_id: Annotated[str, doc("The `webhook-id` of every attempt.")]
     kind: EventKind
@@ -104,25 +97,18 @@ class WebhookDelivery(Record, frozen=True, kw_only=True):
     last_fault: Fault
 
 
-class WebhookDeliveryPage(Record, frozen=True, kw_only=True):
-    """A page of deliveries."""
-
-    component: ClassVar[str] = "WebhookDeliveryPage"
-    items: list[WebhookDelivery]
-    next_cursor: str | None
+WebhookDeliveryPage = page_record("WebhookDeliveryPage", WebhookDelivery, "A page of deliveries.")
 
 
 class WebhookQueued(Record, frozen=True, kw_only=True):
     """How many events were queued."""
 
-    component: ClassVar[str] = "WebhookQueued"
     queued: Count
 
 
 class WebhookTest(Record, frozen=True, kw_only=True):
     """The outcome of a test event."""
 
-    component: ClassVar[str] = "WebhookTest"
     delivered: bool
     message_id: str
     status: HttpStatus

@@ -209,7 +209,7 @@ def make_definitive_attitude(
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     """The jobs of a spacecraft since the start of the service, the newest first."""
-    return json_response(app.definitive.all(name))
+    return json_response(DefinitiveJobList(items=app.definitive.all(name)))
 
 
 @router.get(

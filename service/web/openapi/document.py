@@ -203,7 +203,7 @@ def _schemas() -> dict[str, Any]:
 
 def _records(kind: type[Record]) -> Iterator[type[Record]]:
     for each in kind.__subclasses__():
-        if vars(each).get("component"):
+        if vars(each).get("component", each.__name__):
             yield each
         yield from _records(each)
 
