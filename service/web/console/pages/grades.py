@@ -70,5 +70,5 @@ def grades_page(
         drawn=drawn,
         most_blocks=MOST_BLOCKS,
         attitude_formats=attitude_formats(),
-        jobs=context.app.definitive.all(name).items[:JOBS],
+        jobs=context.app.definitive.all(name)[:JOBS],
     )
