@@ -24,8 +24,7 @@ from service.storage.models.spacecraft import (
     SpacecraftRow,
     SpacecraftState,
 )
-from service.storage.projections import rollups
-from service.storage.queries import fleet, histories, trends
+from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
 from service.storage.recording.tracker_values import is_waiting
@@ -105,7 +104,7 @@ class Spacecraft:
         run: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
-        bucket: rollups.Bucket = "hour",
+        bucket: time_buckets.Bucket = "hour",
     ) -> list[Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
@@ -113,10 +112,9 @@ class Spacecraft:
         """
         self._context.mission(name)
         with self._context.reading() as connection:
-            found = rollups.rates(
+            return time_buckets.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
-        return [Rates(**each) for each in found]
 
     def history(
         self,

@@ -6,15 +6,8 @@ from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from service.storage.models import answers
 from service.storage.models.alarms import Alarm, AlarmSummary
-from service.storage.models.answers import (
-    Summary,
-    ZoneKind,
-    ZonePairCount,
-    ZoneRightAscension,
-    ZoneStarCount,
-    ZoneSummary,
-)
 from service.storage.models.base import (
     Components,
     Count,
@@ -144,17 +137,17 @@ class FleetRow:
     """True if no mission file describes it any more."""
     state: str
     """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
-    latest_batch: Summary | None
-    last_attitude: KnownAttitude | None
-    """It can be older than the latest batch."""
-    trackers: tuple[TrackerCounts, ...]
-    age_s: float | None
-    """From its latest batch to the run's latest batch."""
-    received_age_s: float | None
-    """Since the service received its latest batch."""
-    last_hour: WindowCounts | None
     alarms: tuple[Alarm, ...]
     """The alarms that are not cleared, worst first."""
+    latest_batch: answers.Summary | None = None
+    last_attitude: KnownAttitude | None = None
+    """It can be older than the latest batch."""
+    trackers: tuple[TrackerCounts, ...] = ()
+    age_s: float | None = None
+    """From its latest batch to the run's latest batch."""
+    received_age_s: float | None = None
+    """Since the service received its latest batch."""
+    last_hour: WindowCounts | None = None
 
     @property
     def alarms_now(self) -> list[Alarm]:
@@ -211,11 +204,11 @@ class CacheUse(Record, frozen=True, kw_only=True):
 class CachedZone(CacheUse, frozen=True, kw_only=True):
     """A zone in the cache."""
 
-    kind: ZoneKind
-    ra_deg: ZoneRightAscension
+    kind: answers.ZoneKind
+    ra_deg: answers.ZoneRightAscension
     dec_deg: float
-    stars: ZoneStarCount
-    pairs: ZonePairCount
+    stars: answers.ZoneStarCount
+    pairs: answers.ZonePairCount
     spacecraft: str
     grid_deg: float
     run_catalog: Digest
@@ -246,7 +239,7 @@ class ZoneCache(Record, frozen=True, kw_only=True):
     build_us: Count
 
 
-ZoneList = list_record("ZoneList", ZoneSummary, "Zones.")
+ZoneList = list_record("ZoneList", answers.ZoneSummary, "Zones.")
 
 
 class Dropped(Record, frozen=True, kw_only=True):

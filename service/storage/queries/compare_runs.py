@@ -3,27 +3,16 @@
 import math
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
 from service.storage.archive.reading import Archive, parts_between, places
-from service.storage.models.compare import (
-    AngleStatistics,
-    OutcomeCounts,
-    RatesOfRuns,
-    RunAttitudes,
-    RunChange,
-    RunChangeSide,
-    RunComparison,
-    RunRates,
-    RunStars,
-    RunTransition,
-    StatusCounts,
-)
+from service.storage.models import compare
 from service.storage.queries.pages import PLACE, Place, ResultFilter
-from service.storage.queries.time_buckets import BucketFilter, Columns, Level, read_buckets
+from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
 from service.storage.queries.with_archive import ArchiveUse, bounds_of, first_rows
 from service.storage.sql.tables import (
     COUNTED,
@@ -51,7 +40,7 @@ def compare_runs(
     selected: ResultFilter,
     other: str,
     latest: int | None = None,
-) -> RunComparison:
+) -> compare.RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
     `stars` counts what became of each, from the one run (`before`) to the other
@@ -75,14 +64,14 @@ def changed_batches(
     other: str,
     latest: int,
     limit: int,
-) -> list[RunChange]:
+) -> list[compare.RunChange]:
     """The batches whose counts of stars or whose status differ in the other run, latest first.
 
     At most `limit` of the period's `latest` batches.
     """
     if not is_archived_in_part(connection, selected, other):
         return _changed(connection, _pairs(selected, other, latest), limit)
-    found: list[RunChange] = []
+    found: list[compare.RunChange] = []
     for group in both_runs(connection, archive, selected, other, latest):
         with group.reading() as of_group:
             found += _changed(of_group, _pairs(selected, other), limit)
@@ -91,7 +80,7 @@ def changed_batches(
     return found[:limit]
 
 
-def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunChange]:
+def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compare.RunChange]:
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
         *(old.c[name] != new.c[name] for name in (*COUNTED, "status")),
@@ -114,7 +103,7 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunCha
         .limit(limit)
     )
     return [
-        RunChange(
+        compare.RunChange(
             batch=row["batch"],
             time=row["time"],
             before=_side(row, "before"),
@@ -124,10 +113,10 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunCha
     ]
 
 
-def _side(row: Any, side: str) -> RunChangeSide:
+def _side(row: Any, side: str) -> compare.RunChangeSide:
     counts = {name: row[f"{side}_{name}"] for name in ("unique", "ambiguous", "unmatched")}
-    return RunChangeSide(
-        id=row[f"{side}_id"], counts=OutcomeCounts(**counts), status=row[f"{side}_status"]
+    return compare.RunChangeSide(
+        id=row[f"{side}_id"], counts=compare.OutcomeCounts(**counts), status=row[f"{side}_status"]
     )
 
 
@@ -184,10 +173,10 @@ class _Tally:
             self.after[new or "none"] += int(count)
         self.angles_arcsec += _angles_arcsec(connection, pairs)
 
-    def comparison(self, run: str | None, other: str) -> RunComparison:
+    def comparison(self, run: str | None, other: str) -> compare.RunComparison:
         """The whole; of the transitions the most frequent first."""
         transitions = [
-            RunTransition(before=before, after=after, same_star=alike, stars=stars)
+            compare.RunTransition(before=before, after=after, same_star=alike, stars=stars)
             for (before, after, alike), stars in self.stars.items()
         ]
         transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
@@ -195,20 +184,20 @@ class _Tally:
         statistics = None
         if len(angles):
             median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-            statistics = AngleStatistics(median=median, p95=p95, max=float(angles.max()))
-        return RunComparison(
+            statistics = compare.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+        return compare.RunComparison(
             run=run,
             other=other,
             batches=self.batches,
-            stars=RunStars(
+            stars=compare.RunStars(
                 observed=sum(each.stars for each in transitions),
                 before=_sums((each.before, each.stars) for each in transitions),
                 after=_sums((each.after, each.stars) for each in transitions),
                 transitions=transitions,
             ),
-            attitudes=RunAttitudes(
-                before=StatusCounts(**self.before),
-                after=StatusCounts(**self.after),
+            attitudes=compare.RunAttitudes(
+                before=compare.StatusCounts(**self.before),
+                after=compare.StatusCounts(**self.after),
                 in_both=len(angles),
                 angle_arcsec=statistics,
             ),
@@ -239,11 +228,13 @@ def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str
     }
 
 
-def _sums(stars: Iterable[tuple[str, int]]) -> OutcomeCounts:
+def _sums(stars: Iterable[tuple[str, int]]) -> compare.OutcomeCounts:
     counts: Counter[str] = Counter()
     for outcome, number in stars:
         counts[outcome] += number
-    return OutcomeCounts(**{name: counts[name] for name in OutcomeCounts.__struct_fields__})
+    return compare.OutcomeCounts(
+        **{name: counts[name] for name in compare.OutcomeCounts.__struct_fields__}
+    )
 
 
 def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
@@ -373,7 +364,7 @@ def run_rates(
     runs: Sequence[str],
     start: Utc | None,
     end: Utc | None,
-) -> RatesOfRuns | None:
+) -> compare.RatesOfRuns | None:
     """The rates of all stars of each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
@@ -382,13 +373,14 @@ def run_rates(
     common = _common_days(connection, spacecraft, runs)
     if common is None:
         return None
-    start = max(start or common[0], common[0], key=_tai_ns)
-    end = min(end or common[1], common[1], key=_tai_ns)
+    start = max(start or common[0], common[0], key=attrgetter("tai_ns"))
+    end = min(end or common[1], common[1], key=attrgetter("tai_ns"))
     if start.tai_ns >= end.tai_ns:
         return None
     first_s, end_s = unix_seconds([start.tai_ns, end.tai_ns]).tolist()
-    level: Level = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
-    width_s = HOUR_S if level == "hour" else DAY_S * _days_of_a_cell(end_s - first_s)
+    level: Bucket = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
+    days = math.ceil((end_s - first_s) / (DAY_S * _MOST_CELLS_OF_DAYS))
+    width_s = HOUR_S if level == "hour" else DAY_S * days
     cells = int(-(-end_s // width_s) - first_s // width_s)
     rates = []
     for run in runs:
@@ -396,21 +388,13 @@ def run_rates(
         buckets = read_buckets(connection, span, level, COUNTS)
         place = (buckets["unix_s"] // width_s - first_s // width_s).astype(int)
         rates.append(
-            RunRates(
+            compare.RunRates(
                 run=run,
                 totals={name: int(buckets[name].sum()) for name in COUNTS},
                 shares={name: _share(buckets, name, place, cells) for name in _SHARES},
             )
         )
-    return RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
-
-
-def _tai_ns(moment: Utc) -> int:
-    return moment.tai_ns
-
-
-def _days_of_a_cell(length_s: float) -> int:
-    return math.ceil(length_s / (DAY_S * _MOST_CELLS_OF_DAYS))
+    return compare.RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
 
 
 def _common_days(

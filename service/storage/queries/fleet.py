@@ -10,33 +10,15 @@ from msgspec import structs
 from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, select
 
 from service.missions.mission import Mission
+from service.storage.models import overview as models
 from service.storage.models.alarms import Alarm
 from service.storage.models.answers import Summary
-from service.storage.models.overview import (
-    Fleet,
-    FleetCells,
-    FleetRow,
-    KnownAttitude,
-    Overview,
-    OverviewRow,
-    Sparkline,
-    TrackerCounts,
-    WindowCounts,
-)
+from service.storage.queries import time_buckets
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
 from service.storage.queries.pages import PLACE
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.time_buckets import (
-    MAX_BATCHES_SUMMED,
-    BucketFilter,
-    Columns,
-    batches_about,
-    has_archived,
-    read_buckets,
-    read_steps,
-    totals,
-)
+from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_time_of
 from service.storage.recording.result_metrics import SUMMED
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
@@ -57,7 +39,6 @@ from service.times import (
     HOUR_S,
     UNIX_DAY,
     Utc,
-    bucket_start,
     recorded_utc,
     shifted,
     unix_seconds,
@@ -82,7 +63,7 @@ def fleet(
     period: Period,
     now: Utc,
     spacecraft: Collection[str] | None = None,
-) -> Fleet:
+) -> models.Fleet:
     """Every mission in a run; the last hour and the period end with the run's latest batch.
 
     With `spacecraft`, that of these.
@@ -92,11 +73,11 @@ def fleet(
     active = [each for each in active_alarms(connection, run, now.text) if each.spacecraft in named]
     if as_of is None:
         rows = tuple(_row(each, None, now, active) for each in named.values())
-        return Fleet(run, None, summary(active), rows, None)
+        return models.Fleet(run, None, summary(active), rows, None)
     facts = _Facts(connection, list(named), run, as_of, now)
     rows = tuple(_row(each, facts, now, active) for each in named.values())
     cells = _cells(connection, list(named), run, as_of, period)
-    return Fleet(run, as_of, summary(active), rows, cells)
+    return models.Fleet(run, as_of, summary(active), rows, cells)
 
 
 class _Facts:
@@ -116,43 +97,34 @@ class _Facts:
         self.last_hour = _last_hours(connection, names, run, as_of)
 
 
-def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
+def _row(
+    mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]
+) -> models.FleetRow:
     name = mission.name
     batch = None if facts is None else facts.latest.get(name)
+    about = name, mission.description, mission.retired
     alarms = tuple(each for each in active if each.spacecraft == name)
     if facts is None or batch is None:
-        return FleetRow(
-            name,
-            mission.description,
-            mission.retired,
-            "no_batches",
-            None,
-            None,
-            (),
-            None,
-            None,
-            None,
-            alarms,
-        )
-    return FleetRow(
-        name=name,
-        description=mission.description,
-        retired=mission.retired,
+        return models.FleetRow(*about, state="no_batches", alarms=alarms)
+    return models.FleetRow(
+        *about,
         state=batch.status or "no_attitude",
+        alarms=alarms,
         latest_batch=batch,
         last_attitude=facts.attitudes.get(name),
         trackers=_of_every_tracker(mission, facts.trackers.get(batch.id, {})),
         age_s=max(0.0, (facts.as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9),
         received_age_s=(now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9,
         last_hour=facts.last_hour.get(name),
-        alarms=alarms,
     )
 
 
-def _of_every_tracker(mission: Mission, counted: Mapping[str, Any]) -> tuple[TrackerCounts, ...]:
+def _of_every_tracker(
+    mission: Mission, counted: Mapping[str, Any]
+) -> tuple[models.TrackerCounts, ...]:
     """The counts of a mission's trackers, in its order; none of one that saw no star."""
     names = [each.name for each in mission.trackers]
-    return tuple(TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
+    return tuple(models.TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
 
 
 def _latest_ids(
@@ -212,7 +184,7 @@ def _tracker_counts(
     return found
 
 
-def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, KnownAttitude]:
+def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, models.KnownAttitude]:
     columns = solutions.c
     query = (
         select(
@@ -227,7 +199,7 @@ def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, Know
         .where(results.c.id.in_(list(ids.values())))
     )
     return {
-        name: KnownAttitude(id, time, status, (_root(p11), _root(p22), _root(p33)))
+        name: models.KnownAttitude(id, time, status, (_root(p11), _root(p22), _root(p33)))
         for name, id, time, status, p11, p22, p33 in connection.execute(query)
     }
 
@@ -238,16 +210,18 @@ def _root(variance: float) -> float:
 
 def _last_hours(
     connection: Connection, names: list[str], run: str, as_of: Utc
-) -> dict[str, WindowCounts]:
+) -> dict[str, models.WindowCounts]:
     """The counts of the hour that ends with the run's latest batch."""
     # The latest batch belongs to the window, one just an hour before it does not.
     end = shifted(as_of, _TICK_S)
     start = shifted(end, -HOUR_S)
     query = select(results.c.spacecraft, *(SUMMED[name] for name in COUNTS))
     asked = {"names": names, "run": run, "start_ns": start.tai_ns, "end_ns": end.tai_ns}
-    rows = connection.execute(query.where(*_IN_SPAN).group_by(results.c.spacecraft), asked)
+    rows = connection.execute(
+        query.where(*time_buckets.IN_PERIOD, _IN_NAMES).group_by(results.c.spacecraft), asked
+    )
     return {
-        name: WindowCounts(
+        name: models.WindowCounts(
             start=start.text, end=as_of.text, **dict(zip(COUNTS, map(int, counts), strict=True))
         )
         for name, *counts in rows
@@ -256,7 +230,7 @@ def _last_hours(
 
 def _cells(
     connection: Connection, names: list[str], run: str, as_of: Utc, period: Period
-) -> FleetCells:
+) -> models.FleetCells:
     width_s, span_s = CELLS_S[period], PERIODS_S[period]
     if period == "day":
         # Hours tell how many batches there are, and serve where those are too many.
@@ -277,7 +251,7 @@ def _first_cell_s(as_of: Utc, span_s: int, width_s: int) -> float:
 
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
-) -> FleetCells:
+) -> models.FleetCells:
     """Sums as a table of spacecraft and time."""
     start_s = _first_cell_s(as_of, span_s, width_s)
     place = {name: k for k, name in enumerate(names)}
@@ -289,7 +263,7 @@ def _table(
         values = np.array([each[2] for each in kept], dtype=float).T
         for name, column in zip(COUNTS, values, strict=True):
             np.add.at(counts[name], tuple(at), column)
-    return FleetCells(start_s, width_s, counts)
+    return models.FleetCells(start_s, width_s, counts)
 
 
 def _hours(
@@ -315,51 +289,29 @@ def _hours(
     ]
 
 
-_IN_SPAN = (
-    results.c.current,
-    results.c.spacecraft.in_(bindparam("names", expanding=True)),
-    results.c.run == bindparam("run"),
-    results.c.time_ns >= bindparam("start_ns"),
-    results.c.time_ns < bindparam("end_ns"),
+_IN_NAMES = results.c.spacecraft.in_(bindparam("names", expanding=True))
+_STEPS = (
+    select(results.c.spacecraft, time_buckets.STEP, *(SUMMED[name] for name in COUNTS))
+    .where(*time_buckets.IN_PERIOD, _IN_NAMES)
+    .group_by(results.c.spacecraft, time_buckets.STEP)
 )
 
 
 def _steps(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums of less than an hour, from the batches.
-
-    Each day is read by itself: between two of them there may be a leap second.
-    """
+    """Sums of less than an hour, from the batches."""
     end = shifted(as_of, _TICK_S)
-    begin = shifted(end, -span_s)
     found: list[tuple[Any, ...]] = []
-    for day in range(begin.bucket(DAY_S), as_of.bucket(DAY_S) + 1):
-        midnight, next_midnight = bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
-        asked = {
-            "names": names,
-            "run": run,
-            "start_ns": max(begin.tai_ns, midnight.tai_ns),
-            "end_ns": min(end.tai_ns, next_midnight.tai_ns),
-            "midnight_ns": midnight.tai_ns,
-        }
+    for midnight, asked in time_buckets.steps_by_day(shifted(end, -span_s), end, width_s):
         midnight_s = float(unix_seconds([midnight.tai_ns])[0])
         found += [
             (name, midnight_s + step * width_s, *counts)
-            for name, step, *counts in connection.execute(_steps_query(width_s), asked)
+            for name, step, *counts in connection.execute(
+                _STEPS, {"names": names, "run": run} | asked
+            )
         ]
     return found
-
-
-@cache
-def _steps_query(width_s: int) -> Select[Any]:
-    since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
-    number = since_ns // (width_s * 10**9)
-    # A leap second belongs to the cell that it ends.
-    last = DAY_S // width_s - 1
-    step = case((number > last, last), else_=number).label("step")
-    query = select(results.c.spacecraft, step, *(SUMMED[name] for name in COUNTS))
-    return query.where(*_IN_SPAN).group_by(results.c.spacecraft, step)
 
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
@@ -372,7 +324,7 @@ def overview(
     run: str,
     now: Utc,
     spacecraft: Collection[str] | None = None,
-) -> Overview:
+) -> models.Overview:
     """Every mission in a run; the last hour and day end with the run's latest batch.
 
     With `spacecraft`, runs and batches of others are as if they did not exist.
@@ -383,7 +335,7 @@ def overview(
     found = active_alarms(connection, run, now.text)
     if spacecraft is not None:
         found = [each for each in found if each.spacecraft in spacecraft]
-    return Overview(
+    return models.Overview(
         run=run,
         default_run=default_run(connection, spacecraft),
         as_of=None if as_of is None else as_of.text,
@@ -414,7 +366,7 @@ def _item(
     as_of: Utc | None,
     now: Utc,
     active: Sequence[Alarm],
-) -> OverviewRow:
+) -> models.OverviewRow:
     state = live_state(connection, mission, run, now)
     batch, attitude = state.latest_batch, state.last_attitude
     item: Row = structs.asdict(state) | {
@@ -425,7 +377,7 @@ def _item(
         "alarms": [alarm for alarm in active if alarm.spacecraft == mission.name],
     }
     if batch is None or as_of is None:
-        return OverviewRow(**item)
+        return models.OverviewRow(**item)
     item["age_s"] = max(0.0, (as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9)
     item["received_age_s"] = (now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9
     for name, width_s in (("hour", HOUR_S), ("day", DAY_S)):
@@ -433,10 +385,12 @@ def _item(
         end = shifted(as_of, _TICK_S)
         span = BucketFilter(mission.name, run, shifted(end, -width_s), end)
         step_s, buckets = _read(connection, span, width_s)
-        window = WindowCounts(start=span.start.text, end=as_of.text, **totals(buckets))
+        window = models.WindowCounts(
+            start=span.start.text, end=as_of.text, **time_buckets.totals(buckets)
+        )
         item[f"last_{name}"] = window
         item[f"sparkline_{name}"] = _sparkline(buckets, step_s)
-    return OverviewRow(**item)
+    return models.OverviewRow(**item)
 
 
 def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
@@ -444,18 +398,21 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
     return [math.sqrt(max(covariance_arcsec2[axis][axis], 0.0)) for axis in range(3)]
 
 
-def _read(connection: Connection, span: BucketFilter, width_s: int) -> tuple[int, Columns]:
+def _read(
+    connection: Connection, span: BucketFilter, width_s: int
+) -> tuple[int, time_buckets.Columns]:
     are_many = width_s > HOUR_S and (
-        batches_about(connection, span) > MAX_BATCHES_SUMMED or has_archived(connection, span)
+        time_buckets.batches_about(connection, span) > time_buckets.MAX_BATCHES_SUMMED
+        or time_buckets.has_archived(connection, span)
     )
     if are_many:
-        return HOUR_S, read_buckets(connection, span, "hour", COUNTS)
-    return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
+        return HOUR_S, time_buckets.read_buckets(connection, span, "hour", COUNTS)
+    return STEPS[width_s], time_buckets.read_steps(connection, span, STEPS[width_s], COUNTS)
 
 
-def _sparkline(buckets: Columns, step_s: int) -> Sparkline:
+def _sparkline(buckets: time_buckets.Columns, step_s: int) -> models.Sparkline:
     observed = np.maximum(buckets["observed"], 1.0)
-    return Sparkline(
+    return models.Sparkline(
         bucket_s=step_s,
         unix_s=buckets["unix_s"].tolist(),
         batches=buckets["batches"].astype(int).tolist(),

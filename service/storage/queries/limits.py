@@ -7,6 +7,7 @@ from typing import Any
 
 from sqlalchemy import Connection, bindparam, insert, select, update
 
+from service.alarms import subjects
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import (
     QUANTITIES,
@@ -15,25 +16,17 @@ from service.alarms.quantities import (
     limited_names,
     tracker_names,
 )
-from service.alarms.subjects import (
-    Subject,
-    limits_of_subjects,
-    quantity_and_tracker,
-    sampler,
-    subject_of,
-)
 from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
-from service.storage.queries.pages import ResultFilter, newest
+from service.storage.queries.pages import ResultFilter
 from service.storage.recording import events
 from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import prepared
-from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
-from service.times import Utc, recorded_utc
+from service.storage.sql.tables import COUNTED, MEASURED, results, tracker_values
 
-LimitsInForce = Mapping[Subject, LimitSettings]
+LimitsInForce = Mapping[subjects.Subject, LimitSettings]
 
 _SHIPPED: dict[tuple[str, tuple[str, ...]], Mapping[QuantityName, LimitSettings]] = {}
 # Run with every batch of a live spacecraft.
@@ -52,11 +45,11 @@ def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     if shipped is None:
         shipped = _SHIPPED[key] = default_limits(mission)
     own = {
-        subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
+        subjects.subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
         for row in _in_force(connection, mission.name)
         if row["settings"] is not None
     }
-    return limits_of_subjects(mission, shipped, own)
+    return subjects.limits_of_subjects(mission, shipped, own)
 
 
 @lru_cache(maxsize=256)
@@ -173,18 +166,11 @@ def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
     return _IN_FORCE.read(connection, {"of_spacecraft": spacecraft})
 
 
-def latest_time(connection: Connection, selected: ResultFilter, now: Utc) -> Utc | None:
-    """The time of the newest batch; None without any."""
-    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
-    row = newest(connection, query, selected, now)
-    return None if row is None else recorded_utc(row["time"])
-
-
 def latest_samples(
-    connection: Connection, selected: ResultFilter, subject: Subject, limit: int
+    connection: Connection, selected: ResultFilter, subject: subjects.Subject, limit: int
 ) -> tuple[list[int], list[Sample]]:
     """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
-    _, tracker = quantity_and_tracker(subject)
+    _, tracker = subjects.quantity_and_tracker(subject)
     values = tracker_values if tracker else results
     columns = [values.c[name] for name in (*COUNTED, "status", *MEASURED)]
     query = select(results.c.time_ns, *columns).where(*selected.conditions())
@@ -193,7 +179,7 @@ def latest_samples(
         of_tracker = tracker_values.c.tracker == tracker
         query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
     query = query.order_by(results.c.time_ns.desc(), results.c.batch_id.desc()).limit(limit)
-    sample_of = sampler(subject)
+    sample_of = subjects.sampler(subject)
     rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
     samples = [sample_of(row, {tracker: row}) for row in rows]
     return [row["time_ns"] for row in rows], [each for each in samples if each is not None]

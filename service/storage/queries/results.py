@@ -11,24 +11,10 @@ from sqlalchemy import ColumnElement, Connection, Select, or_, select
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import Busy, NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
-from service.storage.models.answers import (
-    Answer,
-    FrameWithStars,
-    Neighbours,
-    Result,
-    StarCounts,
-    Summary,
-)
+from service.storage.models import answers
 from service.storage.models.base import Page
+from service.storage.queries import with_archive
 from service.storage.queries.pages import ResultFilter, newest
-from service.storage.queries.with_archive import (
-    FIRST_ID,
-    LAST_ID,
-    MOST_OPENED,
-    ArchiveUse,
-    first_rows,
-    page_of,
-)
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import (
@@ -56,7 +42,7 @@ def list_batches(
     batch: str | None,
     limit: int,
     cursor: str | None,
-) -> Page[Summary]:
+) -> Page[answers.Summary]:
     """Current results, recorded and archived, newest batch time first.
 
     `outcome` keeps batches with at least one star of it; `status` those whose
@@ -71,9 +57,9 @@ def list_batches(
     parts = None
     if batch is not None:
         parts = parts_with(connection, selected.spacecraft, selected.run, batch)
-    return page_of(
+    return with_archive.page_of(
         connection,
-        ArchiveUse(archive, most_opened=MOST_OPENED, parts=parts),
+        with_archive.ArchiveUse(archive, most_opened=with_archive.MOST_OPENED, parts=parts),
         summary_query().where(*chosen),
         selected,
         limit,
@@ -144,7 +130,7 @@ def spacecraft_of(connection: Connection, id: str) -> str | None:
     return None
 
 
-def read_record(connection: Connection, id: str, *, archived: bool = False) -> Result:
+def read_record(connection: Connection, id: str, *, archived: bool = False) -> answers.Result:
     """A result with its input and the what-ifs of its batch; raises `NotFound`.
 
     `archived` says that the connection is to a batch of the archive.
@@ -159,7 +145,7 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> R
         frames.c.batch_id == row["batch_id"]
     )
     frame = connection.execute(of_frame).mappings().first()
-    return Result(
+    return answers.Result(
         answer=answer_from_json(row["answer"]),
         input=json.loads(row["input"]),
         options=json.loads(row["options"]),
@@ -175,17 +161,17 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> R
     )
 
 
-def answer_from_json(text: str | bytes) -> Answer:
+def answer_from_json(text: str | bytes) -> answers.Answer:
     """A stored answer, which may be of an earlier version of the service."""
     return _ANSWERS.decode(text)
 
 
-_ANSWERS = msgspec.json.Decoder(Answer)
+_ANSWERS = msgspec.json.Decoder(answers.Answer)
 
 
-def _frame_of(row: Any) -> FrameWithStars:
+def _frame_of(row: Any) -> answers.FrameWithStars:
     fields = json.loads(row["summary"]) | json.loads(row["detections"])
-    return msgspec.convert(fields, FrameWithStars)
+    return msgspec.convert(fields, answers.FrameWithStars)
 
 
 def frame_of_result(connection: Connection, id: str) -> Row:
@@ -224,9 +210,9 @@ def summary_query() -> Select[Any]:
     return select(*kept, *named).join_from(results, batches)
 
 
-def summary_of(row: Any) -> Summary:
+def summary_of(row: Any) -> answers.Summary:
     """A result in a list, without its stars and its attitude."""
-    return Summary(**summary_fields(row))
+    return answers.Summary(**summary_fields(row))
 
 
 def summary_fields(row: Any) -> Row:
@@ -235,7 +221,7 @@ def summary_fields(row: Any) -> Row:
     return {
         **{name: row[name] for name in taken},
         "options": json.loads(row["options"]),
-        "counts": StarCounts(**{name: row[name] for name in STARS}),
+        "counts": answers.StarCounts(**{name: row[name] for name in STARS}),
         "status": row["status"],
         "reason": row["reason"],
         "measures": measured(row),
@@ -267,22 +253,22 @@ def place_of(connection: Connection, id: str) -> ResultPlace:
     return ResultPlace(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
 
 
-def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> Neighbours:
+def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> answers.Neighbours:
     """The results before and after one in time, of its spacecraft and run."""
     sides = (_next(connection, archive, place, newest_first=side) for side in (True, False))
-    return Neighbours(place.current, *sides)
+    return answers.Neighbours(place.current, *sides)
 
 
 def _next(
     connection: Connection, archive: Archive, place: ResultPlace, *, newest_first: bool
-) -> Summary | None:
+) -> answers.Summary | None:
     selected = ResultFilter(place.run, place.spacecraft)
-    beyond = place.time_ns, FIRST_ID if newest_first else LAST_ID
+    beyond = place.time_ns, with_archive.FIRST_ID if newest_first else with_archive.LAST_ID
     query = summary_query().where(*selected.conditions())
     try:
-        found = first_rows(
+        found = with_archive.first_rows(
             connection,
-            ArchiveUse(archive),
+            with_archive.ArchiveUse(archive),
             query,
             selected,
             1,

@@ -7,25 +7,19 @@ that the chart of an old result shows that result.
 import math
 
 import numpy as np
-from erfa import ufunc
 
+from service.acquire.choices import aberration_velocity
 from service.errors import BadBatch, Fault
 from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch, QuaternionPrior
 from service.observations.calibrate import CorrectedObservations, correct
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.ephemeris import observer_velocity, sun_distance_au
+from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
+from service.storage.models import charts
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.models.charts import (
-    Boresight,
-    CatalogStarPlace,
-    ObservedStarPlace,
-    StarField,
-    TrackerField,
-)
 from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
 from service.vectors import (
     ARCSEC_PER_RADIAN,
@@ -46,7 +40,7 @@ EDGE_STEP_DEG = 0.5
 
 def star_field_of(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
-) -> StarField:
+) -> charts.StarField:
     """The view of every tracker of a batch, as an answer to it has identified the stars.
 
     The answer's attitude carries catalog stars into the tracker's axes.  Without one the
@@ -65,7 +59,7 @@ def star_field_of(
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
     trackers = zip(correct(batch, mission), answer.observations, strict=True)
-    return StarField(
+    return charts.StarField(
         through="a_priori" if solved is None else solved.method,
         same_catalog=run_catalog.digest == answer.provenance.run_catalog,
         trackers=[
@@ -85,7 +79,7 @@ def _tracker(
     mission: Mission,
     run_catalog: RunCatalog,
     rows: dict[str, int],
-) -> TrackerField:
+) -> charts.TrackerField:
     tracker = corrected.tracker
     region = search_region(tracker, presumed, mission, f"observations.{index}.tracker")
     to_tracker = tracker.body_from_tracker.T @ attitude
@@ -95,31 +89,32 @@ def _tracker(
     near = _near(run_catalog, region, to_tracker[2], radius_deg)
     shown = np.union1d(near, np.array(list(named.values()), np.int64))
     natural = run_catalog.direction_at(batch.time)[shown]
-    apparent = dict(zip(shown.tolist(), _apparent(natural, batch) @ to_tracker.T, strict=True))
+    seen_at = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
+    place_of = dict(zip(shown.tolist(), seen_at, strict=True))
     ra_deg, dec_deg = to_ra_dec(to_tracker[2])
-    return TrackerField(
+    return charts.TrackerField(
         tracker=tracker.name,
-        boresight=Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
+        boresight=charts.Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
         field_of_view_radius_deg=tracker.field_of_view_radius_deg,
         radius_deg=radius_deg,
         magnitude_limit_mag=mission.catalog.magnitude_limit_mag,
         zone_edges=_zone_edges(region, to_tracker, radius_deg),
         catalog=[
-            CatalogStarPlace(
+            charts.CatalogStarPlace(
                 id=run_catalog.star_id[row],
                 magnitude=float(run_catalog.magnitude_mag[row]),
                 **_angles(direction),
             )
-            for row, direction in apparent.items()
+            for row, direction in place_of.items()
             if direction[2] > 0
         ],
         observed=[
-            ObservedStarPlace(
+            charts.ObservedStarPlace(
                 outcome=star.outcome,
                 star=None if star.star is None else star.star.id,
                 rivals=list(star.rivals or []),
                 magnitude=_number(corrected.magnitude_mag[k]),
-                residual_arcsec=_residual(seen[k], star, rows, apparent),
+                residual_arcsec=_residual(seen[k], star, rows, place_of),
                 **_angles(seen[k]),
             )
             for k, star in enumerate(found.stars)
@@ -150,16 +145,6 @@ def _near(
     return np.asarray(near[(angle >= region.least_deg) & (angle <= region.most_deg)])
 
 
-def _apparent(natural: Vector, batch: ObservationBatch) -> Vector:
-    """Catalog directions as the moving observer sees them, where the batch asks for it."""
-    if batch.aberration != "to_correct":
-        return natural
-    velocity = observer_velocity(batch.time, batch.velocity_km_per_s)
-    inverse_lorentz = math.sqrt(1.0 - float(velocity @ velocity))
-    seen = ufunc.ab(natural, velocity, sun_distance_au(batch.time), inverse_lorentz)
-    return np.asarray(seen, dtype=np.float64)
-
-
 def _zone_edges(
     region: SearchRegion, to_tracker: Matrix, radius_deg: float
 ) -> list[list[list[float]]]:
@@ -183,14 +168,14 @@ def _zone_edges(
 
 
 def _residual(
-    seen: Vector, star: Star, rows: dict[str, int], apparent: dict[int, Vector]
+    seen: Vector, star: Star, rows: dict[str, int], place_of: dict[int, Vector]
 ) -> tuple[float, float] | None:
     row = rows.get(star.star.id) if star.star else None
     if star.residual_arcsec is None or row is None:
         return None
     along_h = unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
     along_v = np.cross(seen, along_h)
-    off = (seen - apparent[row]) * ARCSEC_PER_RADIAN
+    off = (seen - place_of[row]) * ARCSEC_PER_RADIAN
     return float(off @ along_h), float(off @ along_v)
 
 

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select
+from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select, tuple_
 
 from service.alarms.quantities import (
     QUANTITIES,
@@ -18,25 +18,17 @@ from service.alarms.quantities import (
     StarShare,
 )
 from service.storage.models.spacecraft import History, Numbers, RankedBatch, Series
+from service.storage.queries import time_buckets
 from service.storage.queries.pages import (
     PLACE,
     ResultFilter,
-    newest,
+    latest_time,
     newest_first,
-    oldest_first,
-    page_of,
 )
 from service.storage.queries.results import summary_fields, summary_query
-from service.storage.queries.time_buckets import (
-    MAX_BATCHES_SUMMED,
-    BucketFilter,
-    Columns,
-    batches_about,
-    has_archived,
-    read_buckets,
-    read_steps,
-)
+from service.storage.queries.time_buckets import BucketFilter, Columns
 from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
+from service.storage.sql.columns import Row
 from service.storage.sql.tables import (
     COUNTED,
     MEASURED,
@@ -51,7 +43,6 @@ from service.times import (
     HOUR_S,
     Utc,
     bucket_start,
-    parse_utc,
     shifted,
     unix_seconds,
     utc_now,
@@ -104,33 +95,23 @@ def history(
     """
     span = _span(connection, spacecraft, run, start, end, request.tracker)
     if span is None:
-        return _empty(spacecraft, run, start, end, request)
+        return _empty(spacecraft, run, start, request)
     if request.strategy == "latest":
         return _latest(connection, span, request)
     width_s, source = _resolution(connection, span, request.size)
     if source == "batch":
-        cells = read_steps(connection, span, width_s)
+        cells = time_buckets.read_steps(connection, span, width_s)
     else:
-        cells = read_buckets(connection, span, source)
+        cells = time_buckets.read_buckets(connection, span, source)
     return _thinned(cells, span, width_s, source, request)
-
-
-def latest_time(
-    connection: Connection, run: str, spacecraft: str | None = None, *, now: Utc
-) -> Utc | None:
-    """The time of the latest batch of a run, or of one spacecraft in it (see `pages.newest`)."""
-    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
-    row = newest(connection, query, ResultFilter(run, spacecraft), now)
-    return None if row is None else parse_utc(row["time"])
 
 
 def latest_time_of(
     connection: Connection, run: str, spacecraft: Collection[str] | None, *, now: Utc
 ) -> Utc | None:
     """The time of the latest batch of some spacecraft in a run; None: of any."""
-    if spacecraft is None:
-        return latest_time(connection, run, now=now)
-    found = (latest_time(connection, run, name, now=now) for name in spacecraft)
+    names = [None] if spacecraft is None else spacecraft
+    found = (latest_time(connection, ResultFilter(run, name), now) for name in names)
     return max(filter(None, found), key=lambda moment: moment.tai_ns, default=None)
 
 
@@ -143,7 +124,7 @@ def _span(
     tracker: str | None,
 ) -> BucketFilter | None:
     if end is None:
-        latest = latest_time(connection, run, spacecraft, now=utc_now())
+        latest = latest_time(connection, ResultFilter(run, spacecraft), utc_now())
         if latest is None:
             return None
         end = shifted(latest, 1e-6)
@@ -160,8 +141,11 @@ def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[
         # Longer than the widest of them: as many months of thirty days as it takes.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
-        are_few = end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED
-        if are_few and not has_archived(connection, span):
+        are_few = (
+            end_s - first_s <= HOUR_S
+            or time_buckets.batches_about(connection, span) <= time_buckets.MAX_BATCHES_SUMMED
+        )
+        if are_few and not time_buckets.has_archived(connection, span):
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
@@ -183,10 +167,7 @@ def _thinned(
     reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span, number_of))
     counts = number_of.astype(int).tolist()
     return History(
-        spacecraft=span.spacecraft,
-        run=span.run,
-        start=span.start.text,
-        end=span.end.text,
+        **_about(span),
         strategy=request.strategy,
         bucket_s=width_s,
         source=source,
@@ -314,17 +295,19 @@ def every_batch(
     with reading() as connection:
         span = _span(connection, spacecraft, run, start, end, tracker)
     if span is None:
-        yield _empty(spacecraft, run, start, end, request)
+        yield _empty(spacecraft, run, start, request)
         return
-    query = _values_query(span)
-    cursor: str | None = None
+    query = _values_query(span).order_by(*PLACE).limit(PAGE)
+    beyond = query
     while True:
         with reading() as connection:
-            page = page_of(connection, oldest_first(query, cursor), PAGE, dict)
-        yield _of_batches(page.items, span, request)
-        cursor = page.next_cursor
-        if cursor is None:
+            rows = connection.execute(beyond).mappings().all()
+        if rows or beyond is query:
+            yield _of_batches(rows, _about(span), request)
+        if len(rows) < PAGE:
             return
+        last = rows[-1]["time_ns"], rows[-1]["batch_id"]
+        beyond = query.where(tuple_(*PLACE) > tuple_(*last))
 
 
 def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> History:
@@ -332,17 +315,24 @@ def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest)
     query = newest_first(_values_query(span)).limit(request.size + 1)
     rows = list(connection.execute(query).mappings())
     thinned = len(rows) > request.size
-    return _of_batches(rows[: request.size][::-1], span, request, thinned=thinned)
+    return _of_batches(rows[: request.size][::-1], _about(span), request, thinned=thinned)
+
+
+def _about(span: BucketFilter) -> Row:
+    """The fields of a history that tell what it is of."""
+    return {
+        "spacecraft": span.spacecraft,
+        "run": span.run,
+        "start": span.start.text,
+        "end": span.end.text,
+    }
 
 
 def _of_batches(
-    rows: Sequence[Any], span: BucketFilter, request: HistoryRequest, *, thinned: bool = False
+    rows: Sequence[Any], about: Row, request: HistoryRequest, *, thinned: bool = False
 ) -> History:
     return History(
-        spacecraft=span.spacecraft,
-        run=span.run,
-        start=span.start.text,
-        end=span.end.text,
+        **about,
         strategy=request.strategy,
         bucket_s=None,
         source="batch",
@@ -360,33 +350,25 @@ def _of_batches(
     )
 
 
-def _empty(
-    spacecraft: str, run: str, start: Utc | None, end: Utc | None, request: HistoryRequest
-) -> History:
-    """The history of a run without batches of the spacecraft."""
-    is_latest = request.strategy == "latest"
-    columns: tuple[str, ...] = ("value",) if is_latest else ("count", "mean", "min", "max")
-    lists: tuple[str, ...] = ("time", "id", "batch") if is_latest else ("batches",)
+def _empty(spacecraft: str, run: str, start: Utc | None, request: HistoryRequest) -> History:
+    """The history, without an end, of a run without batches of the spacecraft."""
+    begin = None if start is None else start.text
+    about: Row = {"spacecraft": spacecraft, "run": run, "start": begin, "end": None}
+    if request.strategy == "latest":
+        return _of_batches([], about, request)
+    nothing = np.empty(0)
     return History(
-        spacecraft=spacecraft,
-        run=run,
-        start=None if start is None else start.text,
-        end=None if end is None else end.text,
+        **about,
         strategy=request.strategy,
         bucket_s=None,
         source="batch",
         thinned=False,
         unix_s=[],
-        **_no_rows(lists),
+        batches=[],
         series={
-            name: Series(unit=QUANTITIES[name].unit, **{column: [] for column in columns})
-            for name in request.quantities
+            name: _series(name, nothing, nothing, nothing, nothing) for name in request.quantities
         },
     )
-
-
-def _no_rows(names: Sequence[str]) -> dict[str, Any]:
-    return {name: [] for name in names}
 
 
 # The worst batches of a period by a quantity, found without reading all batches.

@@ -163,7 +163,7 @@ def _add_to_trends(connection: Connection, rows: Rows) -> None:
     keys = {id: (row["spacecraft"], row["run"], hours[id]) for id, row in current.items()}
     rollups.add(connection, ((keys[id], row) for id, row in current.items()))
     of_trackers = rows["tracker_values"].to_pylist()
-    rollups.add_trackers(connection, ((keys[row["batch_id"]], row) for row in of_trackers))
+    rollups.add(connection, ((keys[row["batch_id"]], row) for row in of_trackers))
 
 
 def verify_archive(

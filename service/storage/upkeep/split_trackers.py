@@ -247,7 +247,7 @@ def _write(
     insert_all(connection, tracker_values, [values for _, values in new])
     # The projector adds those that it has not come to yet.
     passed = [(id, values) for id, values in new if current[id] <= position]
-    rollups.add_trackers(connection, (((*owner, hours[id]), values) for id, values in passed))
+    rollups.add(connection, (((*owner, hours[id]), values) for id, values in passed))
     last = {"time_ns": rows[-1]["time_ns"], "batch_id": rows[-1]["batch_id"]}
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))
 

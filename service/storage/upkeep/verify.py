@@ -37,6 +37,7 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
+from service.storage.queries.time_buckets import Bucket
 from service.storage.recording.digests import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.tracker_values import is_waiting
 from service.storage.sql.columns import Row, metadata
@@ -308,13 +309,13 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", is_solved: bool) -
 
 def _of_the_trends(engine: Engine) -> Iterator[str]:
     try:
-        for bucket, of_trackers in product(get_args(rollups.Bucket), (False, True)):
+        for bucket, of_trackers in product(get_args(Bucket), (False, True)):
             yield from _of_trends_by(engine, bucket, of_trackers=of_trackers)
     except BadInput as error:
         yield f"the trends cannot be counted again: {error}"
 
 
-def _of_trends_by(engine: Engine, bucket: rollups.Bucket, *, of_trackers: bool) -> Iterator[str]:
+def _of_trends_by(engine: Engine, bucket: Bucket, *, of_trackers: bool) -> Iterator[str]:
     with engine.begin() as connection:
         stored, counted = (
             {key: row for key, row in found.items() if row["batches"]}

@@ -12,7 +12,7 @@ from service.access.tokens import Caller
 from service.observations.schema import Key, RunName, Wire
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
-from service.storage.webhooks.registered import (
+from service.storage.webhooks import (
     Webhook,
     WebhookDeliveryPage,
     WebhookList,

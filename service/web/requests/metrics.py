@@ -32,7 +32,7 @@ from service.storage.models.overview import ZoneCache
 from service.storage.projections.projector import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
-from service.storage.webhooks.registered import Webhook
+from service.storage.webhooks import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now
 from service.webhooks.messages import Result
 

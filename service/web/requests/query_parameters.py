@@ -27,9 +27,9 @@ from service.observations.schema import Key, RunName
 from service.products.attitudes import ProductGrade, StatusWanted
 from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
 from service.products.moment import AtMethod
-from service.storage.projections.rollups import Bucket
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
+from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
 
