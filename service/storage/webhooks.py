@@ -56,9 +56,8 @@ class Webhook(Record, frozen=True, kw_only=True):
     url: str
     kinds: Annotated[list[EventKind] | None, doc("Only events of these kinds; null: of all.")]
     spacecraft: Annotated[list[str] | None, doc("Only events about these; null: about all.")]
-    severity: Annotated[
-        SeverityName | None, doc("Of alarms only those that were at least as severe.")
-    ]
+    severity: SeverityName | None
+    """Of alarms only those that were at least as severe."""
     run: Annotated[str | None, doc("Only events of this run; null: of every run.")]
     enabled: bool
     state: WebhookStateName
@@ -68,17 +67,15 @@ class Webhook(Record, frozen=True, kw_only=True):
     waiting: Annotated[Count, doc("Events that are queued.")]
     oldest: Annotated[Stamp | None, doc("When the oldest of them was queued.")]
     dead: Annotated[Count, doc("Dead letters: events that were not delivered within a day.")]
-    missed: Annotated[
-        Count, doc("Events that were no longer kept when their turn to be queued came.")
-    ]
+    missed: Count
+    """Events that were no longer kept when their turn to be queued came."""
     failing_since: Annotated[Stamp | None, doc("null: the last delivery succeeded.")]
     last_attempt: Stamp | None
     last_delivered: Stamp | None
     last_status: HttpStatus
     last_fault: Fault
-    previous_until: Annotated[
-        Stamp | None, doc("Until then every delivery has a signature by the previous secret too.")
-    ]
+    previous_until: Stamp | None
+    """Until then every delivery has a signature by the previous secret too."""
 
 
 class WebhookWithSecret(Webhook, frozen=True, kw_only=True):

@@ -62,9 +62,8 @@ class DayKey:
 class GradedStretchInfo(Struct, frozen=True, kw_only=True):
     """An unbroken stretch of a day."""
 
-    model: Annotated[
-        str, doc("`gyro`, or `constant_rate` where no gyro runs: the rate is a random walk.")
-    ]
+    model: str
+    """`gyro`, or `constant_rate` where no gyro runs: the rate is a random walk."""
     start: Moment
     end: Moment
     samples: Count
@@ -75,18 +74,12 @@ class DaySummary(Struct, frozen=True, kw_only=True):
     """What became of what was recorded of a day."""
 
     stretches: list[GradedStretchInfo]
-    measurements: Annotated[
-        dict[str, int],
-        doc(
-            "Measured attitudes by what became of them: accepted, rejected, started (with it the "
-            "filter began), undecided, unused, unusable (its covariance), alone (too few)."
-        ),
-    ]
+    measurements: dict[str, int]
+    """Measured attitudes by what became of them: accepted, rejected, started (with it the filter
+    began), undecided, unused, unusable (its covariance), alone (too few)."""
     gyro: Annotated[dict[str, int], doc("Samples, gaps, samples beyond the largest rate.")]
-    nis_per_degree: Annotated[
-        float | None,
-        doc("Mean of z^T S^-1 z of the accepted measurements by degrees of freedom: about 1."),
-    ]
+    nis_per_degree: float | None
+    """Mean of z^T S^-1 z of the accepted measurements by degrees of freedom: about 1."""
 
 
 class GradedDayRow(Struct, frozen=True, kw_only=True):
@@ -109,29 +102,20 @@ class Innovation(Record, frozen=True, kw_only=True):
 
     time: Moment
     outcome: Annotated[
-        str,
-        DescribedAs(Literal["accepted", "rejected", "started", "undecided", "unused"]),
-        doc(
-            "`accepted` and `started` measurements are used; `started`: with it the filter began. "
-            "`undecided`: it agrees with two attitudes that contradict each other."
-        ),
+        str, DescribedAs(Literal["accepted", "rejected", "started", "undecided", "unused"])
     ]
-    innovation_arcsec: Annotated[
-        Components | None,
-        doc("From prediction to measurement, about the body axes; null: nothing was predicted."),
-    ]
-    innovation_sigma_arcsec: Annotated[
-        Components | None, doc("One sigma of prediction and measurement together.")
-    ]
-    chi_square: Annotated[
-        float | None, doc("Of the innovation, with three degrees of freedom: 3 on average.")
-    ]
-    difference_arcsec: Annotated[
-        Components, doc("From the smoothed attitude to the measured one, about the body axes.")
-    ]
-    difference_sigma_arcsec: Annotated[
-        Components, doc("One sigma; the smoothed attitude is partly made of the measured one.")
-    ]
+    """`accepted` and `started` measurements are used; `started`: with it the filter began.
+    `undecided`: it agrees with two attitudes that contradict each other."""
+    innovation_arcsec: Components | None
+    """From prediction to measurement, about the body axes; null: nothing was predicted."""
+    innovation_sigma_arcsec: Components | None
+    """One sigma of prediction and measurement together."""
+    chi_square: float | None
+    """Of the innovation, with three degrees of freedom: 3 on average."""
+    difference_arcsec: Components
+    """From the smoothed attitude to the measured one, about the body axes."""
+    difference_sigma_arcsec: Components
+    """One sigma; the smoothed attitude is partly made of the measured one."""
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
     revision: Annotated[int, Field(ge=1), doc("Of the day.")]
 

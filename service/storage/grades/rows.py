@@ -148,15 +148,12 @@ class LiveAttitude(Record, frozen=True, kw_only=True):
     quaternion: Quaternion
     covariance_arcsec2: Covariance
     rate_deg_per_s: Annotated[Components, doc("Of the body relative to inertial, in body axes.")]
-    bias_deg_per_h: Annotated[
-        Components | None, doc("Bias of the gyro, in body axes; null at a constant rate.")
-    ]
-    bias_sigma_deg_per_h: Annotated[
-        Components, doc("One sigma of the bias or, at a constant rate, of the rate.")
-    ]
-    status: Annotated[
-        StatusWord, doc("`suspect`: measurements contradict it, or have not confirmed it yet.")
-    ]
+    bias_deg_per_h: Components | None
+    """Bias of the gyro, in body axes; null at a constant rate."""
+    bias_sigma_deg_per_h: Components
+    """One sigma of the bias or, at a constant rate, of the rate."""
+    status: StatusWord
+    """`suspect`: measurements contradict it, or have not confirmed it yet."""
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
 
 

@@ -10,13 +10,11 @@ Scope = Literal["read", "submit", "operate"]
 class Session(Record, frozen=True, kw_only=True):
     """The caller and its scopes."""
 
-    name: Annotated[
-        str | None, doc("The token's name, which the audit list records with each change.")
-    ]
+    name: str | None
+    """The token's name, which the audit list records with each change."""
     scopes: list[Scope]
-    spacecraft: Annotated[
-        list[str] | None, doc("Spacecraft that the token is bound to; null: all.")
-    ]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
 
 
 TokenState = Literal["good", "expired", "revoked"]
@@ -27,9 +25,8 @@ class Token(Record, frozen=True, kw_only=True):
 
     name: Annotated[str, doc("The audit list records changes under it; never used again.")]
     scopes: list[Scope]
-    spacecraft: Annotated[
-        list[str] | None, doc("Spacecraft that the token is bound to; null: all.")
-    ]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
     rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
     created: Stamp
     expires: Stamp

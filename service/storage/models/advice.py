@@ -34,15 +34,12 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
     confidence: Literal["high", "moderate", "low", "none"]
     differences: Count
     batches: Count
-    needed: Annotated[
-        Estimate | None, doc("The value that accepts 99 % of the true pairs or stars.")
-    ]
-    share_beyond: Annotated[
-        Estimate | None, doc("Share of the true pairs or stars that the present value rejects.")
-    ]
-    recommended: Annotated[
-        float | None, doc("For votes; `not_used` says where the identifier is another.")
-    ]
+    needed: Estimate | None
+    """The value that accepts 99 % of the true pairs or stars."""
+    share_beyond: Estimate | None
+    """Share of the true pairs or stars that the present value rejects."""
+    recommended: float | None
+    """For votes; `not_used` says where the identifier is another."""
     action: Action
     text: Text
 
@@ -78,10 +75,8 @@ class NoiseAdvice(Record, frozen=True, kw_only=True):
     sigma_arcsec: Estimate | None
     batches: Count
     verdict: Size
-    worst: Annotated[
-        NoisePeriodAdvice | None,
-        doc("A period in which the noise was certainly larger than `sigma_arcsec`."),
-    ]
+    worst: NoisePeriodAdvice | None
+    """A period in which the noise was certainly larger than `sigma_arcsec`."""
     action: Action
     text: Text
 
@@ -91,9 +86,8 @@ class MagnitudeAdvice(Record, frozen=True, kw_only=True):
 
     tracker: str
     pivot_mag: Annotated[float | None, doc("The median of the catalog magnitudes.")]
-    offset_mag: Annotated[
-        Estimate | None, doc("At the pivot; positive: the tracker measures fainter.")
-    ]
+    offset_mag: Estimate | None
+    """At the pivot; positive: the tracker measures fainter."""
     scale: Estimate | None
     now_sigma_mag: float
     scatter_mag: Annotated[Estimate | None, doc("One standard deviation about the line.")]
@@ -109,14 +103,10 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
 
     tracker: str
     reference: str
-    rotation_arcsec: Annotated[
-        Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None,
-        doc("Rotation vector about the body axes."),
-    ]
-    axes_body: Annotated[
-        Annotated[list[Components], Field(min_length=3, max_length=3)] | None,
-        doc("The measured x, y and z axis of the tracker, if the sample fixes them."),
-    ]
+    rotation_arcsec: Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None
+    """Rotation vector about the body axes."""
+    axes_body: Annotated[list[Components], Field(min_length=3, max_length=3)] | None
+    """The measured x, y and z axis of the tracker, if the sample fixes them."""
     batches: Count
     verdict: Literal["off", "fits", "no_verdict"]
     action: Action
@@ -126,13 +116,10 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
 class InnovationAdvice(Record, frozen=True, kw_only=True):
     """Noise by the innovations of the filter and how they follow each other."""
 
-    subject: Annotated[
-        Literal["gyro", "attitudes"],
-        doc("`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."),
-    ]
-    ratio: Annotated[
-        Estimate | None, doc("True over assumed standard deviation; null: too little data.")
-    ]
+    subject: Literal["gyro", "attitudes"]
+    """`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."""
+    ratio: Estimate | None
+    """True over assumed standard deviation; null: too little data."""
     measurements: Annotated[Count, doc("Innovations that were used.")]
     action: Action
     text: Text
@@ -150,17 +137,11 @@ class Trial(Record, frozen=True, kw_only=True):
     unique: Count
     ambiguous: Count
     unmatched: Count
-    named_otherwise: Annotated[
-        Count,
-        doc("Stars that are unique here and under `verified`, but as different catalog stars."),
-    ]
-    change_points: Annotated[
-        Estimate | None,
-        doc(
-            "Change of the share that is not unique, in percentage points, relative to votes "
-            "with the present settings; null: not compared."
-        ),
-    ]
+    named_otherwise: Count
+    """Stars that are unique here and under `verified`, but as different catalog stars."""
+    change_points: Estimate | None
+    """Change of the share that is not unique, in percentage points, relative to votes with the
+    present settings; null: not compared."""
 
 
 class Change(Record, frozen=True, kw_only=True):
@@ -185,21 +166,15 @@ class Advice(Record, frozen=True, kw_only=True):
     refusal: str | None
     mission: Digest
     identifier: Identifier
-    groups: Annotated[
-        list[GroupAdvice],
-        doc(
-            "Findings on batches in which two groups of stars give two attitudes, and on "
-            "mirrored batches."
-        ),
-    ]
+    groups: list[GroupAdvice]
+    """Findings on batches in which two groups of stars give two attitudes, and on mirrored
+    batches."""
     zone: Annotated[list[ZoneAdvice], doc("By the a priori errors of the run's latest batches.")]
     tolerances: list[ToleranceAdvice]
     noise: list[NoiseAdvice]
     magnitudes: list[MagnitudeAdvice]
     alignment: list[AlignmentAdvice]
-    innovations: Annotated[
-        list[InnovationAdvice],
-        doc("Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."),
-    ]
+    innovations: list[InnovationAdvice]
+    """Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."""
     tried: list[Trial]
     changes: list[Change]

@@ -29,9 +29,8 @@ class Limit(Record, frozen=True, kw_only=True):
     quantity: QuantityName
     tracker: Annotated[str | None, doc("null: of the spacecraft as a whole.")] = None
     unit: str
-    is_default: Annotated[
-        bool, doc("Whether this is the shipped limit; of a tracker, that of its spacecraft.")
-    ]
+    is_default: bool
+    """Whether this is the shipped limit; of a tracker, that of its spacecraft."""
     since: Annotated[Stamp | None, doc("null: it was never changed.")]
     who: str | None
     comment: str | None
@@ -63,13 +62,10 @@ class LimitTrial(Record, frozen=True, kw_only=True):
     """How recorded batches are evaluated against a limit."""
 
     settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
-    evaluated: Annotated[
-        int, doc("Batches at which there was a value: the mean over the latest minimum_count.")
-    ]
-    beyond: Annotated[
-        dict[SeverityName, int],
-        doc("Values beyond the bounds of each severity, whatever hysteresis and duration are."),
-    ]
+    evaluated: int
+    """Batches at which there was a value: the mean over the latest minimum_count."""
+    beyond: dict[SeverityName, int]
+    """Values beyond the bounds of each severity, whatever hysteresis and duration are."""
     alarms: Annotated[int, doc("How often the quantity would have left its limits.")]
     excursions: Annotated[list[LimitExcursion], doc("The latest of these, oldest first.")]
 
@@ -129,9 +125,8 @@ class Alarm(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     quantity: QuantityName
-    tracker: Annotated[
-        str | None, doc("The tracker that it is about; null: the spacecraft as a whole.")
-    ] = None
+    tracker: str | None = None
+    """The tracker that it is about; null: the spacecraft as a whole."""
     unit: str
     state: AlarmState
     severity: Annotated[SeverityName, doc("The worst severity so far.")]

@@ -2,10 +2,16 @@
 
 A record is a msgspec struct: storage functions make it, and the API encodes it as
 it is.  Its annotations carry pydantic's `Field` for descriptions and bounds, which
-msgspec ignores; the schema in the OpenAPI document is made of them.
+msgspec ignores; the schema in the OpenAPI document is made of them.  A description too long
+for the line of its field stands below it as a text.
 """
 
+import ast
+import inspect
+import sys
+from collections.abc import Mapping
 from functools import cache
+from itertools import pairwise
 from types import UnionType
 from typing import (
     Annotated,
@@ -155,9 +161,31 @@ def described(record: type[Record]) -> type[BaseModel]:
     for each in structs.fields(record):
         is_required = each.default is NODEFAULT and each.default_factory is NODEFAULT
         default = ... if is_required else None
-        alias = each.encode_name if each.encode_name != each.name else None
-        fields[each.name] = _without_unset(hints[each.name]), Field(default, alias=alias)
+        about: dict[str, Any] = {"description": _text_below(record, each.name)}
+        if each.encode_name != each.name:
+            about["alias"] = each.encode_name
+        known = {name: value for name, value in about.items() if value is not None}
+        fields[each.name] = _without_unset(hints[each.name]), Field(default, **known)
     return create_model(component_name(record), __base__=Shape, __doc__=record.__doc__, **fields)
+
+
+def _text_below(record: type[Record], field: str) -> str | None:
+    owners = [each for each in record.__mro__ if issubclass(each, Record)]
+    texts = (_texts_below_fields(each.__module__).get((each.__name__, field)) for each in owners)
+    return next(filter(None, texts), None)
+
+
+@cache
+def _texts_below_fields(module: str) -> Mapping[tuple[str, str], str]:
+    """The texts that stand below fields in the source of a module, by class and field."""
+    found = {}
+    for record in ast.parse(inspect.getsource(sys.modules[module])).body:
+        if isinstance(record, ast.ClassDef):
+            for field, below in pairwise(record.body):
+                match field, below:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        found[record.name, name] = " ".join(text.split())
+    return found
 
 
 def _without_unset(kind: Any) -> Any:
@@ -187,7 +215,7 @@ def page_record(name: str, item: type[Record], description: str) -> type[Record]
 
 
 def _defined(name: str, fields: Any, base: type[R], description: str) -> type[R]:
-    content = {"__doc__": description}
+    content = {"__doc__": description, "__module__": __name__}
     record = defstruct(name, fields, bases=(base,), namespace=content, frozen=True, kw_only=True)
     return cast(type[R], record)
 

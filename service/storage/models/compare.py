@@ -20,9 +20,8 @@ class ComparedSide(StarCounts, frozen=True, kw_only=True):
     solved: Count
     suspect: Count
     residual_ratio_mean: float | None
-    us_per_batch: Annotated[
-        float | None, doc("Median time for zones, identification and attitude.")
-    ]
+    us_per_batch: float | None
+    """Median time for zones, identification and attitude."""
 
 
 class Transition(Record, frozen=True, kw_only=True):
@@ -87,9 +86,8 @@ class Comparison(Record, frozen=True, kw_only=True):
     a: ComparedSide
     b: ComparedSide
     transitions: list[Transition]
-    renamed: Annotated[
-        Count, doc("Stars that are unique on both sides, but as different catalog stars.")
-    ]
+    renamed: Count
+    """Stars that are unique on both sides, but as different catalog stars."""
     attitudes: ComparedAttitudes
     changed_batches: Count
     changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]

@@ -18,9 +18,8 @@ class GyroBlockRow(Record, frozen=True, kw_only=True):
     start: Annotated[Moment, doc("Time of the first sample.")]
     end: Annotated[Moment, doc("Time of the last sample.")]
     samples: Annotated[int, Field(ge=1)]
-    step_s: Annotated[
-        float | None, doc("From each sample to the next; null: the block has times of its own.")
-    ]
+    step_s: float | None
+    """From each sample to the next; null: the block has times of its own."""
     received: Stamp
 
 
@@ -31,7 +30,5 @@ class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
     """A recorded gyro block with its samples."""
 
     times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
-    rates_rad_per_s: Annotated[
-        list[Components],
-        doc("Of each sample, as it was sent: about the three axes of the mission's gyro."),
-    ]
+    rates_rad_per_s: list[Components]
+    """Of each sample, as it was sent: about the three axes of the mission's gyro."""

@@ -54,14 +54,11 @@ class Sparkline(Record, frozen=True, kw_only=True):
 class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
     """The state of one spacecraft; null without a batch in the run."""
 
-    sigma_arcsec: Annotated[
-        Components | None,
-        doc("Standard deviations of `last_attitude` about the body axes."),
-    ]
+    sigma_arcsec: Components | None
+    """Standard deviations of `last_attitude` about the body axes."""
     age_s: Annotated[float | None, doc("Time from its latest batch to the run's latest batch.")]
-    received_age_s: Annotated[
-        float | None, doc("Time since the service received its latest batch.")
-    ]
+    received_age_s: float | None
+    """Time since the service received its latest batch."""
     last_hour: WindowCounts | None
     last_day: WindowCounts | None
     sparkline_hour: Sparkline | None

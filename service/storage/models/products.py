@@ -31,52 +31,31 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     time: Moment
     quaternion: ContinuousQuaternion
     covariance_arcsec2: Covariance
-    rate_deg_per_s: Annotated[
-        Components | None, doc("Of the body relative to inertial, in body axes; null: unknown.")
-    ]
-    rate_origin: Annotated[
-        Literal["own", "derived", "estimated", "none"],
-        doc(
-            "`own`: of the batch. `derived`: from the attitudes before and after. `estimated`: by "
-            "the filter."
-        ),
-    ]
+    rate_deg_per_s: Components | None
+    """Of the body relative to inertial, in body axes; null: unknown."""
+    rate_origin: Literal["own", "derived", "estimated", "none"]
+    """`own`: of the batch. `derived`: from the attitudes before and after. `estimated`: by the
+    filter."""
     status: Status
     method: Annotated[
-        str,
-        DescribedAs(Literal["quest", "triad", "measured", "ekf", "filter_smoother"]),
-        doc("`ekf` of the grade `filtered`, `filter_smoother` of `smoothed`."),
+        str, DescribedAs(Literal["quest", "triad", "measured", "ekf", "filter_smoother"])
     ]
-    residual_rms_arcsec: Annotated[
-        float | None, doc("null unless the grade is `raw` and the attitude is of stars.")
-    ]
+    """`ekf` of the grade `filtered`, `filter_smoother` of `smoothed`."""
+    residual_rms_arcsec: float | None
+    """null unless the grade is `raw` and the attitude is of stars."""
     predicted_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
     stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
     batch: Annotated[str | None, doc("null unless the grade is `raw`.")]
     id: Annotated[Id, doc("Of the result; unless the grade is `raw`, of the day's revision.")]
-    model: Annotated[
-        Literal["gyro", "constant_rate"] | UnsetType,
-        doc(
-            "What the filter knows of the motion: the rates of a gyro, or that the rate is "
-            "constant but for a random walk. Absent if the grade is `raw`."
-        ),
-    ] = UNSET
-    revision: Annotated[
-        int | UnsetType, doc("Of the day's attitudes, from 1. Absent if the grade is `raw`.")
-    ] = UNSET
-    bias_deg_per_h: Annotated[
-        Components | UnsetType | None,
-        doc(
-            "Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is `raw`."
-        ),
-    ] = UNSET
-    bias_sigma_deg_per_h: Annotated[
-        Components | UnsetType,
-        doc(
-            "One sigma of the bias or, at a constant rate, of the rate. Absent if the grade "
-            "is `raw`."
-        ),
-    ] = UNSET
+    model: Literal["gyro", "constant_rate"] | UnsetType = UNSET
+    """What the filter knows of the motion: the rates of a gyro, or that the rate is constant but
+    for a random walk. Absent if the grade is `raw`."""
+    revision: int | UnsetType = UNSET
+    """Of the day's attitudes, from 1. Absent if the grade is `raw`."""
+    bias_deg_per_h: Components | UnsetType | None = UNSET
+    """Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is `raw`."""
+    bias_sigma_deg_per_h: Components | UnsetType = UNSET
+    """One sigma of the bias or, at a constant rate, of the rate. Absent if the grade is `raw`."""
 
 
 class AttitudeProduct(Record, frozen=True, kw_only=True):
@@ -92,20 +71,11 @@ class AttitudeAtMoment(Record, frozen=True, kw_only=True):
     time: Moment
     method: Literal["nearest", "interpolated"]
     quaternion: ContinuousQuaternion
-    covariance_arcsec2: Annotated[
-        Covariance,
-        doc(
-            "Of the attitudes that were used. Between two batches their errors are independent; "
-            "between filtered or smoothed samples it is the weighted mean."
-        ),
-    ]
-    motion_arcsec: Annotated[
-        float | None,
-        doc(
-            "The error that the motion adds. Nearest: the angle that the body turns until the "
-            "moment. Interpolated: an eighth of the step times the change of the rate. Null: no "
-            "rate is known."
-        ),
-    ]
+    covariance_arcsec2: Covariance
+    """Of the attitudes that were used. Between two batches their errors are independent; between
+    filtered or smoothed samples it is the weighted mean."""
+    motion_arcsec: float | None
+    """The error that the motion adds. Nearest: the angle that the body turns until the moment.
+    Interpolated: an eighth of the step times the change of the rate. Null: no rate is known."""
     offset_s: Annotated[float, doc("From the moment to the nearest attitude that was used.")]
     ids: Annotated[list[Id], doc("The results that were used.")]

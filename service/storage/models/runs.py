@@ -35,13 +35,9 @@ class Forgotten(Record, frozen=True, kw_only=True):
     batches: Annotated[Count, doc("Batches in the database, with their results.")]
     archived_batches: Annotated[Count, doc("Batches in the archive.")]
     gyro_blocks: Count
-    graded_days: Annotated[
-        Count,
-        doc(
-            "Days of filtered and smoothed attitudes that were computed with them, every revision "
-            "counted. `acquire smooth` computes them again from what is left."
-        ),
-    ]
+    graded_days: Count
+    """Days of filtered and smoothed attitudes that were computed with them, every revision counted.
+    `acquire smooth` computes them again from what is left."""
 
 
 class ReplayLines(Record, frozen=True, kw_only=True):
@@ -57,9 +53,8 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
 
     new: Annotated[Count, doc("Batches that this replay recorded.")]
     repeated: Annotated[Count, doc("Batches that were already recorded.")]
-    observed: Annotated[
-        Count, doc("Stars of these batches; the next fields count them by outcome.")
-    ]
+    observed: Count
+    """Stars of these batches; the next fields count them by outcome."""
     unique: Count
     ambiguous: Count
     unmatched: Count
@@ -76,9 +71,8 @@ class ApidPackets(Record, frozen=True, kw_only=True):
     described: Annotated[bool, doc("Whether the XTCE file describes them.")]
     gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
     missing: Annotated[Count, doc("Packets that are missing in these places.")]
-    backward: Annotated[
-        Count, doc("Places where the count repeats or goes back: a reset, or a changed order.")
-    ]
+    backward: Count
+    """Places where the count repeats or goes back: a reset, or a changed order."""
     refused: Count
     incomplete: Annotated[Count, doc("Segments of packets of which others are missing.")] = 0
 
@@ -100,16 +94,13 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     backward: Count
     refused: Annotated[Count, doc("Packets that could not be read.")]
     joined: Annotated[Count, doc("Packets that were joined of segments.")] = 0
-    incomplete: Annotated[
-        Count, doc("Segments of packets of which others are missing; they are refused, too.")
-    ] = 0
-    unread_bytes: Annotated[
-        Count, doc("From the packets on at which files could not be read any further.")
-    ] = 0
+    incomplete: Count = 0
+    """Segments of packets of which others are missing; they are refused, too."""
+    unread_bytes: Count = 0
+    """From the packets on at which files could not be read any further."""
     empty_files: Annotated[Count, doc("Files without a packet.")] = 0
-    without_attitude: Annotated[
-        Count, doc("Packets whose a priori quaternion was zero or not finite.")
-    ] = 0
+    without_attitude: Count = 0
+    """Packets whose a priori quaternion was zero or not finite."""
     apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
 
 
@@ -146,10 +137,8 @@ class Replay(ReplayProgress, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "ReplayState"
     packets: Annotated[ReplayPackets | None, doc("null unless the replay reads space packets.")]
-    errors: Annotated[
-        list[RefusedLine],
-        doc("The first thousand refused lines; then, for a failed replay, the reason."),
-    ]
+    errors: list[RefusedLine]
+    """The first thousand refused lines; then, for a failed replay, the reason."""
 
     def progress(self) -> ReplayProgress:
         """The replay without the refused lines."""

@@ -35,9 +35,8 @@ class AttitudeRow(Record, frozen=True, kw_only=True):
     quaternion: Quaternion
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
-    residual_rms_arcsec: Annotated[
-        float | None, doc("Null, as the next two, of an attitude that a tracker measured itself.")
-    ]
+    residual_rms_arcsec: float | None
+    """Null, as the next two, of an attitude that a tracker measured itself."""
     predicted_rms_arcsec: float | None
     taste: float | None
     method: Annotated[str, DescribedAs(Literal["quest", "triad", "measured"])]
@@ -53,23 +52,15 @@ class SpacecraftRow(Record, frozen=True, kw_only=True):
     name: str
     description: str
     retired: Annotated[bool, doc("True if no mission file describes it any more.")]
-    state: Annotated[
-        Literal["good", "suspect", "no_attitude", "no_batches"],
-        doc("State of the latest batch."),
-    ]
+    state: Literal["good", "suspect", "no_attitude", "no_batches"]
+    """State of the latest batch."""
     latest_batch: Summary | None
-    attitude: Annotated[
-        AttitudeRow | None,
-        doc("Attitude of the latest batch; null if this batch has none."),
-    ]
-    last_attitude: Annotated[
-        AttitudeRow | None,
-        doc("The latest attitude. It can be older than the latest batch; see its time."),
-    ]
-    tracking: Annotated[
-        Annotated[str, DescribedAs(TrackingState)] | None,
-        doc("State of the latest batch; null if that does not ask for the last attitude."),
-    ]
+    attitude: AttitudeRow | None
+    """Attitude of the latest batch; null if this batch has none."""
+    last_attitude: AttitudeRow | None
+    """The latest attitude. It can be older than the latest batch; see its time."""
+    tracking: Annotated[str, DescribedAs(TrackingState)] | None
+    """State of the latest batch; null if that does not ask for the last attitude."""
 
 
 SpacecraftList = list_record("SpacecraftList", SpacecraftRow, "Every spacecraft.")
@@ -92,10 +83,8 @@ class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
     """The state of a spacecraft, and its mission's settings with their history."""
 
     mission: MissionNow
-    history: Annotated[
-        list[MissionThen],
-        doc("Oldest first; a return to earlier settings is a new entry."),
-    ]
+    history: list[MissionThen]
+    """Oldest first; a return to earlier settings is a new entry."""
 
 
 class Rates(Record, frozen=True, kw_only=True):
@@ -122,9 +111,8 @@ class Series(Record, frozen=True, kw_only=True):
 
     unit: Annotated[str, Field(examples=["arcsec"])]
     count: Annotated[list[Count] | UnsetType, doc("`minmax`: batches with a value.")] = UNSET
-    mean: Annotated[
-        Numbers | UnsetType, doc("`minmax`: for shares, over all stars or batches.")
-    ] = UNSET
+    mean: Numbers | UnsetType = UNSET
+    """`minmax`: for shares, over all stars or batches."""
     min: Annotated[Numbers | UnsetType, doc("Least value of a batch.")] = UNSET
     max: Annotated[Numbers | UnsetType, doc("Greatest value of a batch.")] = UNSET
     value: Annotated[Numbers | UnsetType, doc("`latest`: the value of each batch.")] = UNSET
@@ -136,33 +124,21 @@ class History(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
-    not_split: Annotated[
-        bool | UnsetType,
-        doc(
-            "With `tracker`: true while older batches of the run are not split by tracker yet, "
-            "and so are missing here."
-        ),
-    ] = UNSET
+    not_split: bool | UnsetType = UNSET
+    """With `tracker`: true while older batches of the run are not split by tracker yet, and so are
+    missing here."""
     start: Moment | None
     end: Moment | None
     strategy: Literal["minmax", "latest"]
     bucket_s: Annotated[int | None, doc("The width of a bucket; null for single batches.")]
-    source: Annotated[
-        Literal["batch", "hour", "day"],
-        doc("The source of the data; both ends of the period are exact in any case."),
-    ]
+    source: Literal["batch", "hour", "day"]
+    """The source of the data; both ends of the period are exact in any case."""
     thinned: Annotated[bool, doc("Whether the period has more batches than the answer has points.")]
-    unix_s: Annotated[
-        list[float],
-        doc(
-            "POSIX time of the beginning of each bucket, or of each batch. Empty buckets are "
-            "omitted."
-        ),
-    ]
+    unix_s: list[float]
+    """POSIX time of the beginning of each bucket, or of each batch. Empty buckets are omitted."""
     batches: Annotated[list[Count] | UnsetType, doc("`minmax`: batches in each bucket.")] = UNSET
-    time: Annotated[list[Moment] | UnsetType, doc("`latest` only, like the next two fields.")] = (
-        UNSET
-    )
+    time: list[Moment] | UnsetType = UNSET
+    """`latest` only, like the next two fields."""
     id: list[Id] | UnsetType = UNSET
     batch: list[str] | UnsetType = UNSET
     series: dict[QuantityName, Series]
@@ -181,7 +157,6 @@ class Ranking(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "WorstList"
     by: QuantityName
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
-    not_split: Annotated[
-        bool | UnsetType, doc("With `tracker`: true while older batches are not split by tracker.")
-    ] = UNSET
+    not_split: bool | UnsetType = UNSET
+    """With `tracker`: true while older batches are not split by tracker."""
     items: list[RankedBatch]
