@@ -194,7 +194,6 @@ def lone_stars(
     The batch is calibrated with the settings that its result was made with; the inertial
     directions are apparent ones, as attitudes are solved from.
     """
-    missions: dict[str, Mission] = {}
     rows_of: dict[str, dict[str, int]] = {}
     found: list[tuple[int, Vector, Vector, Vector]] = []
     query = (
@@ -213,10 +212,8 @@ def lone_stars(
         stars = _unique_stars(connection, [row.id for row in part])
         inputs = _inputs(connection, [row.batch_id for row in part])
         for row in part:
-            digest = row.mission_digest
-            if digest not in missions:
-                missions[digest] = recorded_mission(connection, digest)
-            mission, batch = missions[digest], submission_from_json(inputs[row.batch_id]).batch
+            mission = recorded_mission(connection, row.mission_digest)
+            batch = submission_from_json(inputs[row.batch_id]).batch
             run_catalog = sky.run_catalog(mission, batch.time)
             if run_catalog.digest not in rows_of:
                 rows_of[run_catalog.digest] = {n: k for k, n in enumerate(run_catalog.star_id)}

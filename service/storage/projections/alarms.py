@@ -21,12 +21,13 @@ from service.missions.mission import Mission
 from service.storage.projections.recorded import RecordedResult
 from service.storage.queries.alarms import change, record_action
 from service.storage.queries.limits import limits_of
+from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import alarms, watches
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
-from service.storage.sql.tables import batches, missions, results, runs
+from service.storage.sql.tables import batches, results, runs
 from service.times import Utc, recorded_utc
 
 # Run with every batch of a live spacecraft, or with a few of them.
@@ -78,12 +79,13 @@ class LimitEvaluator:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
         self._new = new
-        self._limits = limits_of(connection, _mission(connection, new[0]))
-        row = self._locked()
+        mission = recorded_mission(connection, new[0].result["mission_digest"])
+        self._limits = limits_of(connection, mission)
+        row = _locked(connection, spacecraft, run)
         if row is None:
             first = {"spacecraft": spacecraft, "run": run, "state": "{}"}
             insert_missing(connection, watches, [first | _columns_of(new[0].result)])
-            row = self._locked()
+            row = _locked(connection, spacecraft, run)
         assert row is not None
         self._row = row
         saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
@@ -203,10 +205,6 @@ class LimitEvaluator:
                 now = new.result["received"]
                 self._active.observe(name, found.severity, limits, point, now, found.worst)
 
-    def _locked(self) -> Row | None:
-        place = {"of_spacecraft": self._spacecraft, "of_run": self._run}
-        return next(iter(_LOCK.read(self._connection, place)), None)
-
     def _save(self, newest: Row | None, received: str) -> None:
         windows = {name: window.to_json() for name, window in self._windows.items()}
         state = msgspec.json.encode(windows).decode()
@@ -247,22 +245,6 @@ def _by_tracker(new: RecordedResult) -> Mapping[str, Row]:
     return {row["tracker"]: row | time_ns for row in new.trackers}
 
 
-def _mission(connection: Connection, new: RecordedResult) -> Mission:
-    """The mission that a result was computed with; what a digest stands for never changes."""
-    digest = new.result["mission_digest"]
-    mission = _MISSIONS.get(digest)
-    if mission is None:
-        query = select(missions.c.settings).where(missions.c.digest == digest)
-        mission = Mission.model_validate_json(connection.execute(query).scalar_one())
-        if len(_MISSIONS) >= _MAX_SAVED:
-            _MISSIONS.clear()
-        _MISSIONS[digest] = mission
-    return mission
-
-
-_MISSIONS: dict[str, Mission] = {}
-
-
 def _columns_of(batch: Row) -> Row:
     names = {"time": "time", "time_ns": "time_ns", "batch_id": "id", "received": "received"}
     return {name: batch[column] for name, column in names.items()}
@@ -281,7 +263,7 @@ def silence_severity(limits: Mapping[Subject, LimitSettings], gap_s: float) -> S
 def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
     """Raise the alarms of live spacecraft that are silent, and end shelving that has expired."""
     for spacecraft in sorted(_silent(connection, missions, now)):
-        row = _locked_watch(connection, spacecraft)
+        row = _locked(connection, spacecraft, LIVE)
         if row is None:
             continue
         active = ActiveAlarms(connection, spacecraft, LIVE)
@@ -327,9 +309,9 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
     return found
 
 
-def _locked_watch(connection: Connection, spacecraft: str) -> Any:
-    query = select(watches).where(watches.c.spacecraft == spacecraft, watches.c.run == LIVE)
-    return connection.execute(query.with_for_update()).mappings().first()
+def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
+    place = {"of_spacecraft": spacecraft, "of_run": run}
+    return next(iter(_LOCK.read(connection, place)), None)
 
 
 def _expired(now: Utc) -> Any:

@@ -50,8 +50,19 @@ def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, A
 
 def recorded_mission(connection: Connection, digest: str) -> Mission:
     """A mission as its settings were when their digest was recorded."""
-    query = select(missions.c.settings).where(missions.c.digest == digest)
-    return Mission.model_validate_json(connection.execute(query).scalar_one())
+    mission = _MISSIONS.get(digest)
+    if mission is None:
+        query = select(missions.c.settings).where(missions.c.digest == digest)
+        mission = Mission.model_validate_json(connection.execute(query).scalar_one())
+        if len(_MISSIONS) >= _MOST_MISSIONS:
+            _MISSIONS.clear()
+        _MISSIONS[digest] = mission
+    return mission
+
+
+# What a digest stands for never changes.
+_MISSIONS: dict[str, Mission] = {}
+_MOST_MISSIONS = 64
 
 
 def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -> ObservationBatch:
