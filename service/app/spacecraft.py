@@ -136,11 +136,9 @@ class Spacecraft:
         mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
         own = self._split_tracker(mission, tracker)
-        asked = trends.HistoryRequest(names, strategy, size, own)
+        asked = trends.HistoryRequest(name, run or LIVE, start, end, names, strategy, size, own)
         with self._context.reading() as connection:
-            found = trends.history(
-                connection, name, run=run or LIVE, start=start, end=end, request=asked
-            )
+            found = trends.history(connection, asked)
             return structs.replace(found, **_named(connection, mission, run or LIVE, tracker))
 
     def every_batch(
@@ -155,15 +153,10 @@ class Spacecraft:
     ) -> Iterator[History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
         mission = self._context.mission(name)
-        return trends.every_batch(
-            self._context.reading,
-            name,
-            run=run or LIVE,
-            start=start,
-            end=end,
-            quantities=_quantities(quantities, tracker),
-            tracker=self._split_tracker(mission, tracker),
-        )
+        names = _quantities(quantities, tracker)
+        own = self._split_tracker(mission, tracker)
+        asked = trends.HistoryRequest(name, run or LIVE, start, end, names, tracker=own)
+        return trends.every_batch(self._context.reading, asked)
 
     def ranking(
         self,

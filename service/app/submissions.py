@@ -21,7 +21,7 @@ from service.observations.faults import faults_of
 from service.observations.schema import Submission, submission_from_json
 from service.storage.gyro import BlockFilter, Recorded, list_blocks, read_block
 from service.storage.models.base import Page
-from service.storage.models.gyro import GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import LIVE, Answered
 from service.times import Utc
 

@@ -26,7 +26,7 @@ from service.gyro import (
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models.base import Page
-from service.storage.models.gyro import GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import gyro_blocks

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, bindparam, select
 
 from service.acquire.choices import aberration_velocity
@@ -14,7 +15,7 @@ from service.attitude.solution import NoAttitude
 from service.errors import BadInput
 from service.filtering.prediction import Known
 from service.filtering.samples import DirectionMeasurements, no_directions
-from service.grades.day import METHOD, day_bounds
+from service.grades.day import METHOD
 from service.grades.stretches import Recorded, arrays_of, usable_attitudes
 from service.gyro import Nanoseconds, tai_ns_of
 from service.identify.attitude_from_matches import matched_vectors
@@ -29,6 +30,7 @@ from service.sky.model import SkyModel
 from service.storage.gyro import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.tables import batches, results, rollups_daily, solutions, star_results
 from service.times import DAY_S, Utc, recorded_utc
@@ -46,14 +48,9 @@ def days_with_batches(
 ) -> list[int]:
     """The UTC days of a period (see `Utc.bucket`) that have batches, in order."""
     c = rollups_daily.c
-    chosen = [c.spacecraft == spacecraft, c.run == run]
-    if start is not None:
-        chosen.append(c.bucket >= start.bucket(DAY_S))
-    if end is not None:
-        chosen.append(c.bucket <= end.bucket(DAY_S))
-    days = connection.scalars(select(c.bucket).where(*chosen).order_by(c.bucket))
-    # The end of a period is excluded.
-    return [day for day in days if end is None or day_bounds(day)[0].tai_ns < end.tai_ns]
+    within = buckets_between(c.bucket, start, end, DAY_S)
+    chosen = c.spacecraft == spacecraft, c.run == run, *within
+    return list(connection.scalars(select(c.bucket).where(*chosen).order_by(c.bucket)))
 
 
 def recorded_in(
@@ -81,14 +78,20 @@ def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds,
         times.append(tai_ns_of(row["start_ns"], times_of(row)))
         rates.append(rates_of(row))
     tai_ns, rate = np.concatenate(times), np.concatenate(rates)
-    inside = np.ones(len(tai_ns), bool)
-    if selected.start is not None:
-        inside &= tai_ns >= selected.start.tai_ns
-    if selected.end is not None:
-        inside &= tai_ns < selected.end.tai_ns
-    tai_ns, rate = tai_ns[inside], rate[inside]
+    places = inside(tai_ns, selected)
+    tai_ns, rate = tai_ns[places], rate[places]
     order = np.argsort(tai_ns, kind="stable")
     return tai_ns[order], rate[order]
+
+
+def inside(tai_ns: Nanoseconds, selected: ResultFilter | BlockFilter) -> npt.NDArray[np.intp]:
+    """The places of the times that lie in a period."""
+    chosen = np.ones(len(tai_ns), dtype=bool)
+    if selected.start is not None:
+        chosen &= tai_ns >= selected.start.tai_ns
+    if selected.end is not None:
+        chosen &= tai_ns < selected.end.tai_ns
+    return np.flatnonzero(chosen)
 
 
 def inputs_digest(recorded: Recorded, mission: Mission) -> str:

@@ -26,6 +26,7 @@ from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.missions.mission import Mission
 from service.storage.grades.days import DayKey, GradedDayRow, Innovation, shown
+from service.storage.grades.inputs import inside
 from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
 from service.storage.models.base import Page
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
@@ -110,7 +111,7 @@ def latest_innovations(
     blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
     found = [unpacked_innovations(row.packed, row.samples) for row in rows]
-    return [each.taken(inside(each, selected)) for each in found]
+    return [each.taken(inside(each.tai_ns, selected)) for each in found]
 
 
 def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_Block]:
@@ -172,12 +173,12 @@ def _severity(status: Integers) -> Integers:
 
 def _of_each_part(time_ns: Integers, rank: npt.ArrayLike, start: Utc, end: Utc) -> Integers:
     """The places, one in each part of the period, with the greatest rank in it; the first such."""
-    inside_ = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
+    within = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
     length_ns = max(end.tai_ns - start.tai_ns, 1)
-    part = ((time_ns[inside_] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
-    order = np.lexsort((time_ns[inside_], -np.asarray(rank)[inside_], part))
+    part = ((time_ns[within] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
+    order = np.lexsort((time_ns[within], -np.asarray(rank)[within], part))
     _, first = np.unique(part[order], return_index=True)
-    return np.asarray(inside_[order[first]])
+    return np.asarray(within[order[first]])
 
 
 def _repeated_models(read: Sequence[_Block], time_ns: Integers) -> npt.NDArray[np.bool_]:
@@ -199,7 +200,7 @@ def _innovations(
     parts = []
     for row in _packed(connection, INNOVATIONS, read):
         found = unpacked_innovations(row.packed, row.samples)
-        parts.append(found.taken(inside(found, selected)))
+        parts.append(found.taken(inside(found.tai_ns, selected)))
     whole = MeasuredInnovations.joined(parts)
     is_used = whole.is_used
     nis = np.where(np.isfinite(whole.nis), whole.nis, np.inf)
@@ -223,7 +224,7 @@ def list_innovations(
     items: list[Innovation] = []
     while (block := connection.execute(beyond).mappings().first()) is not None:
         found = unpacked_innovations(block["packed"], block["samples"])
-        places = inside(found, selected)
+        places = inside(found.tai_ns, selected)
         if (block["day"], block["position"]) == (day, position):
             places = places[places >= row]
         for place, item in zip(places.tolist(), _shown(block, found, places), strict=False):
@@ -232,16 +233,6 @@ def list_innovations(
             items.append(item)
         beyond = query.where(tuple_(*PLACE) > tuple_(block["day"], block["position"]))
     return Page(items, None)
-
-
-def inside(found: MeasuredInnovations, selected: ResultFilter) -> Any:
-    """The places of the measurements in the period."""
-    chosen = np.ones(len(found), dtype=bool)
-    if selected.start is not None:
-        chosen &= found.tai_ns >= selected.start.tai_ns
-    if selected.end is not None:
-        chosen &= found.tai_ns < selected.end.tai_ns
-    return np.flatnonzero(chosen)
 
 
 def _shown(block: Any, found: MeasuredInnovations, places: Any) -> Iterator[Innovation]:

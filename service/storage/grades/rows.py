@@ -12,6 +12,7 @@ from service.grades.carried import Carried
 from service.grades.day import Grade, day_bounds, unpacked
 from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
+from service.storage.grades.inputs import inside
 from service.storage.models.base import (
     Components,
     Covariance,
@@ -99,12 +100,7 @@ def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bo
 def _rows(row: Any, selected: ResultFilter, grade: Grade) -> AttitudeRows:
     """The samples of a block that lie in the period."""
     found = unpacked(row["packed"], row["samples"])
-    first, last = 0, len(found)
-    if selected.start is not None:
-        first = int(np.searchsorted(found.tai_ns, selected.start.tai_ns))
-    if selected.end is not None:
-        last = int(np.searchsorted(found.tai_ns, selected.end.tai_ns))
-    found = found.taken(slice(first, last))
+    found = found.taken(inside(found.tai_ns, selected))
     n = len(found)
     start, _ = day_bounds(row["day"])
     status = _repeated(None, n)

@@ -18,8 +18,8 @@ from service.storage.models.base import (
     Status,
     doc,
 )
-from service.storage.models.gyro import GyroBlockRow
 from service.storage.models.runs import ReplayProgress
+from service.storage.models.spacecraft import GyroBlockRow
 
 
 class LatestBatch(Record, frozen=True, kw_only=True):

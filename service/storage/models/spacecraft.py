@@ -1,4 +1,4 @@
-"""Spacecraft: state, settings, star rates, and histories of attitudes and quantities."""
+"""Spacecraft: state, settings, star rates, histories of attitudes and quantities, gyro blocks."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -9,6 +9,7 @@ from service.acquire.result import TrackingState
 from service.alarms.quantities import QuantityName
 from service.storage.models.answers import Summary
 from service.storage.models.base import (
+    Components,
     Count,
     Covariance,
     DescribedAs,
@@ -160,3 +161,30 @@ class Ranking(Record, frozen=True, kw_only=True):
     not_split: bool | UnsetType = UNSET
     """With `tracker`: true while older batches are not split by tracker."""
     items: list[RankedBatch]
+
+
+class GyroBlockRow(Record, frozen=True, kw_only=True):
+    """A recorded gyro block."""
+
+    component: ClassVar[str] = "GyroBlock"
+    id: Id
+    spacecraft: str
+    run: str
+    block: str
+    start: Annotated[Moment, doc("Time of the first sample.")]
+    end: Annotated[Moment, doc("Time of the last sample.")]
+    samples: Annotated[int, Field(ge=1)]
+    step_s: float | None
+    """From each sample to the next; null: the block has times of its own."""
+    received: Stamp
+
+
+GyroBlockPage = page_record("GyroBlockPage", GyroBlockRow, "A page of gyro blocks.")
+
+
+class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
+    """A recorded gyro block with its samples."""
+
+    times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
+    rates_rad_per_s: list[Components]
+    """Of each sample, as it was sent: about the three axes of the mission's gyro."""

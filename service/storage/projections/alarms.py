@@ -19,7 +19,7 @@ from service.alarms.subjects import Subject, quantity_and_tracker, sampler, subj
 from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
 from service.storage.projections.recorded import RecordedResult
-from service.storage.queries.alarms import change, record_action
+from service.storage.queries.alarms import change
 from service.storage.queries.limits import limits_of
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.recording.ids import Ulids
@@ -390,7 +390,7 @@ class ActiveAlarms:
                 what = {"quantity": quantity, "tracker": tracker}
                 alarm = {"id": _IDS.new(), **what, **self._place, **columns}
                 self._connection.execute(insert(alarms), alarm)
-                record_action(self._connection, alarm, actions, now)
+                change(self._connection, alarm, {}, actions, now)
                 self._alarms[subject] = alarm
             return
         changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)

@@ -122,34 +122,24 @@ def change(
     """Change a stored alarm, record the actions and add an event; returns the changed alarm."""
     if changes:
         connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
-    whole = {**alarm, **changes}
-    record_action(connection, whole, actions, now, who=who, comment=comment)
-    return whole
-
-
-def record_action(
-    connection: Connection,
-    alarm: Row,
-    actions: Sequence[AlarmActionName],
-    now: str,
-    *,
-    who: str | None = None,
-    comment: str | None = None,
-) -> None:
-    """Record actions on an alarm, and add an event."""
-    if not actions:
-        return
-    point = {"value": alarm["latest_value"], "time": alarm["latest_time"]}
-    severity = {"severity": alarm["current_severity"]}
-    # The first action is the user's; the others follow from it.
-    by = [{"who": who, "comment": comment}] + [{"who": None, "comment": None}] * len(actions)
-    rows = [
-        {"alarm_id": alarm["id"], "at": now, "action": action, **point, **severity, **whom}
-        for action, whom in zip(actions, by, strict=False)
-    ]
-    connection.execute(insert(alarm_actions), rows)
-    shown = shown_alarm(alarm, now)
-    events.add_event(connection, "alarm", shown, run=alarm["run"], spacecraft=alarm["spacecraft"])
+    alarm = {**alarm, **changes}
+    if actions:
+        row = {
+            "alarm_id": alarm["id"],
+            "at": now,
+            "value": alarm["latest_value"],
+            "time": alarm["latest_time"],
+            "severity": alarm["current_severity"],
+            "who": None,
+            "comment": None,
+        }
+        rows = [row | {"action": action} for action in actions]
+        # The first action is the user's; the others follow from it.
+        rows[0] |= {"who": who, "comment": comment}
+        connection.execute(insert(alarm_actions), rows)
+        shown, run, spacecraft = shown_alarm(alarm, now), alarm["run"], alarm["spacecraft"]
+        events.add_event(connection, "alarm", shown, run=run, spacecraft=spacecraft)
+    return alarm
 
 
 def shown_alarm(alarm: Any, now: str) -> Alarm:

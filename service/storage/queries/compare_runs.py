@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from service.storage.archive.reading import Archive, parts_between, places
 from service.storage.models import compare
 from service.storage.queries.pages import PLACE, Place, ResultFilter
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
-from service.storage.queries.with_archive import ArchiveUse, bounds_of, first_rows
+from service.storage.queries.with_archive import Listing, bounds_of
 from service.storage.sql.tables import (
     COUNTED,
     COUNTS,
@@ -48,12 +48,8 @@ def compare_runs(
     compares what both have.  With `latest`, of the period's latest batches alone.
     """
     tally = _Tally()
-    if not is_archived_in_part(connection, selected, other):
-        tally.add(connection, _pairs(selected, other, latest))
-    else:
-        for group in both_runs(connection, archive, selected, other, latest):
-            with group.reading() as of_group:
-                tally.add(of_group, _pairs(selected, other))
+    for of_group, pairs in _groups(connection, archive, selected, other, latest):
+        tally.add(of_group, pairs)
     return tally.comparison(selected.run, other)
 
 
@@ -69,15 +65,31 @@ def changed_batches(
 
     At most `limit` of the period's `latest` batches.
     """
-    if not is_archived_in_part(connection, selected, other):
-        return _changed(connection, _pairs(selected, other, latest), limit)
     found: list[compare.RunChange] = []
-    for group in both_runs(connection, archive, selected, other, latest):
-        with group.reading() as of_group:
-            found += _changed(of_group, _pairs(selected, other), limit)
+    for of_group, pairs in _groups(connection, archive, selected, other, latest):
+        found += _changed(of_group, pairs, limit)
         if len(found) >= limit:
             break
     return found[:limit]
+
+
+def _groups(
+    connection: Connection,
+    archive: Archive,
+    selected: ResultFilter,
+    other: str,
+    latest: int | None,
+) -> Iterator[tuple[Connection, Subquery]]:
+    """The pairs of results of both runs with the database that they are in, latest first.
+
+    Without an archive that is one group.
+    """
+    if not is_archived_in_part(connection, selected, other):
+        yield connection, _pairs(selected, other, latest)
+        return
+    for group in both_runs(connection, archive, selected, other, latest):
+        with group.reading() as of_group:
+            yield of_group, _pairs(selected, other)
 
 
 def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compare.RunChange]:
@@ -283,30 +295,23 @@ def both_runs(
     At most the `latest` of those selected.  Recorded and archived ones are copied into one
     database, so that any of the two may be in either place.
     """
-    from service.storage.archive.opened import Opened
-
     named = (results.c.spacecraft, batches.c.batch)
     query = select(*PLACE, *named).join_from(results, batches, results.c.batch_id == batches.c.id)
     query = query.where(*selected.conditions())
-    use, left = ArchiveUse(archive), latest
+    listing, left = Listing(archive, query, selected, newest_first=True), latest
     beyond: Place | None = None
     while left is None or left > 0:
         limit = GROUP if left is None else min(GROUP, left)
-        found = first_rows(
-            connection, use, query, selected, limit, newest_first=True, beyond=beyond
-        ).rows
+        found = listing.first_rows(connection, limit, beyond).rows
         if not found:
             return
-        opened = Opened()
         names = [(each.row.spacecraft, each.row.batch) for each in found]
         own: dict[bool, list[str]] = {True: [], False: []}
         for each in found:
             own[each.archived].append(each.row.batch_id)
-        _add_recorded(connection, opened, [*own[False], *_named(connection, batches, other, names)])
+        recorded = [*own[False], *_named(connection, batches, other, names)]
         archived = [*own[True], *_named(connection, archived_batches, other, names)]
-        _add_archived(connection, archive, opened, archived)
-        opened.add_indexes()
-        yield opened
+        yield _opened(connection, archive, recorded, archived)
         beyond = found[-1].place
         left = None if left is None else left - len(found)
         if len(found) < limit:
@@ -326,29 +331,25 @@ def _named(
     return found
 
 
-def _add_recorded(connection: Connection, opened: "Opened", ids: Sequence[str]) -> None:
+def _opened(
+    connection: Connection, archive: Archive, recorded: Sequence[str], archived: Sequence[str]
+) -> "Opened":
+    """Recorded and archived batches in one database."""
+    from service.storage.archive.opened import Opened, columns_of
     from service.storage.archive.rows import read_rows
 
-    if ids:
-        opened.add_rows(read_rows(connection, ids))
-
-
-def _add_archived(
-    connection: Connection, archive: Archive, opened: "Opened", ids: Collection[str]
-) -> None:
-    from service.storage.archive.opened import columns_of
-
-    for path, of_part in _places(connection, list(ids)).items():
-        own: Any = [[("id", "in", of_part)], [("batch_id", "in", of_part)]]
+    opened = Opened()
+    if recorded:
+        opened.add_rows(read_rows(connection, recorded))
+    of_file: dict[str, list[str]] = {}
+    for first in range(0, len(archived), _AT_ONCE):
+        for path, ids in places(connection, archived[first : first + _AT_ONCE]).items():
+            of_file.setdefault(path, []).extend(ids)
+    for path, ids in of_file.items():
+        own: Any = [[("id", "in", ids)], [("batch_id", "in", ids)]]
         opened.add_partition(archive.read(path, columns_of(_COMPARED), own))
-
-
-def _places(connection: Connection, ids: Sequence[str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for first in range(0, len(ids), _AT_ONCE):
-        for path, added in places(connection, ids[first : first + _AT_ONCE]).items():
-            found.setdefault(path, []).extend(added)
-    return found
+    opened.add_indexes()
+    return opened
 
 
 _SHOWN_BY_HOUR_S = 30 * DAY_S

@@ -18,7 +18,7 @@ from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries.pages import PLACE, ResultFilter, newest
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive import MOST_OPENED, ArchiveUse, page_of
+from service.storage.queries.with_archive import MOST_OPENED, Listing
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import (
@@ -61,15 +61,9 @@ def list_attitudes(
 ) -> Page[AttitudeRow]:
     """The attitudes of current results, recorded and archived, oldest batch time first."""
     chosen = [*selected.conditions(), results.c.status.is_not(None)]
-    return page_of(
-        connection,
-        ArchiveUse(archive, ("solution",), most_opened=MOST_OPENED),
-        attitudes().where(*chosen),
-        selected,
-        limit,
-        attitude_row,
-        cursor=cursor,
-    )
+    query = attitudes().where(*chosen)
+    listing = Listing(archive, query, selected, needs=("solution",), most_opened=MOST_OPENED)
+    return listing.page(connection, limit, cursor, attitude_row)
 
 
 def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:

@@ -13,9 +13,9 @@ import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, Select, bindparam, select
 
 from service.acquire.choices import aberration_velocity
-from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
+from service.identify.prior_attitude import PriorAttitude, search_region
 from service.missions.mission import Mission, Tracker
-from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations, correct
 from service.observations.schema import submission_from_json
 from service.sky.catalog.run_catalog import RunCatalog
@@ -27,6 +27,7 @@ from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerS
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
+from service.storage.queries.star_field import presumed_attitude
 from service.storage.queries.time_buckets import BucketFilter, read_buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
@@ -159,25 +160,9 @@ class _Collected:
     region: SearchRegion | None = None
 
 
-class _Catalogs:
-    """Run catalogs by epoch, with the rows of their stars by name."""
-
-    def __init__(self, sky: SkyModel) -> None:
-        self._sky = sky
-        self._rows: dict[str, dict[str, int]] = {}
-
-    def of(self, mission: Mission, batch: ObservationBatch) -> tuple[RunCatalog, dict[str, int]]:
-        run_catalog = self._sky.run_catalog(mission, batch.time)
-        rows = self._rows.get(run_catalog.digest)
-        if rows is None:
-            rows = {name: row for row, name in enumerate(run_catalog.star_id)}
-            self._rows[run_catalog.digest] = rows
-        return run_catalog, rows
-
-
 def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     """Attitudes, boresights, residuals and magnitudes of a sample of batches."""
-    catalogs = _Catalogs(sky)
+    rows_of: dict[str, dict[str, int]] = {}
     read = [
         (
             submission_from_json(row["input"]).batch,
@@ -189,10 +174,13 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     collected: dict[str, _Collected] = {}
     other_catalog = 0
     for place, (batch, answer, mission) in enumerate(read):
-        run_catalog, rows = catalogs.of(mission, batch)
-        is_known = run_catalog.digest == answer.provenance.run_catalog
+        run_catalog = sky.run_catalog(mission, batch.time)
+        digest = run_catalog.digest
+        if digest not in rows_of:
+            rows_of[digest] = {name: row for row, name in enumerate(run_catalog.star_id)}
+        is_known = digest == answer.provenance.run_catalog
         other_catalog += not is_known
-        presumed = _presumed(batch, answer, mission)
+        presumed = presumed_attitude(batch, answer, mission)
         for tracker in mission.trackers:
             into = collected.setdefault(
                 tracker.name, _Collected(tracker, [np.array(_UNKNOWN_DIRECTION)] * len(read))
@@ -203,7 +191,7 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
             into.tracker = seen.tracker
             into.region = _region(seen.tracker, presumed, mission)
             if is_known:
-                _add(into, batch, answer, seen, found.stars, run_catalog, rows)
+                _add(into, batch, answer, seen, found.stars, run_catalog, rows_of[digest])
     times = [batch.time for batch, _, _ in read]
     return PeriodStars(
         total=sample.total,
@@ -214,14 +202,6 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
         first=times[0] if times else None,
         last=times[-1] if times else None,
     )
-
-
-def _presumed(batch: ObservationBatch, answer: Answer, mission: Mission) -> PriorAttitude | None:
-    """The attitude about which stars were searched for; None where nothing gave one."""
-    prior = batch.a_priori
-    if answer.attitude is not None and answer.path != "zone":
-        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
-    return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
 
 
 def _boresight(

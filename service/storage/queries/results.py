@@ -57,16 +57,15 @@ def list_batches(
     parts = None
     if batch is not None:
         parts = parts_with(connection, selected.spacecraft, selected.run, batch)
-    return with_archive.page_of(
-        connection,
-        with_archive.ArchiveUse(archive, most_opened=with_archive.MOST_OPENED, parts=parts),
+    listing = with_archive.Listing(
+        archive,
         summary_query().where(*chosen),
         selected,
-        limit,
-        summary_of,
         newest_first=True,
-        cursor=cursor,
+        most_opened=with_archive.MOST_OPENED,
+        parts=parts,
     )
+    return listing.page(connection, limit, cursor, summary_of)
 
 
 def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str | None:
@@ -265,16 +264,9 @@ def _next(
     selected = ResultFilter(place.run, place.spacecraft)
     beyond = place.time_ns, with_archive.FIRST_ID if newest_first else with_archive.LAST_ID
     query = summary_query().where(*selected.conditions())
+    listing = with_archive.Listing(archive, query, selected, newest_first)
     try:
-        found = with_archive.first_rows(
-            connection,
-            with_archive.ArchiveUse(archive),
-            query,
-            selected,
-            1,
-            newest_first=newest_first,
-            beyond=beyond,
-        )
+        found = listing.first_rows(connection, 1, beyond)
     except Busy:
         # Without the archive the page of a recorded batch is shown all the same.
         return None

@@ -47,14 +47,11 @@ def star_field_of(
     a priori attitude does, and the stars are displaced by its error.  Raises `BadInput`
     for a batch that does not fit the mission.
     """
-    solved, prior = answer.attitude, batch.a_priori
-    if solved is not None and answer.path != "zone":
-        # The whole sky gave the attitude that stars were looked for about.
-        prior = QuaternionPrior(np.array(solved.quaternion))
-    if prior is None:
+    solved = answer.attitude
+    presumed = presumed_attitude(batch, answer, mission)
+    if presumed is None:
         message = "nothing is known of the attitude, neither beforehand nor from the stars"
         raise BadBatch(Fault("a_priori", message, "null"))
-    presumed = prior_attitude(prior, batch.time, mission, batch.position_km)
     attitude = presumed.attitude if solved is None else matrix_from_quaternion(solved.quaternion)
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
@@ -67,6 +64,17 @@ def star_field_of(
             for index, (each, found) in enumerate(trackers)
         ],
     )
+
+
+def presumed_attitude(
+    batch: ObservationBatch, answer: Answer, mission: Mission
+) -> PriorAttitude | None:
+    """The attitude about which stars were searched for; None where nothing gave one."""
+    prior = batch.a_priori
+    if answer.attitude is not None and answer.path != "zone":
+        # The whole sky gave it.
+        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
+    return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
 
 
 def _tracker(

@@ -260,6 +260,21 @@ def _owner(span: BucketFilter) -> Row:
     return owner if span.tracker is None else owner | {"tracker": span.tracker}
 
 
+def buckets_between(
+    bucket: ColumnElement[int], start: Utc | None, end: Utc | None, width_s: int
+) -> list[ColumnElement[bool]]:
+    """The buckets of a width that a period from `start` to before `end` touches, as SQL."""
+    chosen = []
+    if start is not None:
+        chosen.append(bucket >= start.bucket(width_s))
+    if end is not None:
+        last = end.bucket(width_s)
+        # A bucket that begins just where the period ends lies outside it.
+        last -= bucket_start(last, width_s).tai_ns == end.tai_ns
+        chosen.append(bucket <= last)
+    return chosen
+
+
 def rates(
     connection: Connection,
     spacecraft: str,
@@ -276,15 +291,10 @@ def rates(
     trend = TRENDS[bucket]
     table = trend.table
     query = select(table.c.bucket, *(table.c[name] for name in COUNTS)).where(
-        table.c.spacecraft == spacecraft, table.c.run == run
+        table.c.spacecraft == spacecraft,
+        table.c.run == run,
+        *buckets_between(table.c.bucket, start, end, trend.width_s),
     )
-    if start is not None:
-        query = query.where(table.c.bucket >= start.bucket(trend.width_s))
-    if end is not None:
-        last = end.bucket(trend.width_s)
-        # A bucket that begins just where the range ends lies outside it.
-        last -= bucket_start(last, trend.width_s).tai_ns == end.tai_ns
-        query = query.where(table.c.bucket <= last)
     rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
     if len(rows) > MAX_RATES:
         value = "nothing" if start is None else start.text

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -70,32 +70,29 @@ WIDTHS_S = (
 
 @dataclass(frozen=True)
 class HistoryRequest:
-    """The wanted history: the quantities, how they are thinned out, and to how many points."""
+    """The wanted history: of what, which quantities, and how they are thinned out.
 
+    Without an end it ends just after the latest batch, without a start it begins a day before
+    its end.
+    """
+
+    spacecraft: str
+    run: str
+    start: Utc | None
+    end: Utc | None
     quantities: Sequence[QuantityName]
-    strategy: Strategy
-    size: int
+    strategy: Strategy = "latest"
+    size: int = PAGE
+    """The most points."""
     tracker: str | None = None
     """The tracker whose values they are, of a spacecraft with several."""
 
 
-def history(
-    connection: Connection,
-    spacecraft: str,
-    *,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    request: HistoryRequest,
-) -> History:
-    """A history, its buckets or batches in columns, oldest first.
-
-    Without an end it ends just after the latest batch, without a start it
-    begins a day before its end.
-    """
-    span = _span(connection, spacecraft, run, start, end, request.tracker)
+def history(connection: Connection, request: HistoryRequest) -> History:
+    """A history, its buckets or batches in columns, oldest first."""
+    span = _span(connection, request)
     if span is None:
-        return _empty(spacecraft, run, start, request)
+        return _empty(request)
     if request.strategy == "latest":
         return _latest(connection, span, request)
     width_s, source = _resolution(connection, span, request.size)
@@ -115,22 +112,17 @@ def latest_time_of(
     return max(filter(None, found), key=lambda moment: moment.tai_ns, default=None)
 
 
-def _span(
-    connection: Connection,
-    spacecraft: str,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    tracker: str | None,
-) -> BucketFilter | None:
+def _span(connection: Connection, request: HistoryRequest) -> BucketFilter | None:
+    spacecraft, run, end = request.spacecraft, request.run, request.end
     if end is None:
         latest = latest_time(connection, ResultFilter(run, spacecraft), utc_now())
         if latest is None:
             return None
         end = shifted(latest, 1e-6)
-    begin = shifted(end, -DAY_S) if start is None else start
-    span = BucketFilter(spacecraft, run, begin, end, tracker)
-    return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
+    begin = shifted(end, -DAY_S) if request.start is None else request.start
+    if begin.tai_ns > end.tai_ns:
+        end = begin
+    return BucketFilter(spacecraft, run, begin, end, request.tracker)
 
 
 def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[int, Source]:
@@ -277,34 +269,26 @@ def _values_query(span: BucketFilter) -> Select[Any]:
 
 
 def every_batch(
-    reading: Callable[[], AbstractContextManager[Connection]],
-    spacecraft: str,
-    *,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    quantities: Sequence[QuantityName],
-    tracker: str | None = None,
+    reading: Callable[[], AbstractContextManager[Connection]], request: HistoryRequest
 ) -> Iterator[History]:
     """The batches of a period as `history` gives the latest, oldest first, in pages.
 
     At least one page is given, which may hold none.  Between two pages no
     connection is held, so that a slow reader keeps none from others.
     """
-    request = HistoryRequest(quantities, "latest", PAGE, tracker)
     with reading() as connection:
-        span = _span(connection, spacecraft, run, start, end, tracker)
+        span = _span(connection, request)
     if span is None:
-        yield _empty(spacecraft, run, start, request)
+        yield _empty(request)
         return
-    query = _values_query(span).order_by(*PLACE).limit(PAGE)
+    query = _values_query(span).order_by(*PLACE).limit(request.size)
     beyond = query
     while True:
         with reading() as connection:
             rows = connection.execute(beyond).mappings().all()
         if rows or beyond is query:
             yield _of_batches(rows, _about(span), request)
-        if len(rows) < PAGE:
+        if len(rows) < request.size:
             return
         last = rows[-1]["time_ns"], rows[-1]["batch_id"]
         beyond = query.where(tuple_(*PLACE) > tuple_(*last))
@@ -350,10 +334,15 @@ def _of_batches(
     )
 
 
-def _empty(spacecraft: str, run: str, start: Utc | None, request: HistoryRequest) -> History:
+def _empty(request: HistoryRequest) -> History:
     """The history, without an end, of a run without batches of the spacecraft."""
-    begin = None if start is None else start.text
-    about: Row = {"spacecraft": spacecraft, "run": run, "start": begin, "end": None}
+    start = None if request.start is None else request.start.text
+    about: Row = {
+        "spacecraft": request.spacecraft,
+        "run": request.run,
+        "start": start,
+        "end": None,
+    }
     if request.strategy == "latest":
         return _of_batches([], about, request)
     nothing = np.empty(0)
@@ -438,30 +427,24 @@ def _hours(
     table = rollup.c
     most = _greatest(by, rollup)
     query = select(table.bucket, most).where(
-        table.spacecraft == selected.spacecraft, table.run == selected.run, most.is_not(None)
+        table.spacecraft == selected.spacecraft,
+        table.run == selected.run,
+        most.is_not(None),
+        *time_buckets.buckets_between(table.bucket, selected.start, selected.end, HOUR_S),
     )
     if tracker is not None:
         query = query.where(table.tracker == tracker)
-    if selected.start is not None:
-        query = query.where(table.bucket >= selected.start.bucket(HOUR_S))
-    if selected.end is not None:
-        query = query.where(table.bucket <= selected.end.bucket(HOUR_S))
     # Of `limit` whole hours each holds a batch at least as bad as any in the hours beyond them;
     # two more, because the ends of the period may cut away what made an hour one of the worst.
     query = query.order_by(most.desc(), table.bucket.desc()).limit(limit + 2)
-    rows = connection.execute(query).all()
-    return _narrowed(rows, selected.start, selected.end)
-
-
-def _narrowed(rows: Any, start: Utc | None, end: Utc | None) -> Iterator[tuple[int, int, float]]:
-    for bucket, most in rows:
+    for bucket, greatest in connection.execute(query).all():
         begin, over = (bucket_start(bucket + ahead, HOUR_S).tai_ns for ahead in (0, 1))
-        if start is not None:
-            begin = max(begin, start.tai_ns)
-        if end is not None:
-            over = min(over, end.tai_ns)
+        if selected.start is not None:
+            begin = max(begin, selected.start.tai_ns)
+        if selected.end is not None:
+            over = min(over, selected.end.tai_ns)
         if begin < over:
-            yield begin, over, float(most)
+            yield begin, over, float(greatest)
 
 
 def _badness(by: RankedName, of: Table) -> ColumnElement[Any]:

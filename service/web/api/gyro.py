@@ -9,7 +9,7 @@ from starlette.responses import Response
 
 from service.errors import BadInput
 from service.gyro import GyroBlockIn
-from service.storage.models.gyro import GyroBlockPage, GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.web.openapi.route import LINK, LOCATION, REPLAYED, ResponseDoc, route_docs
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response, page_response
 from service.web.requests.query_parameters import NO_QUERY, PeriodPageQuery, SpacecraftPath
