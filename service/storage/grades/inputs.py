@@ -5,7 +5,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
 import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, bindparam, select
@@ -28,8 +27,9 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 from service.storage.gyro import BlockFilter, rates_of, times_of
-from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter, covariance_of
 from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.result_tables import RATES
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.tables import batches, results, rollups_daily, solutions, star_results
@@ -38,8 +38,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 _ATTITUDES = select(
     results.c.time_ns,
-    *(solutions.c[name] for name in ("q1", "q2", "q3", "qc")),
-    *(solutions.c[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
+    *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
 ).join_from(results, solutions, solutions.c.result_id == results.c.id)
 
 
@@ -112,16 +111,11 @@ def inputs_digest(recorded: Recorded, mission: Mission) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
-_SHOWN = (
-    results.c.id,
-    batches.c.time,
-    batches.c.time_ns,
-    batches.c.input,
-    *(solutions.c[name] for name in ("q1", "q2", "q3", "qc")),
-    *(solutions.c[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
-)
 _LAST = (
-    select(*_SHOWN)
+    select(
+        *(results.c.id, batches.c.time, batches.c.time_ns, batches.c.input),
+        *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
+    )
     .join_from(results, batches, results.c.batch_id == batches.c.id)
     .join(solutions, solutions.c.result_id == results.c.id)
     .where(
@@ -147,13 +141,6 @@ class RecordedAttitude:
     body_rates_deg_per_s: Vector
 
 
-class _Rates(msgspec.Struct):
-    body_rates_deg_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-_RATES = msgspec.json.Decoder(_Rates)
-
-
 def last_attitudes(
     connection: Connection, spacecraft: str, run: str, until: Utc, within_s: float
 ) -> list[RecordedAttitude]:
@@ -169,10 +156,9 @@ def last_attitudes(
     }
     found = []
     for row in connection.execute(_LAST, asked):
-        p11, p12, p13, p22, p23, p33 = row[8:]
-        covariance = np.array([[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]])
+        covariance = np.array(covariance_of(row[8:]))
         known = Known(row.time_ns, np.array(row[4:8]), covariance / ARCSEC_PER_RADIAN**2)
-        rates = np.array(_RATES.decode(row.input).body_rates_deg_per_s)
+        rates = np.array(RATES.decode(row.input).body_rates_deg_per_s or np.zeros(3))
         found.append(RecordedAttitude(row.id, recorded_utc(row.time), known, rates))
     return found
 

@@ -25,7 +25,7 @@ from service.storage.models.base import (
 from service.storage.models.base import (
     Status as StatusWord,
 )
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, covariance_of
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.times import DAY_S, Utc
 
@@ -159,13 +159,12 @@ def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAtt
         return None
     sample = carried.sample
     (time,) = texts_of(day_start, np.asarray((sample.tai_ns - day_start.tai_ns) * 1e-9))
-    p11, p12, p13, p22, p23, p33 = sample.covariance_arcsec2[0].tolist()
     is_gyro = carried.model == "gyro"
     return LiveAttitude(
         spacecraft=name,
         time=time,
         quaternion=sample.quaternion[0].tolist(),
-        covariance_arcsec2=[[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]],
+        covariance_arcsec2=covariance_of(sample.covariance_arcsec2[0].tolist()),
         rate_deg_per_s=sample.rate_deg_per_s[0].tolist(),
         bias_deg_per_h=sample.bias_deg_per_h[0].tolist() if is_gyro else None,
         bias_sigma_deg_per_h=sample.bias_sigma_deg_per_h[0].tolist(),

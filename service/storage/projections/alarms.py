@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
-from msgspec import Struct
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
@@ -88,8 +87,10 @@ class LimitEvaluator:
             row = _locked(connection, spacecraft, run)
         assert row is not None
         self._row = row
-        saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
-        self._windows = saved.windows_of(row["state"])
+        state, self._windows = _LAST_SAVED.pop((spacecraft, run), ("", {}))
+        if state != row["state"]:
+            stored = msgspec.json.decode(row["state"])
+            self._windows = {name: SampleWindow.from_json(each) for name, each in stored.items()}
         self._active = ActiveAlarms(connection, spacecraft, run)
 
     def evaluate(self) -> None:
@@ -214,28 +215,12 @@ class LimitEvaluator:
         _SAVE.run(self._connection, [place | {name: row[name] for name in _COLUMNS}])
         if len(_LAST_SAVED) >= _MAX_SAVED:
             _LAST_SAVED.clear()
-        _LAST_SAVED[self._spacecraft, self._run] = _SavedWindows(state, self._windows)
+        _LAST_SAVED[self._spacecraft, self._run] = state, self._windows
 
 
-class _SavedWindows(Struct):
-    """The windows of one spacecraft and run as this process last wrote them.
-
-    Where the database still holds the same text, it is not decoded again.
-    """
-
-    state: str
-    windows: dict[str, SampleWindow]
-
-    def windows_of(self, state: str) -> dict[str, SampleWindow]:
-        """The windows that a stored text holds."""
-        if self.state == state:
-            return self.windows
-        stored = msgspec.json.decode(state)
-        return {name: SampleWindow.from_json(each) for name, each in stored.items()}
-
-
-_NOTHING_SAVED = _SavedWindows("", {})
-_LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
+# The windows of a spacecraft and run as this process last wrote them, with the text that it wrote:
+# where the database still holds that, it is not decoded again.
+_LAST_SAVED: dict[tuple[str, str], tuple[str, dict[str, SampleWindow]]] = {}
 _MAX_SAVED = 64
 
 

@@ -21,22 +21,10 @@ from service.storage.recording.result_metrics import (
     merge,
     rolled_up,
 )
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import add_rollups, insert_all
-from service.storage.sql.tables import (
-    COUNTS,
-    MAXIMA,
-    MINIMA,
-    ROLLED_UP,
-    SUMS,
-    archived_hours,
-    batches,
-    projector,
-    results,
-    rollups_hourly,
-    tracker_rollups_hourly,
-    tracker_values,
-)
+from service.storage.sql.tables import COUNTS, batches, projector, results, tracker_values
 from service.times import HOUR_S, bucket_start, parse_utc, recorded_utc
 
 BucketKey = tuple[str, str, int]
@@ -47,7 +35,9 @@ WHOLE = ""
 """The tracker that stands for the spacecraft as a whole."""
 _KEY = ("spacecraft", "run", "bucket")
 _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
-_NOTHING: Row = dict.fromkeys((*COUNTS, *SUMS), 0) | dict.fromkeys((*MINIMA, *MAXIMA))
+_NOTHING: Row = dict.fromkeys((*COUNTS, *tables.SUMS), 0) | dict.fromkeys(
+    (*tables.MINIMA, *tables.MAXIMA)
+)
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
@@ -168,7 +158,7 @@ def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
 def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Rollups:
     """The rollups of the hours of a day by tracker."""
     of_tracker: Rollups = {}
-    for table in (rollups_hourly, tracker_rollups_hourly):
+    for table in (tables.rollups_hourly, tables.tracker_rollups_hourly):
         query = select(table).where(
             table.c.spacecraft == spacecraft,
             table.c.run == run,
@@ -176,7 +166,7 @@ def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Roll
             table.c.bucket < 24 * (day + 1),
         )
         for row in connection.execute(query.order_by(table.c.bucket)).mappings():
-            hour = {name: row[name] for name in ROLLED_UP}
+            hour = {name: row[name] for name in tables.ROLLED_UP}
             _put(of_tracker, row.get("tracker", WHOLE), hour)
     return of_tracker
 
@@ -234,7 +224,7 @@ def hours_of_all(connection: Connection) -> set[BucketKey]:
         (spacecraft, run, recorded_utc(time).bucket(HOUR_S))
         for spacecraft, run, time in connection.execute(query)
     }
-    for table in (rollups_hourly, archived_hours):
+    for table in (tables.rollups_hourly, tables.archived_hours):
         query = select(*(table.c[name] for name in _KEY)).distinct()
         found.update((row[0], row[1], row[2]) for row in connection.execute(query))
     return found
@@ -292,19 +282,19 @@ def insert_share(
         for tracker, share in shares.items()
     ]
     if rows:
-        connection.execute(insert(archived_hours), rows)
+        connection.execute(insert(tables.archived_hours), rows)
 
 
 def forget_share(connection: Connection, part_id: int, spacecraft: str, run: str) -> None:
     """Delete the share of a part whose batches are recorded again."""
-    c = archived_hours.c
+    c = tables.archived_hours.c
     own = c.spacecraft == spacecraft, c.run == run, c.part_id == part_id
-    connection.execute(delete(archived_hours).where(*own))
+    connection.execute(delete(tables.archived_hours).where(*own))
 
 
 def shares_of_hour(connection: Connection, spacecraft: str, run: str, hour: int) -> dict[str, Row]:
     """The share of all archived batches of an hour, by tracker and for the `WHOLE`."""
-    c = archived_hours.c
+    c = tables.archived_hours.c
     found: Rollups = {}
     own = c.spacecraft == spacecraft, c.run == run, c.bucket == hour
     for *_, tracker, _, share in _shares(connection, *own):
@@ -316,7 +306,7 @@ def _shares(
     connection: Connection, *chosen: ColumnElement[bool]
 ) -> Iterator[tuple[str, str, str, int, Row]]:
     """The chosen shares, or all, as (spacecraft, run, tracker, hour, columns)."""
-    c = archived_hours.c
+    c = tables.archived_hours.c
     query = select(c.spacecraft, c.run, c.tracker, c.bucket, c.sums).where(*chosen)
     for spacecraft, run, tracker, hour, sums in connection.execute(query):
         yield spacecraft, run, tracker, hour, _NOTHING | json.loads(sums)

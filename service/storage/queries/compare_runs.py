@@ -11,19 +11,11 @@ from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, selec
 
 from service.storage.archive.reading import Archive, parts_between, places
 from service.storage.models import compare
-from service.storage.queries.pages import PLACE, Place, ResultFilter
+from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
 from service.storage.queries.with_archive import Listing, bounds_of
-from service.storage.sql.tables import (
-    COUNTED,
-    COUNTS,
-    archived_batches,
-    batches,
-    results,
-    rollups_daily,
-    solutions,
-    star_results,
-)
+from service.storage.sql import tables
+from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
@@ -31,7 +23,6 @@ if TYPE_CHECKING:
     from service.storage.archive.opened import Opened
 
 _READ_AT_ONCE = 10_000
-_QUATERNION = ("q1", "q2", "q3", "qc")
 
 
 def compare_runs(
@@ -47,10 +38,45 @@ def compare_runs(
     (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
     compares what both have.  With `latest`, of the period's latest batches alone.
     """
-    tally = _Tally()
+    stars: Counter[tuple[str, str, bool]] = Counter()
+    before: Counter[str] = Counter()
+    after: Counter[str] = Counter()
+    angles_arcsec = [np.empty(0)]
     for of_group, pairs in _groups(connection, archive, selected, other, latest):
-        tally.add(of_group, pairs)
-    return tally.comparison(selected.run, other)
+        stars.update(_transitions(of_group, pairs))
+        states = pairs.c.status_before, pairs.c.status_after
+        for old, new, count in of_group.execute(select(*states, func.count()).group_by(*states)):
+            before[old or "none"] += int(count)
+            after[new or "none"] += int(count)
+        angles_arcsec += _angles_arcsec(of_group, pairs)
+    transitions = [
+        compare.RunTransition(before=old, after=new, same_star=alike, stars=number)
+        for (old, new, alike), number in stars.items()
+    ]
+    # The most frequent first.
+    transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
+    angles = np.concatenate(angles_arcsec)
+    statistics = None
+    if len(angles):
+        median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
+        statistics = compare.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+    return compare.RunComparison(
+        run=selected.run,
+        other=other,
+        batches=before.total(),
+        stars=compare.RunStars(
+            observed=stars.total(),
+            before=_sums((each.before, each.stars) for each in transitions),
+            after=_sums((each.after, each.stars) for each in transitions),
+            transitions=transitions,
+        ),
+        attitudes=compare.RunAttitudes(
+            before=compare.StatusCounts(**before),
+            after=compare.StatusCounts(**after),
+            in_both=len(angles),
+            angle_arcsec=statistics,
+        ),
+    )
 
 
 def changed_batches(
@@ -84,7 +110,11 @@ def _groups(
 
     Without an archive that is one group.
     """
-    if not is_archived_in_part(connection, selected, other):
+    is_archived = any(
+        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
+        for run in (selected.run, other)
+    )
+    if not is_archived:
         yield connection, _pairs(selected, other, latest)
         return
     for group in both_runs(connection, archive, selected, other, latest):
@@ -95,14 +125,14 @@ def _groups(
 def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compare.RunChange]:
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
-        *(old.c[name] != new.c[name] for name in (*COUNTED, "status")),
+        *(old.c[name] != new.c[name] for name in (*tables.COUNTED, "status")),
         # Without an attitude the status is null.
         old.c.status.is_(None) != new.c.status.is_(None),
     )
     sides = [
         each.c[name].label(f"{side}_{name}")
         for side, each in (("before", old), ("after", new))
-        for name in ("id", *COUNTED, "status")
+        for name in ("id", *tables.COUNTED, "status")
     ]
     query = (
         select(batches.c.batch, batches.c.time, *sides)
@@ -163,62 +193,9 @@ def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Sub
     )
 
 
-class _Tally:
-    """Both runs so far, over the groups of batches that were compared."""
-
-    def __init__(self) -> None:
-        self.batches = 0
-        self.stars: Counter[tuple[str, str, bool]] = Counter()
-        self.before: Counter[str] = Counter()
-        self.after: Counter[str] = Counter()
-        self.angles_arcsec: list[Vector] = []
-
-    def add(self, connection: Connection, pairs: Subquery) -> None:
-        """Take the pairs of a group."""
-        self.batches += int(connection.scalar(select(func.count()).select_from(pairs)) or 0)
-        self.stars.update(_transitions(connection, pairs))
-        states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
-            pairs.c.status_before, pairs.c.status_after
-        )
-        for old, new, count in connection.execute(states):
-            self.before[old or "none"] += int(count)
-            self.after[new or "none"] += int(count)
-        self.angles_arcsec += _angles_arcsec(connection, pairs)
-
-    def comparison(self, run: str | None, other: str) -> compare.RunComparison:
-        """The whole; of the transitions the most frequent first."""
-        transitions = [
-            compare.RunTransition(before=before, after=after, same_star=alike, stars=stars)
-            for (before, after, alike), stars in self.stars.items()
-        ]
-        transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
-        angles = np.concatenate([np.empty(0), *self.angles_arcsec])
-        statistics = None
-        if len(angles):
-            median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-            statistics = compare.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
-        return compare.RunComparison(
-            run=run,
-            other=other,
-            batches=self.batches,
-            stars=compare.RunStars(
-                observed=sum(each.stars for each in transitions),
-                before=_sums((each.before, each.stars) for each in transitions),
-                after=_sums((each.after, each.stars) for each in transitions),
-                transitions=transitions,
-            ),
-            attitudes=compare.RunAttitudes(
-                before=compare.StatusCounts(**self.before),
-                after=compare.StatusCounts(**self.after),
-                in_both=len(angles),
-                angle_arcsec=statistics,
-            ),
-        )
-
-
 def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str, bool], int]:
     """How many stars went from which outcome to which, and whether they name the same star."""
-    old, new = star_results.alias("old_star"), star_results.alias("new_star")
+    old, new = tables.star_results.alias("old_star"), tables.star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
     query = (
         select(old.c.outcome, new.c.outcome, same, func.count())
@@ -251,9 +228,9 @@ def _sums(stars: Iterable[tuple[str, int]]) -> compare.OutcomeCounts:
 
 def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
     """The angles between the attitudes that both have, in arrays."""
-    old, new = solutions.alias("old_solution"), solutions.alias("new_solution")
+    old, new = tables.solutions.alias("old_solution"), tables.solutions.alias("new_solution")
     query = (
-        select(*(each.c[name] for each in (old, new) for name in _QUATERNION))
+        select(*(each.c[name] for each in (old, new) for name in QUATERNION))
         .select_from(pairs)
         .join(old, old.c.result_id == pairs.c.before)
         .join(new, new.c.result_id == pairs.c.after)
@@ -273,14 +250,6 @@ GROUP = 2_000
 """Batches of a run that are compared together."""
 _COMPARED = ("solution", "stars")
 _AT_ONCE = 1_000
-
-
-def is_archived_in_part(connection: Connection, selected: ResultFilter, other: str) -> bool:
-    """True if the archive has batches of the period in one of the runs."""
-    return any(
-        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
-        for run in (selected.run, other)
-    )
 
 
 def both_runs(
@@ -310,7 +279,7 @@ def both_runs(
         for each in found:
             own[each.archived].append(each.row.batch_id)
         recorded = [*own[False], *_named(connection, batches, other, names)]
-        archived = [*own[True], *_named(connection, archived_batches, other, names)]
+        archived = [*own[True], *_named(connection, tables.archived_batches, other, names)]
         yield _opened(connection, archive, recorded, archived)
         beyond = found[-1].place
         left = None if left is None else left - len(found)
@@ -386,12 +355,12 @@ def run_rates(
     rates = []
     for run in runs:
         span = BucketFilter(spacecraft, run, start, end)
-        buckets = read_buckets(connection, span, level, COUNTS)
+        buckets = read_buckets(connection, span, level, tables.COUNTS)
         place = (buckets["unix_s"] // width_s - first_s // width_s).astype(int)
         rates.append(
             compare.RunRates(
                 run=run,
-                totals={name: int(buckets[name].sum()) for name in COUNTS},
+                totals={name: int(buckets[name].sum()) for name in tables.COUNTS},
                 shares={name: _share(buckets, name, place, cells) for name in _SHARES},
             )
         )
@@ -401,7 +370,7 @@ def run_rates(
 def _common_days(
     connection: Connection, spacecraft: str, runs: Sequence[str]
 ) -> tuple[Utc, Utc] | None:
-    c = rollups_daily.c
+    c = tables.rollups_daily.c
     query = (
         select(func.min(c.bucket), func.max(c.bucket))
         .where(c.spacecraft == spacecraft, c.run.in_(runs), c.batches > 0)

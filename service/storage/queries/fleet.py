@@ -22,18 +22,9 @@ from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_time_of
 from service.storage.recording.result_metrics import SUMMED
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTS,
-    batches,
-    mission_uses,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    runs,
-    solutions,
-    star_results,
-)
+from service.storage.sql.tables import COUNTS, batches, results
 from service.times import (
     DAY_S,
     HOUR_S,
@@ -145,9 +136,9 @@ def _latest_ids(
 @cache
 def _newest_query(solved: bool) -> Select[Any]:
     # Every spacecraft of a mission file is noted with its settings when the service starts.
-    known = select(mission_uses.c.spacecraft.label("name")).distinct()
+    known = select(tables.mission_uses.c.spacecraft.label("name")).distinct()
     asked = known.where(
-        mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
+        tables.mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
     ).subquery()
     newest = select(results.c.id).where(
         results.c.current,
@@ -171,7 +162,7 @@ def _tracker_counts(
     connection: Connection, ids: Iterable[str]
 ) -> dict[str, dict[str, tuple[int, int]]]:
     """Stars and unique stars of each tracker, by the id of the result."""
-    columns = star_results.c
+    columns = tables.star_results.c
     unique = func.sum(case((columns.outcome == "unique", 1), else_=0))
     query = (
         select(columns.result_id, columns.tracker, func.count(), unique)
@@ -185,7 +176,7 @@ def _tracker_counts(
 
 
 def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, models.KnownAttitude]:
-    columns = solutions.c
+    columns = tables.solutions.c
     query = (
         select(
             results.c.spacecraft,
@@ -195,7 +186,7 @@ def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, mode
             *(columns.p11, columns.p22, columns.p33),
         )
         .join_from(results, batches, results.c.batch_id == batches.c.id)
-        .join(solutions, columns.result_id == results.c.id)
+        .join(tables.solutions, columns.result_id == results.c.id)
         .where(results.c.id.in_(list(ids.values())))
     )
     return {
@@ -270,7 +261,7 @@ def _hours(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
     """Sums of whole hours, from the rollups."""
-    table, hours = rollups_hourly.c, width_s // HOUR_S
+    table, hours = tables.rollups_hourly.c, width_s // HOUR_S
     first = shifted(as_of, -span_s).bucket(HOUR_S)
     cell = (table.bucket // hours).label("cell")
     query = (
@@ -350,12 +341,12 @@ def default_run(connection: Connection, spacecraft: Collection[str] | None = Non
 
     With `spacecraft`, batches of these.
     """
-    batches = select(rollups_daily.c.run).where(rollups_daily.c.run == runs.c.name)
+    daily, c = tables.rollups_daily.c, tables.runs.c
+    filled = select(daily.run).where(daily.run == c.name)
     if spacecraft is not None:
-        batches = batches.where(rollups_daily.c.spacecraft.in_(spacecraft))
-    filled = batches.exists()
-    query = select(runs.c.name).where(filled)
-    first = query.order_by(runs.c.name != LIVE, runs.c.created.desc(), runs.c.name).limit(1)
+        filled = filled.where(daily.spacecraft.in_(spacecraft))
+    query = select(c.name).where(filled.exists())
+    first = query.order_by(c.name != LIVE, c.created.desc(), c.name).limit(1)
     return str(connection.execute(first).scalar() or LIVE)
 
 

@@ -5,17 +5,11 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, insert, select, update
+from sqlalchemy import ColumnElement, Connection, bindparam, insert, select, update
 
-from service.alarms import subjects
+from service.alarms import quantities, subjects
 from service.alarms.limits import LimitSettings
-from service.alarms.quantities import (
-    QUANTITIES,
-    QuantityName,
-    default_limits,
-    limited_names,
-    tracker_names,
-)
+from service.alarms.quantities import QuantityName
 from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
@@ -40,10 +34,10 @@ _IN_FORCE = prepared(
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     """The limits in force for a spacecraft and its trackers: own ones in place of the shipped."""
     # Read with every batch; a process meets few missions.
-    key = mission.digest, limited_names()
+    key = mission.digest, quantities.limited_names()
     shipped = _SHIPPED.get(key)
     if shipped is None:
-        shipped = _SHIPPED[key] = default_limits(mission)
+        shipped = _SHIPPED[key] = quantities.default_limits(mission)
     own = {
         subjects.subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
         for row in _in_force(connection, mission.name)
@@ -76,15 +70,7 @@ def limit_history(
 ) -> LimitHistory:
     """The limit in force for a quantity, the shipped one, and every one set, newest first."""
     shipped = _inherited(connection, mission, tracker)[quantity]
-    query = (
-        select(limits)
-        .where(
-            limits.c.spacecraft == mission.name,
-            limits.c.quantity == quantity,
-            limits.c.tracker == tracker,
-        )
-        .order_by(limits.c.id.desc())
-    )
+    query = select(limits).where(*_place(mission, quantity, tracker)).order_by(limits.c.id.desc())
     rows = [dict(row) for row in connection.execute(query).mappings()]
     latest = next((row for row in rows if row["until"] is None), None)
     return LimitHistory(
@@ -94,15 +80,20 @@ def limit_history(
     )
 
 
+def _place(mission: Mission, quantity: str, tracker: str) -> tuple[ColumnElement[bool], ...]:
+    c = limits.c
+    return c.spacecraft == mission.name, c.quantity == quantity, c.tracker == tracker
+
+
 def _inherited(
     connection: Connection, mission: Mission, tracker: str
 ) -> Mapping[QuantityName, LimitSettings]:
     """The limits that hold where none was set: the shipped ones, or a tracker's spacecraft's."""
-    shipped = default_limits(mission)
+    shipped = quantities.default_limits(mission)
     if not tracker:
         return shipped
     whole = limits_of(connection, mission)
-    return {name: whole[name] for name in shipped if name in tracker_names()}
+    return {name: whole[name] for name in shipped if name in quantities.tracker_names()}
 
 
 def set_limit(
@@ -117,12 +108,8 @@ def set_limit(
     tracker: str = "",
 ) -> Limit:
     """Set a limit from now on; None restores the shipped one.  The one before stays in history."""
-    place = (
-        limits.c.spacecraft == mission.name,
-        limits.c.quantity == quantity,
-        limits.c.tracker == tracker,
-    )
-    connection.execute(update(limits).where(*place, limits.c.until.is_(None)).values(until=now))
+    before = *_place(mission, quantity, tracker), limits.c.until.is_(None)
+    connection.execute(update(limits).where(*before).values(until=now))
     row = {
         "spacecraft": mission.name,
         "quantity": quantity,
@@ -153,7 +140,7 @@ def shown_limit(
         spacecraft=spacecraft,
         quantity=quantity,
         tracker=tracker or None,
-        unit=QUANTITIES[quantity].unit,
+        unit=quantities.QUANTITIES[quantity].unit,
         is_default=own is None,
         since=row and row["since"],
         who=row and row["who"],

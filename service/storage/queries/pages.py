@@ -1,6 +1,7 @@
 """Current results in order of their batches' time, a page at a time."""
 
 import base64
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,10 @@ from service.times import Utc, recorded_utc
 
 Place = tuple[int, str]
 """The time of a batch, and its id."""
+
+QUATERNION = ("q1", "q2", "q3", "qc")
+COVARIANCE = ("p11", "p12", "p13", "p22", "p23", "p33")
+"""Columns of `solutions`."""
 
 PLACE = (results.c.time_ns, results.c.batch_id)
 """The order of a list.  Columns of the batch, not of the result: adopting changes no order."""
@@ -43,6 +48,12 @@ class ResultFilter:
         if self.end is not None:
             chosen.append(results.c.time_ns < self.end.tai_ns)
         return chosen
+
+
+def covariance_of(upper: Sequence[float]) -> list[list[float]]:
+    """The covariance matrix of what its columns `COVARIANCE` hold."""
+    p11, p12, p13, p22, p23, p33 = upper
+    return [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
 
 
 def newest(

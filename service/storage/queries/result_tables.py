@@ -12,7 +12,7 @@ from service.alarms.quantities import QUANTITIES
 from service.products.attitudes import AttitudeRows
 from service.products.tables import Column, Page, Table
 from service.storage.archive.reading import Archive
-from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter
 from service.storage.queries.with_archive import Listing, Reading, all_rows
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, solutions, star_results
 from service.vectors import Vector
@@ -20,7 +20,6 @@ from service.vectors import Vector
 PAGE = 5_000
 """Rows that are read together."""
 
-_SOLVED = ("q1", "q2", "q3", "qc", "p11", "p12", "p13", "p22", "p23", "p33")
 _QUALITY = ("residual_rms_arcsec", "predicted_rms_arcsec")
 _QUERY: Select[Any] = (
     select(
@@ -31,7 +30,7 @@ _QUERY: Select[Any] = (
         batches.c.time,
         batches.c.input,
         solutions.c.method,
-        *(solutions.c[name] for name in (*_SOLVED, *_QUALITY)),
+        *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE, *_QUALITY)),
         *(results.c[name] for name in COUNTED),
     )
     .join_from(results, batches, results.c.batch_id == batches.c.id)
@@ -40,12 +39,11 @@ _QUERY: Select[Any] = (
 
 
 class _Rates(msgspec.Struct):
-    """The rates of a recorded input."""
-
     body_rates_deg_per_s: tuple[float, float, float] | None = None
 
 
-_RATES = msgspec.json.Decoder(_Rates)
+RATES = msgspec.json.Decoder(_Rates)
+"""Reads the rates of a recorded input."""
 _UNKNOWN = (np.nan, np.nan, np.nan)
 
 
@@ -73,7 +71,7 @@ def _columns(rows: Sequence[Any]) -> AttitudeRows:
     values = np.array(numbers, dtype=np.float64)
     # In the table they are zero.
     values[10:12, np.array(method, dtype=object) == METHOD] = np.nan
-    rates = [_RATES.decode(each).body_rates_deg_per_s for each in sent]
+    rates = [RATES.decode(each).body_rates_deg_per_s for each in sent]
     return AttitudeRows(
         time_ns=np.array(time_ns, dtype=np.int64),
         time=_texts(time),

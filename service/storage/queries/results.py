@@ -16,16 +16,9 @@ from service.storage.models.base import Page
 from service.storage.queries import with_archive
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_what_ifs,
-    batches,
-    frames,
-    missions,
-    results,
-    runs,
-)
+from service.storage.sql.tables import batches, results
 from service.times import Utc
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
@@ -79,7 +72,7 @@ def _conditions(selected: ResultFilter, batch: str | None) -> list[ColumnElement
         return selected.conditions()
     # The unique index begins with spacecraft and run: neither is left open.  Both are asked of the
     # batch alone: asked of its result, they lead SQLite through all results of the spacecraft.
-    in_runs = select(runs.c.name) if selected.run is None else [selected.run]
+    in_runs = select(tables.runs.c.name) if selected.run is None else [selected.run]
     ids = select(batches.c.id).where(
         batches.c.spacecraft == selected.spacecraft,
         batches.c.run.in_(in_runs),
@@ -115,8 +108,8 @@ def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) 
 
 def _archived(id: str) -> Select[tuple[str]]:
     """The query for the spacecraft of an archived result."""
-    what_if = select(archived_what_ifs.c.batch_id).where(archived_what_ifs.c.id == id)
-    c = archived_batches.c
+    what_if = select(tables.archived_what_ifs.c.batch_id).where(tables.archived_what_ifs.c.id == id)
+    c = tables.archived_batches.c
     return select(c.spacecraft).where(or_(c.id == id, c.id == what_if.scalar_subquery()))
 
 
@@ -140,8 +133,8 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> a
         .where(results.c.batch_id == row["batch_id"], results.c.parent_id.is_not(None))
         .order_by(results.c.id)
     )
-    of_frame = select(frames.c.summary, frames.c.detections).where(
-        frames.c.batch_id == row["batch_id"]
+    of_frame = select(tables.frames.c.summary, tables.frames.c.detections).where(
+        tables.frames.c.batch_id == row["batch_id"]
     )
     frame = connection.execute(of_frame).mappings().first()
     return answers.Result(
@@ -184,15 +177,15 @@ def frame_of_result(connection: Connection, id: str) -> Row:
             results.c.answer,
             results.c.catalog_digest,
             batches.c.input,
-            frames.c.detections,
-            frames.c.preview,
-            frames.c.preview_step,
-            missions.c.settings,
+            tables.frames.c.detections,
+            tables.frames.c.preview,
+            tables.frames.c.preview_step,
+            tables.missions.c.settings,
         )
         .select_from(
             results.join(batches, results.c.batch_id == batches.c.id)
-            .join(frames, frames.c.batch_id == batches.c.id)
-            .join(missions, missions.c.digest == results.c.mission_digest)
+            .join(tables.frames, tables.frames.c.batch_id == batches.c.id)
+            .join(tables.missions, tables.missions.c.digest == results.c.mission_digest)
         )
         .where(results.c.id == id)
     )

@@ -26,20 +26,11 @@ from sqlalchemy import (
 from service.errors import BadInput, Fault
 from service.storage.models.spacecraft import Rates
 from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTS,
-    ROLLED_UP,
-    archived_parts,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    tracker_rollups_daily,
-    tracker_rollups_hourly,
-    tracker_values,
-)
+from service.storage.sql.tables import results
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
-from service.vectors import Matrix, Vector
+from service.vectors import Vector
 
 Bucket = Literal["hour", "day"]
 Columns = dict[str, Vector]
@@ -64,8 +55,8 @@ class Trend:
 
 
 TRENDS: dict[Bucket, Trend] = {
-    "hour": Trend(rollups_hourly, tracker_rollups_hourly, HOUR_S),
-    "day": Trend(rollups_daily, tracker_rollups_daily, DAY_S),
+    "hour": Trend(tables.rollups_hourly, tables.tracker_rollups_hourly, HOUR_S),
+    "day": Trend(tables.rollups_daily, tables.tracker_rollups_daily, DAY_S),
 }
 
 
@@ -85,7 +76,7 @@ class BucketFilter:
 
 def batches_about(connection: Connection, span: BucketFilter) -> int:
     """The batches of all hours that a span touches: at least as many as it holds."""
-    table = rollups_hourly.c
+    table = tables.rollups_hourly.c
     query = select(func.sum(table.batches)).where(
         table.spacecraft == span.spacecraft,
         table.run == span.run,
@@ -97,7 +88,7 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
 
 def has_archived(connection: Connection, span: BucketFilter) -> bool:
     """True if a span has archived batches, which only the rollups count."""
-    c = archived_parts.c
+    c = tables.archived_parts.c
     query = select(c.id).where(
         c.spacecraft == span.spacecraft,
         c.run == span.run,
@@ -108,7 +99,7 @@ def has_archived(connection: Connection, span: BucketFilter) -> bool:
 
 
 def read_buckets(
-    connection: Connection, span: BucketFilter, level: Bucket, names: Names = ROLLED_UP
+    connection: Connection, span: BucketFilter, level: Bucket, names: Names = tables.ROLLED_UP
 ) -> Columns:
     """The buckets of a span, in order of time; those without a batch are left out."""
     width_s = TRENDS[level].width_s
@@ -135,7 +126,7 @@ def _finer(connection: Connection, span: BucketFilter, level: Bucket, names: Nam
 
 
 def read_steps(
-    connection: Connection, span: BucketFilter, width_s: int, names: Names = ROLLED_UP
+    connection: Connection, span: BucketFilter, width_s: int, names: Names = tables.ROLLED_UP
 ) -> Columns:
     """Buckets of so much of a UTC day each, summed up by the database from the batches.
 
@@ -197,31 +188,32 @@ def _steps_query(names: Names, of_tracker: bool) -> Select[Any]:
     summed = SUMMED_OF_TRACKERS if of_tracker else SUMMED
     query = select(STEP, *(summed[name] for name in names))
     if of_tracker:
-        of_one = tracker_values.c.tracker == bindparam("tracker")
+        of_one = tables.tracker_values.c.tracker == bindparam("tracker")
         query = query.select_from(OF_TRACKERS).where(of_one)
     own = results.c.spacecraft == bindparam("spacecraft")
     return query.where(*IN_PERIOD, own).group_by(STEP).order_by(STEP)
 
 
 def _steps_of(rows: Sequence[Any], midnight: Utc, width_s: int, names: Names) -> Columns:
-    read = _table(rows, names)
-    begin_ns = midnight.tai_ns + read[0].astype(np.int64) * width_s * 10**9
-    return {"unix_s": unix_seconds(begin_ns), **dict(zip(names, read[1:], strict=True))}
+    columns = _columns(rows, names)
+    begin_ns = midnight.tai_ns + columns["unix_s"].astype(np.int64) * width_s * 10**9
+    return columns | {"unix_s": unix_seconds(begin_ns)}
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _table(rows: Sequence[Any], names: Names) -> Matrix:
-    """Rows as columns, the key's first."""
+def _columns(rows: Sequence[Any], names: Names) -> Columns:
+    """Rows as columns; `unix_s` is the first, the number of the bucket."""
     # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
-    return np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names)).T
+    table = np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names))
+    return dict(zip(("unix_s", *names), table.T, strict=True))
 
 
 def totals(buckets: Columns) -> Row:
     """The counts of all buckets together."""
-    return {name: int(buckets[name].sum()) for name in COUNTS}
+    return {name: int(buckets[name].sum()) for name in tables.COUNTS}
 
 
 @cache
@@ -248,11 +240,8 @@ def _whole(
     trend = TRENDS[level]
     table = trend.table if span.tracker is None else trend.tracker_table
     asked = _owner(span) | {"first": first, "last": last}
-    read = _table(connection.execute(_whole_query(table, names), asked).all(), names)
-    return {
-        "unix_s": read[0] * trend.width_s - UNIX_DAY * DAY_S,
-        **dict(zip(names, read[1:], strict=True)),
-    }
+    columns = _columns(connection.execute(_whole_query(table, names), asked).all(), names)
+    return columns | {"unix_s": columns["unix_s"] * trend.width_s - UNIX_DAY * DAY_S}
 
 
 def _owner(span: BucketFilter) -> Row:
@@ -290,7 +279,7 @@ def rates(
     """
     trend = TRENDS[bucket]
     table = trend.table
-    query = select(table.c.bucket, *(table.c[name] for name in COUNTS)).where(
+    query = select(table.c.bucket, *(table.c[name] for name in tables.COUNTS)).where(
         table.c.spacecraft == spacecraft,
         table.c.run == run,
         *buckets_between(table.c.bucket, start, end, trend.width_s),
@@ -303,7 +292,8 @@ def rates(
         raise BadInput(Fault("start", wrong, value))
     return [
         Rates(
-            start=bucket_start(number, trend.width_s).text, **dict(zip(COUNTS, counts, strict=True))
+            start=bucket_start(number, trend.width_s).text,
+            **dict(zip(tables.COUNTS, counts, strict=True)),
         )
         for number, *counts in rows
     ]

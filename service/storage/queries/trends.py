@@ -28,16 +28,9 @@ from service.storage.queries.pages import (
 from service.storage.queries.results import summary_fields, summary_query
 from service.storage.queries.time_buckets import BucketFilter, Columns
 from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTED,
-    MEASURED,
-    batches,
-    results,
-    rollups_hourly,
-    tracker_rollups_hourly,
-    tracker_values,
-)
+from service.storage.sql.tables import batches, results, tracker_values
 from service.times import (
     DAY_S,
     HOUR_S,
@@ -248,7 +241,7 @@ def _listed(values: Vector) -> Numbers:
     return list(values.tolist())
 
 
-_VALUES = (*COUNTED, "status", *MEASURED)
+_VALUES = (*tables.COUNTED, "status", *tables.MEASURED)
 _SHOWN = (results.c.id, *PLACE, batches.c.batch, batches.c.time)
 _OF_BATCHES = select(*(results.c[name] for name in _VALUES), *_SHOWN).join_from(
     results, batches, results.c.batch_id == batches.c.id
@@ -423,7 +416,7 @@ def _hours(
 
     An hour that the period cuts is narrowed; its greatest value may lie outside.
     """
-    rollup = rollups_hourly if tracker is None else tracker_rollups_hourly
+    rollup = tables.rollups_hourly if tracker is None else tables.tracker_rollups_hourly
     table = rollup.c
     most = _greatest(by, rollup)
     query = select(table.bucket, most).where(

@@ -5,6 +5,7 @@ record and on one row group of the archive after another, until it is certain wh
 """
 
 import heapq
+import itertools
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -81,16 +82,24 @@ class Listing:
         found = [Found(row, False) for row in connection.execute(query)]
         sign = -1 if self.newest_first else 1
         last_ns = found[limit - 1].place[0] if len(found) >= limit else None
-        waiting = _Waiting(self._parts(connection, beyond, last_ns), sign)
+        # Parts and row groups that are not read yet, by where they begin in the order of the list.
+        heap: list[tuple[int, int, PlacedPart | Block]] = []
+        numbers = itertools.count()
+
+        def read_later(more: Iterable[PlacedPart | Block]) -> None:
+            for each in more:
+                begins = each.first_ns if sign > 0 else -each.last_ns
+                heapq.heappush(heap, (begins, next(numbers), each))
+
+        read_later(self._parts(connection, beyond, last_ns))
         opened = 0
-        while waiting.any_left:
-            begins = waiting.begins
+        while heap:
+            begins, _, next_up = heapq.heappop(heap)
             if len(found) >= limit and sign * found[limit - 1].place[0] < begins:
                 break
-            next_up = waiting.pop()
             if isinstance(next_up, PlacedPart):
                 blocks = self.archive.blocks(next_up)
-                waiting.add(each for each in blocks if self._reaches(each, beyond))
+                read_later(each for each in blocks if self._reaches(each, beyond))
                 continue
             # Row groups that begin where the page does are all opened: the next page would begin
             # there.
@@ -228,31 +237,3 @@ def bounds_of(selected: ResultFilter) -> tuple[int | None, int | None]:
         None if selected.start is None else selected.start.tai_ns,
         None if selected.end is None else selected.end.tai_ns,
     )
-
-
-class _Waiting:
-    """Parts and row groups that are not read yet, the one that begins first first."""
-
-    def __init__(self, parts: Iterable[PlacedPart], sign: int) -> None:
-        self._sign = sign
-        self._heap: list[tuple[int, int, PlacedPart | Block]] = []
-        self._count = 0
-        self.add(parts)
-
-    @property
-    def any_left(self) -> bool:
-        return bool(self._heap)
-
-    @property
-    def begins(self) -> int:
-        """The begin of the first, in the order of the list: no row of any comes before it."""
-        return self._heap[0][0]
-
-    def add(self, more: Iterable[PlacedPart | Block]) -> None:
-        for each in more:
-            begins = each.first_ns if self._sign > 0 else -each.last_ns
-            self._count += 1
-            heapq.heappush(self._heap, (begins, self._count, each))
-
-    def pop(self) -> PlacedPart | Block:
-        return heapq.heappop(self._heap)[2]
