@@ -5,8 +5,8 @@ letter stays until it is sent again, or until there are too many after it.
 """
 
 import json
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
 from pydantic import Field
@@ -39,6 +39,7 @@ _row = webhook_deliveries.c
 _SHOWN = (
     *("id", "name", "url", "severity", "run", "enabled", "who", "created", "missed"),
     *("failing_since", "last_attempt", "last_delivered", "last_status", "last_fault"),
+    *("kinds", "spacecraft", "state", "reason"),
 )
 
 
@@ -183,8 +184,8 @@ def list_webhooks(
     """
     of_each = {row["webhook_id"]: row for row in connection.execute(_counts()).mappings()}
     return [
-        _shown_webhook(row, of_each.get(row["id"], {}), now, is_open)
-        for row in connection.execute(_with_token(id)).mappings()
+        _shown_webhook(row, of_each.get(row["id"], {}), now)
+        for row in _rows(connection, now, is_open, id)
     ]
 
 
@@ -199,8 +200,9 @@ def registered_webhooks(
     connection: Connection, now: str, is_open: bool, id: str | None = None
 ) -> Sequence[Registered]:
     """Every webhook, or one, as it is sent to."""
-    rows = connection.execute(_with_token(id)).mappings()
-    return [_registered(row, now, is_open) for row in rows]
+    names = [each.name for each in fields(Registered)]
+    rows = _rows(connection, now, is_open, id)
+    return [Registered(**{name: row[name] for name in names}) for row in rows]
 
 
 def registered_webhook(connection: Connection, id: str, now: str, is_open: bool) -> Registered:
@@ -210,7 +212,8 @@ def registered_webhook(connection: Connection, id: str, now: str, is_open: bool)
     raise _unknown(id)
 
 
-def _with_token(id: str | None) -> Any:
+def _rows(connection: Connection, now: str, is_open: bool, id: str | None) -> Iterator[Row]:
+    """Webhooks as they are stored, each with its lists, its state and the reason of that."""
     tokens = access_tokens.c
     query = (
         select(
@@ -222,7 +225,12 @@ def _with_token(id: str | None) -> Any:
         .outerjoin(access_tokens, tokens.id == webhooks.c.token_id)
         .order_by(webhooks.c.id)
     )
-    return query if id is None else query.where(webhooks.c.id == id)
+    if id is not None:
+        query = query.where(webhooks.c.id == id)
+    for row in connection.execute(query).mappings():
+        lists = {name: row[name] and json.loads(row[name]) for name in ("kinds", "spacecraft")}
+        state, reason = _state(row, now, is_open)
+        yield {**row, **lists, "state": state, "reason": reason}
 
 
 def _counts() -> Any:
@@ -252,15 +260,10 @@ def _state(row: Any, now: str, is_open: bool) -> tuple[WebhookStateName, str | N
     return "active", None
 
 
-def _shown_webhook(row: Any, counted: Any, now: str, is_open: bool) -> Webhook:
-    state, reason = _state(row, now, is_open)
+def _shown_webhook(row: Row, counted: Any, now: str) -> Webhook:
     until = row["previous_until"]
     return Webhook(
         **{name: row[name] for name in _SHOWN},
-        kinds=_listed(row["kinds"]),
-        spacecraft=_listed(row["spacecraft"]),
-        state=state,
-        reason=reason,
         previous_until=until if until is not None and until > now else None,
         waiting=int(counted.get("waiting", 0)),
         dead=int(counted.get("dead", 0)),
@@ -268,25 +271,9 @@ def _shown_webhook(row: Any, counted: Any, now: str, is_open: bool) -> Webhook:
     )
 
 
-def _registered(row: Any, now: str, is_open: bool) -> Registered:
-    state, reason = _state(row, now, is_open)
-    same = ("id", "name", "url", "severity", "run", "secret", "previous_secret", "previous_until")
-    return Registered(
-        **{name: row[name] for name in (*same, "position", "held_until")},
-        kinds=_listed(row["kinds"]),
-        spacecraft=_listed(row["spacecraft"]),
-        state=state,
-        reason=reason,
-    )
-
-
 def _stored(row: Row) -> Row:
     lists = {name: row[name] for name in ("kinds", "spacecraft") if row.get(name) is not None}
     return row | {name: json.dumps(sorted(set(value))) for name, value in lists.items()}
-
-
-def _listed(text: str | None) -> list[Any] | None:
-    return None if text is None else list(json.loads(text))
 
 
 def _unknown(id: str) -> NotFound:

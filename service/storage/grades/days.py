@@ -162,6 +162,12 @@ def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) 
     for block in blocks:
         digest.update(block["packed"])
     start, end = day_bounds(key.day)
+    summary = DaySummary(
+        stretches=[_stretch(start, each) for each in graded.stretches],
+        measurements=graded.measurements,
+        gyro=graded.gyro,
+        nis_per_degree=graded.nis_per_degree,
+    )
     day = {
         "id": id,
         "spacecraft": key.spacecraft,
@@ -174,7 +180,7 @@ def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) 
         "inputs": inputs,
         "digest": f"sha256:{digest.hexdigest()}",
         "samples": graded.samples,
-        "summary": msgspec.json.encode(_summary(start, graded)).decode(),
+        "summary": msgspec.json.encode(summary).decode(),
     }
     return [day, *blocks]
 
@@ -241,15 +247,6 @@ def _parts(
     edges = [*range(0, len(samples), MOST_PACKED), len(samples)]
     for first, end in pairwise(edges):
         yield samples.taken(slice(first, end))
-
-
-def _summary(start: Utc, graded: GradedDay) -> DaySummary:
-    return DaySummary(
-        stretches=[_stretch(start, each) for each in graded.stretches],
-        measurements=graded.measurements,
-        gyro=graded.gyro,
-        nis_per_degree=graded.nis_per_degree,
-    )
 
 
 def _stretch(start: Utc, stretch: GradedStretch) -> GradedStretchInfo:

@@ -37,8 +37,7 @@ from service.times import DAY_S, Utc, recorded_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 _ATTITUDES = select(
-    results.c.time_ns,
-    *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
+    results.c.time_ns, *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE))
 ).join_from(results, solutions, solutions.c.result_id == results.c.id)
 
 

@@ -32,6 +32,7 @@ from service.storage.models.base import Page
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
 from service.storage.queries.limits import limits_of
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.times import DAY_S, Utc, shifted
 
@@ -82,7 +83,11 @@ def grades_of_period(
     if not blocks:
         return None
     measured = _blocks(connection, selected, INNOVATIONS)
-    days, total = _days(connection, spacecraft, run, start, end)
+    c = graded_days.c
+    chosen = c.current, c.spacecraft == spacecraft, c.run == run
+    within = buckets_between(c.day, start, end, DAY_S)
+    query = select(graded_days).where(*chosen, *within).order_by(c.day)
+    days = connection.execute(query).mappings().all()
     read = _spread(blocks)
     whole = {grade: _samples(connection, grade, read) for grade in GRADES}
     places = _of_each_part(
@@ -98,8 +103,8 @@ def grades_of_period(
         innovations=_innovations(connection, _spread(measured), selected, start, end),
         is_whole=len(blocks) <= MOST_BLOCKS and len(measured) <= MOST_BLOCKS,
         stretches=[(each.model, each.start_ns, each.end_ns) for each in blocks],
-        days=days,
-        total_days=total,
+        days=[shown(row) for row in days[-MOST_DAYS:]],
+        total_days=len(days),
     )
 
 
@@ -124,21 +129,6 @@ def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_
         .order_by(graded_days.c.day, c.position)
     )
     return [_Block(*row) for row in connection.execute(query)]
-
-
-def _days(
-    connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
-) -> tuple[list[GradedDayRow], int]:
-    c = graded_days.c
-    query = select(graded_days).where(
-        c.current,
-        c.spacecraft == spacecraft,
-        c.run == run,
-        c.day >= start.bucket(DAY_S),
-        c.start_ns < end.tai_ns,
-    )
-    rows = connection.execute(query.order_by(c.day)).mappings().all()
-    return [shown(row) for row in rows[-MOST_DAYS:]], len(rows)
 
 
 def _spread(blocks: Sequence[_Block]) -> list[_Block]:
@@ -188,11 +178,7 @@ def _repeated_models(read: Sequence[_Block], time_ns: Integers) -> npt.NDArray[n
 
 
 def _innovations(
-    connection: Connection,
-    read: Sequence[_Block],
-    selected: ResultFilter,
-    start: Utc,
-    end: Utc,
+    connection: Connection, read: Sequence[_Block], selected: ResultFilter, start: Utc, end: Utc
 ) -> MeasuredInnovations | None:
     """The innovations to show; None where none were recorded, as of an older revision."""
     if not read:

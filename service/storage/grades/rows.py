@@ -22,10 +22,9 @@ from service.storage.models.base import (
     Record,
     doc,
 )
-from service.storage.models.base import (
-    Status as StatusWord,
-)
+from service.storage.models.base import Status as StatusWord
 from service.storage.queries.pages import ResultFilter, covariance_of
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.times import DAY_S, Utc
 
@@ -88,12 +87,12 @@ def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bo
         days.spacecraft == selected.spacecraft,
         days.run == selected.run,
         blocks.grade == kind,
+        *buckets_between(days.day, selected.start, selected.end, DAY_S),
     ]
     if selected.start is not None:
-        chosen += [days.day >= selected.start.bucket(DAY_S)]
-        chosen += [blocks.end_ns >= selected.start.tai_ns]
+        chosen.append(blocks.end_ns >= selected.start.tai_ns)
     if selected.end is not None:
-        chosen += [days.day <= selected.end.bucket(DAY_S), blocks.start_ns < selected.end.tai_ns]
+        chosen.append(blocks.start_ns < selected.end.tai_ns)
     return chosen
 
 

@@ -30,10 +30,7 @@ from service.storage.sql.tables import batches, results, runs
 from service.times import Utc, recorded_utc
 
 # Run with every batch of a live spacecraft, or with a few of them.
-_PLACE = (
-    watches.c.spacecraft == bindparam("of_spacecraft"),
-    watches.c.run == bindparam("of_run"),
-)
+_PLACE = (watches.c.spacecraft == bindparam("of_spacecraft"), watches.c.run == bindparam("of_run"))
 _LOCK = prepared(select(watches).where(*_PLACE).with_for_update())
 _COLUMNS = ("time", "time_ns", "batch_id", "received", "state")
 _SAVE = prepared(

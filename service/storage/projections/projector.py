@@ -23,7 +23,7 @@ from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
-from service.storage.queries.pages import PLACE
+from service.storage.queries.pages import newest_first
 from service.storage.recording import events
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
@@ -72,8 +72,7 @@ def _note_states(
     if run == LIVE:
         received_ns = max(each.received_ns for each in tracked)
         query = query.where(results.c.time_ns <= received_ns + AHEAD_NS)
-    latest = query.order_by(*(column.desc() for column in PLACE)).limit(1)
-    row = connection.execute(latest).first()
+    row = connection.execute(newest_first(query).limit(1)).first()
     before = None if row is None else state_in(row.answer)
     for each in sorted(tracked, key=lambda each: int(each.result["time_ns"])):
         if row is not None and row.time_ns > each.result["time_ns"]:

@@ -11,7 +11,7 @@ from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, selec
 
 from service.storage.archive.reading import Archive, parts_between, places
 from service.storage.models import compare
-from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter
+from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter, newest_first
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
 from service.storage.queries.with_archive import Listing, bounds_of
 from service.storage.sql import tables
@@ -100,11 +100,7 @@ def changed_batches(
 
 
 def _groups(
-    connection: Connection,
-    archive: Archive,
-    selected: ResultFilter,
-    other: str,
-    latest: int | None,
+    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
 ) -> Iterator[tuple[Connection, Subquery]]:
     """The pairs of results of both runs with the database that they are in, latest first.
 
@@ -168,8 +164,7 @@ def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Sub
     of_run = selected.conditions()
     if latest is not None:
         # The limit comes first: to look for partners of millions of batches takes minutes.
-        chosen = select(results.c.id).where(*of_run)
-        chosen = chosen.order_by(results.c.time_ns.desc(), results.c.batch_id.desc())
+        chosen = newest_first(select(results.c.id).where(*of_run))
         of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
         select(
@@ -253,11 +248,7 @@ _AT_ONCE = 1_000
 
 
 def both_runs(
-    connection: Connection,
-    archive: Archive,
-    selected: ResultFilter,
-    other: str,
-    latest: int | None,
+    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
 ) -> Iterator["Opened"]:
     """The selected batches with those of the same names in another run, latest first.
 
@@ -329,11 +320,7 @@ _SHARES = ("ambiguous", "unmatched")
 
 
 def run_rates(
-    connection: Connection,
-    spacecraft: str,
-    runs: Sequence[str],
-    start: Utc | None,
-    end: Utc | None,
+    connection: Connection, spacecraft: str, runs: Sequence[str], start: Utc | None, end: Utc | None
 ) -> compare.RatesOfRuns | None:
     """The rates of all stars of each run, in total and over time.
 

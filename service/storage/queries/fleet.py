@@ -16,7 +16,7 @@ from service.storage.models.answers import Summary
 from service.storage.queries import time_buckets
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
-from service.storage.queries.pages import PLACE
+from service.storage.queries.pages import newest_first
 from service.storage.queries.results import summary_of, summary_query
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_time_of
@@ -25,15 +25,7 @@ from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import COUNTS, batches, results
-from service.times import (
-    DAY_S,
-    HOUR_S,
-    UNIX_DAY,
-    Utc,
-    recorded_utc,
-    shifted,
-    unix_seconds,
-)
+from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, recorded_utc, shifted, unix_seconds
 
 Period = Literal["hour", "day", "week"]
 PERIODS_S: Mapping[Period, int] = {"hour": HOUR_S, "day": DAY_S, "week": 7 * DAY_S}
@@ -148,7 +140,7 @@ def _newest_query(solved: bool) -> Select[Any]:
     )
     if solved:
         newest = newest.where(results.c.status.is_not(None))
-    newest = newest.order_by(*(column.desc() for column in PLACE)).limit(1).correlate(asked)
+    newest = newest_first(newest).limit(1).correlate(asked)
     return select(asked.c.name, newest.scalar_subquery())
 
 
@@ -235,16 +227,12 @@ def _cells(
     return _table(names, rows, as_of, span_s, width_s)
 
 
-def _first_cell_s(as_of: Utc, span_s: int, width_s: int) -> float:
-    end_s = float(unix_seconds([as_of.tai_ns])[0])
-    return (end_s - span_s) // width_s * width_s + width_s
-
-
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
 ) -> models.FleetCells:
     """Sums as a table of spacecraft and time."""
-    start_s = _first_cell_s(as_of, span_s, width_s)
+    end_s = float(unix_seconds([as_of.tai_ns])[0])
+    start_s = (end_s - span_s) // width_s * width_s + width_s
     place = {name: k for k, name in enumerate(names)}
     counts = {name: np.zeros((len(names), span_s // width_s)) for name in COUNTS}
     found = [(place[row[0]], int((row[1] - start_s) // width_s), row[2:]) for row in rows]

@@ -13,7 +13,7 @@ from service.alarms.quantities import QuantityName
 from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, newest_first
 from service.storage.recording import events
 from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
@@ -165,7 +165,7 @@ def latest_samples(
         same_batch = tracker_values.c.batch_id == results.c.batch_id
         of_tracker = tracker_values.c.tracker == tracker
         query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
-    query = query.order_by(results.c.time_ns.desc(), results.c.batch_id.desc()).limit(limit)
+    query = newest_first(query).limit(limit)
     sample_of = subjects.sampler(subject)
     rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
     samples = [sample_of(row, {tracker: row}) for row in rows]

@@ -24,7 +24,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star
 from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
-from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.pages import PLACE, ResultFilter, newest_first
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
 from service.storage.queries.star_field import presumed_attitude
@@ -81,21 +81,22 @@ def sample_period(
     selected = ResultFilter(span.run, span.spacecraft, span.start, span.end)
     query = _SHOWN.order_by(*PLACE)
     if total <= most:
-        rows = _rows(connection, query.where(*selected.conditions()).limit(most))
+        chosen = query.where(*selected.conditions()).limit(most)
+        rows = tuple(map(dict, connection.execute(chosen).mappings()))
         follows = np.arange(len(rows)) > 0
     else:
         drawn = _drawn_times_ns(hours["unix_s"], hours["batches"], most // 2)
         # The first hour may begin before the period.
         pairs = _pairs(connection, selected, [max(each, span.start.tai_ns) for each in drawn])
-        chosen = {id for pair in pairs for id in pair}
+        drawn_ids = {id for pair in pairs for id in pair}
         # Without the period, through which the ids would be looked for one after another.
-        own = (results.c.current, results.c.batch_id.in_(chosen))
-        rows = _rows(connection, query.where(*own))
+        chosen = query.where(results.c.current, results.c.batch_id.in_(drawn_ids))
+        rows = tuple(map(dict, connection.execute(chosen).mappings()))
         ids = [row["batch_id"] for row in rows]
         follows = np.array([False, *(pair in pairs for pair in pairwise(ids))])
     digests = {row["mission_digest"] for row in rows}
     missions = {digest: recorded_mission(connection, digest) for digest in digests}
-    return PeriodSample(total, follows, tuple(rows), missions)
+    return PeriodSample(total, follows, rows, missions)
 
 
 def _drawn_times_ns(
@@ -121,12 +122,7 @@ def _pairs(
         .order_by(*PLACE)
         .limit(2)
     )
-    backward = (
-        select(results.c.batch_id)
-        .where(*selected.conditions())
-        .order_by(*(column.desc() for column in PLACE))
-        .limit(2)
-    )
+    backward = newest_first(select(results.c.batch_id).where(*selected.conditions())).limit(2)
     found = set()
     for begin_ns in begins_ns:
         pair = [row[0] for row in connection.execute(forward, {"from_ns": begin_ns})]
@@ -134,10 +130,6 @@ def _pairs(
             pair = [row[0] for row in connection.execute(backward)][::-1]
         found.add((pair[0], pair[1]))
     return found
-
-
-def _rows(connection: Connection, query: Select[tuple[str, str, int, str, str]]) -> list[Row]:
-    return [dict(row) for row in connection.execute(query).mappings()]
 
 
 LEAST_EXPECTED = 0.1

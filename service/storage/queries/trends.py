@@ -19,27 +19,14 @@ from service.alarms.quantities import (
 )
 from service.storage.models.spacecraft import History, Numbers, RankedBatch, Series
 from service.storage.queries import time_buckets
-from service.storage.queries.pages import (
-    PLACE,
-    ResultFilter,
-    latest_time,
-    newest_first,
-)
+from service.storage.queries.pages import PLACE, ResultFilter, latest_time, newest_first
 from service.storage.queries.results import summary_fields, summary_query
 from service.storage.queries.time_buckets import BucketFilter, Columns
 from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results, tracker_values
-from service.times import (
-    DAY_S,
-    HOUR_S,
-    Utc,
-    bucket_start,
-    shifted,
-    unix_seconds,
-    utc_now,
-)
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.intp]
@@ -330,12 +317,7 @@ def _of_batches(
 def _empty(request: HistoryRequest) -> History:
     """The history, without an end, of a run without batches of the spacecraft."""
     start = None if request.start is None else request.start.text
-    about: Row = {
-        "spacecraft": request.spacecraft,
-        "run": request.run,
-        "start": start,
-        "end": None,
-    }
+    about: Row = {"spacecraft": request.spacecraft, "run": request.run, "start": start, "end": None}
     if request.strategy == "latest":
         return _of_batches([], about, request)
     nothing = np.empty(0)
@@ -406,11 +388,7 @@ def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
 
 
 def _hours(
-    connection: Connection,
-    selected: ResultFilter,
-    by: RankedName,
-    limit: int,
-    tracker: str | None,
+    connection: Connection, selected: ResultFilter, by: RankedName, limit: int, tracker: str | None
 ) -> Iterator[tuple[int, int, float]]:
     """The hours of a period as (begin, end, the greatest value in it), the greatest first.
 
