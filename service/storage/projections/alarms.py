@@ -139,25 +139,19 @@ class LimitEvaluator:
         """
         due = []
         for name, limits in self._limits.items():
-            samples = list(filter(None, self._samples(name, self._new)))
+            every = list(self._samples(name, self._new))
+            samples = list(filter(None, every))
             if not samples:
                 continue
             window = self._windows.setdefault(name, SampleWindow())
             if self._active.is_out(name) or not window.add_if_within(samples, limits):
                 due.append((name, limits))
             elif self._active.has(name) and (value := window.value(limits)) is not None:
-                batch = self._latest_with(name)
+                present = (each.result for each, one in zip(self._new, every, strict=True) if one)
+                batch = max(present, key=lambda result: int(result["time_ns"]))
                 point = Point(value, *self._latest_in_window(batch, window.samples[-1][0]))
                 self._active.observe(name, None, limits, point, batch["received"])
         return due
-
-    def _latest_with(self, name: Subject) -> Row:
-        """The latest new batch that has a value of a subject."""
-        latest_first = sorted(self._new, key=lambda each: -each.result["time_ns"])
-        samples = self._samples(name, latest_first)
-        return next(
-            each.result for each, sample in zip(latest_first, samples, strict=True) if sample
-        )
 
     @staticmethod
     def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:

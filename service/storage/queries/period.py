@@ -1,7 +1,8 @@
 """The batches of a period: a bounded sample of them, and the arrays that its charts show.
 
 Nothing is identified here.  Directions are computed from what was sent, with the
-settings of the mission as they were for each result.
+settings of the mission as they were for each result.  Batches (b) are in order of time.
+Where something is not known an array has NaN.
 """
 
 from collections.abc import Sequence
@@ -23,7 +24,6 @@ from service.sky.ephemeris import apparent, sun_direction
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star
-from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
 from service.storage.queries.pages import PLACE, ResultFilter, newest_first
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
@@ -31,7 +31,7 @@ from service.storage.queries.star_field import presumed_attitude
 from service.storage.queries.time_buckets import BucketFilter, read_buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.times import HOUR_S, utc_of_unix
+from service.times import HOUR_S, Utc, utc_of_unix
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
@@ -52,6 +52,70 @@ _SHOWN: Select[tuple[str, str, int, str, str]] = select(
     batches.c.input,
 ).join_from(results, batches, results.c.batch_id == batches.c.id)
 _FROM_NS = bindparam("from_ns", type_=BigInteger)
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodAttitudes:
+    """The attitudes of the batches that were read.
+
+    `quaternion` (b, 4) is inertial to body, `covariance_arcsec2` (b, 3, 3) of the error
+    rotation about the body axes.  `status` is `good`, `suspect` or `no_attitude`.
+    `follows` (b,) says whether no other batch lies between one and that before it.
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    time: tuple[str, ...]
+    status: tuple[str, ...]
+    quaternion: Vector
+    covariance_arcsec2: Vector
+    follows: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerStarsOfPeriod:
+    """The unique stars (n) of one tracker, and where it looked in each batch.
+
+    `place_deg` (n, 2) is h and v on the focal plane.  `residual_arcsec` (n, 2) is
+    observed minus predicted along h and along v, and `expected_arcsec` (n, 2) its
+    standard deviation: the star's sigma less the part of the noise that the
+    attitude takes up.  Both are NaN for a star that the attitude does not use.
+    `boresight` (b, 3) is inertial; without an attitude that of the a priori one.
+    """
+
+    tracker: str
+    field_of_view_radius_deg: float
+    sigma_arcsec: float
+    boresight: Vector
+    place_deg: Vector
+    residual_arcsec: Vector
+    expected_arcsec: Vector
+    observed_mag: Vector
+    catalog_mag: Vector
+    region: SearchRegion | None
+    """Where the stars of the latest batch were searched for."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodStars:
+    """What was read of the `total` batches of a period: all, or some where there are many.
+
+    `other_catalog` is how many of those read were identified with a star catalog that
+    the service no longer has; they are without stars here.  `sun` (b, 3) are inertial
+    directions to the Sun.
+    """
+
+    total: int
+    attitudes: PeriodAttitudes
+    trackers: tuple[TrackerStarsOfPeriod, ...]
+    other_catalog: int
+    sun: Vector
+    first: Utc | None
+    last: Utc | None
+
+    @property
+    def read(self) -> int:
+        """The number of batches that were read."""
+        return len(self.attitudes.time)
 
 
 @dataclass(frozen=True)

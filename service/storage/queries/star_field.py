@@ -1,12 +1,14 @@
 """The stars of a batch in each tracker's field of view, and its trackers side by side.
 
 Nothing is identified here: the outcomes are those of the answer that is shown, so
-that the chart of an old result shows that result.
+that the chart of an old result shows that result.  Directions are given as `h_deg`, `v_deg`:
+that of (tan h, tan v, 1) in the tracker's axes.
 """
 
 import math
 
 import numpy as np
+from msgspec import Struct
 
 from service.acquire.choices import aberration_velocity
 from service.errors import BadBatch, Fault
@@ -18,7 +20,6 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
-from service.storage.models import charts
 from service.storage.models.answers import Answer, Star, TrackerStars
 from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
 from service.vectors import (
@@ -38,9 +39,65 @@ WIDEST_DEG = 15.0
 EDGE_STEP_DEG = 0.5
 
 
+class Boresight(Struct, frozen=True, kw_only=True):
+    """The boresight in the inertial frame."""
+
+    ra_deg: float
+    dec_deg: float
+
+
+class CatalogStarPlace(Struct, frozen=True, kw_only=True):
+    """A catalog star in the field of view."""
+
+    id: str
+    magnitude: float
+    h_deg: float
+    v_deg: float
+
+
+class ObservedStarPlace(Struct, frozen=True, kw_only=True):
+    """An observed star with its outcome; `residual_arcsec` is observed minus predicted.
+
+    The residual is along h and along v, None if the attitude does not use the star.
+    """
+
+    outcome: str
+    star: str | None
+    rivals: list[str]
+    magnitude: float | None
+    h_deg: float
+    v_deg: float
+    residual_arcsec: tuple[float, float] | None
+
+
+class TrackerField(Struct, frozen=True, kw_only=True):
+    """The view of one tracker; `zone_edges` are lines of [h, v] in degrees."""
+
+    tracker: str
+    boresight: Boresight
+    field_of_view_radius_deg: float
+    radius_deg: float
+    magnitude_limit_mag: float
+    zone_edges: list[list[list[float]]]
+    catalog: list[CatalogStarPlace]
+    observed: list[ObservedStarPlace]
+
+
+class StarField(Struct, frozen=True, kw_only=True):
+    """The views of all trackers of a batch.
+
+    `through` is "quest", "triad" or "a_priori": the attitude by which catalog stars are drawn.
+    `same_catalog` says whether the run catalog is the one of the answer.
+    """
+
+    through: str
+    same_catalog: bool
+    trackers: list[TrackerField]
+
+
 def star_field_of(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
-) -> charts.StarField:
+) -> StarField:
     """The view of every tracker of a batch, as an answer to it has identified the stars.
 
     The answer's attitude carries catalog stars into the tracker's axes.  Without one the
@@ -56,7 +113,7 @@ def star_field_of(
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
     trackers = zip(correct(batch, mission), answer.observations, strict=True)
-    return charts.StarField(
+    return StarField(
         through="a_priori" if solved is None else solved.method,
         same_catalog=run_catalog.digest == answer.provenance.run_catalog,
         trackers=[
@@ -87,7 +144,7 @@ def _tracker(
     mission: Mission,
     run_catalog: RunCatalog,
     rows: dict[str, int],
-) -> charts.TrackerField:
+) -> TrackerField:
     tracker = corrected.tracker
     region = search_region(tracker, presumed, mission, f"observations.{index}.tracker")
     to_tracker = tracker.body_from_tracker.T @ attitude
@@ -100,15 +157,15 @@ def _tracker(
     seen_at = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
     place_of = dict(zip(shown.tolist(), seen_at, strict=True))
     ra_deg, dec_deg = to_ra_dec(to_tracker[2])
-    return charts.TrackerField(
+    return TrackerField(
         tracker=tracker.name,
-        boresight=charts.Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
+        boresight=Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
         field_of_view_radius_deg=tracker.field_of_view_radius_deg,
         radius_deg=radius_deg,
         magnitude_limit_mag=mission.catalog.magnitude_limit_mag,
         zone_edges=_zone_edges(region, to_tracker, radius_deg),
         catalog=[
-            charts.CatalogStarPlace(
+            CatalogStarPlace(
                 id=run_catalog.star_id[row],
                 magnitude=float(run_catalog.magnitude_mag[row]),
                 **_angles(direction),
@@ -117,7 +174,7 @@ def _tracker(
             if direction[2] > 0
         ],
         observed=[
-            charts.ObservedStarPlace(
+            ObservedStarPlace(
                 outcome=star.outcome,
                 star=None if star.star is None else star.star.id,
                 rivals=list(star.rivals or []),

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.attitude.rotations import rotation_vectors
-from service.storage.models.charts import PeriodAttitudes
+from service.storage.queries.period import PeriodAttitudes
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 

@@ -18,8 +18,8 @@ from service.observations.schema import Key
 from service.storage.models.answers import Answer, Summary
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.base import Page
-from service.storage.models.charts import ObservedStarPlace, StarField
 from service.storage.queries.results import OutcomeName, StatusName, answer_from_json
+from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.tracks import TrackList

@@ -7,7 +7,7 @@ from fastapi import Path
 from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.storage.models.charts import TrackerStarsOfPeriod
+from service.storage.queries.period import TrackerStarsOfPeriod
 from service.web.console.charts.all_sky import all_sky_chart
 from service.web.console.charts.attitude import attitude_charts
 from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
