@@ -14,7 +14,7 @@ from service.missions.mission import Mission
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models.base import Page
-from service.storage.models.overview import Fleet, Overview
+from service.storage.models.overview import Overview
 from service.storage.models.spacecraft import (
     AttitudeRow,
     History,
@@ -52,7 +52,7 @@ class Spacecraft:
         run: str,
         period: fleet.Period,
         spacecraft: Collection[str] | None = None,
-    ) -> Fleet:
+    ) -> fleet.Fleet:
         """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
         missions = [self._context.known[name] for name in names]
         with self._context.reading() as connection:

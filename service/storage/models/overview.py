@@ -1,7 +1,5 @@
 """The state of the service: spacecraft at a glance, a fleet, versions, and the cache of zones."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from pydantic import Field
@@ -19,8 +17,6 @@ from service.storage.models.base import (
     list_record,
 )
 from service.storage.models.spacecraft import SpacecraftRow
-from service.times import Utc
-from service.vectors import Matrix
 
 Shares = list[float]
 
@@ -102,92 +98,6 @@ class About(Record, frozen=True, kw_only=True):
     catalog: CatalogAbout
     missions: list[MissionAbout]
     credits: list[str]
-
-
-@dataclass(frozen=True)
-class TrackerCounts:
-    """One tracker's stars of the latest batch, and how many of them are unique."""
-
-    tracker: str
-    observed: int
-    unique: int
-
-
-@dataclass(frozen=True)
-class KnownAttitude:
-    """The newest attitude of a spacecraft: of which result, at what time, how good."""
-
-    id: str
-    time: str
-    status: str
-    sigma_arcsec: tuple[float, float, float]
-    """One standard deviation about each body axis."""
-
-
-@dataclass(frozen=True)
-class FleetRow:
-    """The state of one spacecraft in a run; None without a batch."""
-
-    name: str
-    description: str
-    retired: bool
-    """True if no mission file describes it any more."""
-    state: str
-    """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
-    alarms: tuple[Alarm, ...]
-    """The alarms that are not cleared, worst first."""
-    latest_batch: answers.Summary | None = None
-    last_attitude: KnownAttitude | None = None
-    """It can be older than the latest batch."""
-    trackers: tuple[TrackerCounts, ...] = ()
-    age_s: float | None = None
-    """From its latest batch to the run's latest batch."""
-    received_age_s: float | None = None
-    """Since the service received its latest batch."""
-    last_hour: WindowCounts | None = None
-
-    @property
-    def alarms_now(self) -> list[Alarm]:
-        """Alarms whose quantity is out of its limits, without shelved ones."""
-        return [each for each in self.alarms if not each.in_limits and each.state != "shelved"]
-
-    @property
-    def alarms_returned(self) -> list[Alarm]:
-        """Alarms whose quantity is back in its limits and that wait to be acknowledged."""
-        return [each for each in self.alarms if each.in_limits and each.state != "shelved"]
-
-    @property
-    def has_attitude(self) -> bool:
-        """True if the latest batch has an attitude of its own."""
-        return self.state in ("good", "suspect")
-
-
-@dataclass(frozen=True)
-class FleetCells:
-    """Counts in cells of equal width in time: a row for each spacecraft, a column for each cell."""
-
-    start_s: float
-    """POSIX time at which the first cell begins."""
-    width_s: int
-    counts: Mapping[str, Matrix]
-    """A rollup's counts, such as `observed`; 0 where there was no batch."""
-
-    @property
-    def columns(self) -> int:
-        """How many cells there are in time."""
-        return int(self.counts["batches"].shape[1])
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Every spacecraft in a run; the rows of `cells` are those of `rows`."""
-
-    run: str
-    as_of: Utc | None
-    """The time of the run's latest batch."""
-    alarms: AlarmSummary
-    rows: tuple[FleetRow, ...]
-    cells: FleetCells | None
 
 
 class CacheUse(Record, frozen=True, kw_only=True):

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -10,9 +11,9 @@ from msgspec import structs
 from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, select
 
 from service.missions.mission import Mission
-from service.storage.models import overview as models
-from service.storage.models.alarms import Alarm
+from service.storage.models.alarms import Alarm, AlarmSummary
 from service.storage.models.answers import Summary
+from service.storage.models.overview import Overview, OverviewRow, Sparkline, WindowCounts
 from service.storage.queries import time_buckets
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
@@ -26,6 +27,7 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import COUNTS, batches, results
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, recorded_utc, shifted, unix_seconds
+from service.vectors import Matrix
 
 Period = Literal["hour", "day", "week"]
 PERIODS_S: Mapping[Period, int] = {"hour": HOUR_S, "day": DAY_S, "week": 7 * DAY_S}
@@ -39,6 +41,92 @@ _Sums = Sequence[tuple[Any, ...]]
 """Rows of spacecraft, POSIX time at which a cell begins, and counts."""
 
 
+@dataclass(frozen=True)
+class TrackerCounts:
+    """One tracker's stars of the latest batch, and how many of them are unique."""
+
+    tracker: str
+    observed: int
+    unique: int
+
+
+@dataclass(frozen=True)
+class KnownAttitude:
+    """The newest attitude of a spacecraft: of which result, at what time, how good."""
+
+    id: str
+    time: str
+    status: str
+    sigma_arcsec: tuple[float, float, float]
+    """One standard deviation about each body axis."""
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """The state of one spacecraft in a run; None without a batch."""
+
+    name: str
+    description: str
+    retired: bool
+    """True if no mission file describes it any more."""
+    state: str
+    """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
+    alarms: tuple[Alarm, ...]
+    """The alarms that are not cleared, worst first."""
+    latest_batch: Summary | None = None
+    last_attitude: KnownAttitude | None = None
+    """It can be older than the latest batch."""
+    trackers: tuple[TrackerCounts, ...] = ()
+    age_s: float | None = None
+    """From its latest batch to the run's latest batch."""
+    received_age_s: float | None = None
+    """Since the service received its latest batch."""
+    last_hour: WindowCounts | None = None
+
+    @property
+    def alarms_now(self) -> list[Alarm]:
+        """Alarms whose quantity is out of its limits, without shelved ones."""
+        return [each for each in self.alarms if not each.in_limits and each.state != "shelved"]
+
+    @property
+    def alarms_returned(self) -> list[Alarm]:
+        """Alarms whose quantity is back in its limits and that wait to be acknowledged."""
+        return [each for each in self.alarms if each.in_limits and each.state != "shelved"]
+
+    @property
+    def has_attitude(self) -> bool:
+        """True if the latest batch has an attitude of its own."""
+        return self.state in ("good", "suspect")
+
+
+@dataclass(frozen=True)
+class FleetCells:
+    """Counts in cells of equal width in time: a row for each spacecraft, a column for each cell."""
+
+    start_s: float
+    """POSIX time at which the first cell begins."""
+    width_s: int
+    counts: Mapping[str, Matrix]
+    """A rollup's counts, such as `observed`; 0 where there was no batch."""
+
+    @property
+    def columns(self) -> int:
+        """How many cells there are in time."""
+        return int(self.counts["batches"].shape[1])
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Every spacecraft in a run; the rows of `cells` are those of `rows`."""
+
+    run: str
+    as_of: Utc | None
+    """The time of the run's latest batch."""
+    alarms: AlarmSummary
+    rows: tuple[FleetRow, ...]
+    cells: FleetCells | None
+
+
 def fleet(
     connection: Connection,
     missions: Iterable[Mission],
@@ -46,7 +134,7 @@ def fleet(
     period: Period,
     now: Utc,
     spacecraft: Collection[str] | None = None,
-) -> models.Fleet:
+) -> Fleet:
     """Every mission in a run; the last hour and the period end with the run's latest batch.
 
     With `spacecraft`, that of these.
@@ -56,11 +144,11 @@ def fleet(
     active = [each for each in active_alarms(connection, run, now.text) if each.spacecraft in named]
     if as_of is None:
         rows = tuple(_row(each, None, now, active) for each in named.values())
-        return models.Fleet(run, None, summary(active), rows, None)
+        return Fleet(run, None, summary(active), rows, None)
     facts = _Facts(connection, list(named), run, as_of, now)
     rows = tuple(_row(each, facts, now, active) for each in named.values())
     cells = _cells(connection, list(named), run, as_of, period)
-    return models.Fleet(run, as_of, summary(active), rows, cells)
+    return Fleet(run, as_of, summary(active), rows, cells)
 
 
 class _Facts:
@@ -80,16 +168,14 @@ class _Facts:
         self.last_hour = _last_hours(connection, names, run, as_of)
 
 
-def _row(
-    mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]
-) -> models.FleetRow:
+def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
     name = mission.name
     batch = None if facts is None else facts.latest.get(name)
     about = name, mission.description, mission.retired
     alarms = tuple(each for each in active if each.spacecraft == name)
     if facts is None or batch is None:
-        return models.FleetRow(*about, state="no_batches", alarms=alarms)
-    return models.FleetRow(
+        return FleetRow(*about, state="no_batches", alarms=alarms)
+    return FleetRow(
         *about,
         state=batch.status or "no_attitude",
         alarms=alarms,
@@ -102,12 +188,10 @@ def _row(
     )
 
 
-def _of_every_tracker(
-    mission: Mission, counted: Mapping[str, Any]
-) -> tuple[models.TrackerCounts, ...]:
+def _of_every_tracker(mission: Mission, counted: Mapping[str, Any]) -> tuple[TrackerCounts, ...]:
     """The counts of a mission's trackers, in its order; none of one that saw no star."""
     names = [each.name for each in mission.trackers]
-    return tuple(models.TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
+    return tuple(TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
 
 
 def _latest_ids(
@@ -167,7 +251,7 @@ def _tracker_counts(
     return found
 
 
-def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, models.KnownAttitude]:
+def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, KnownAttitude]:
     columns = tables.solutions.c
     query = (
         select(
@@ -182,7 +266,7 @@ def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, mode
         .where(results.c.id.in_(list(ids.values())))
     )
     return {
-        name: models.KnownAttitude(id, time, status, (_root(p11), _root(p22), _root(p33)))
+        name: KnownAttitude(id, time, status, (_root(p11), _root(p22), _root(p33)))
         for name, id, time, status, p11, p22, p33 in connection.execute(query)
     }
 
@@ -193,7 +277,7 @@ def _root(variance: float) -> float:
 
 def _last_hours(
     connection: Connection, names: list[str], run: str, as_of: Utc
-) -> dict[str, models.WindowCounts]:
+) -> dict[str, WindowCounts]:
     """The counts of the hour that ends with the run's latest batch."""
     # The latest batch belongs to the window, one just an hour before it does not.
     end = shifted(as_of, _TICK_S)
@@ -204,7 +288,7 @@ def _last_hours(
         query.where(*time_buckets.IN_PERIOD, _IN_NAMES).group_by(results.c.spacecraft), asked
     )
     return {
-        name: models.WindowCounts(
+        name: WindowCounts(
             start=start.text, end=as_of.text, **dict(zip(COUNTS, map(int, counts), strict=True))
         )
         for name, *counts in rows
@@ -213,7 +297,7 @@ def _last_hours(
 
 def _cells(
     connection: Connection, names: list[str], run: str, as_of: Utc, period: Period
-) -> models.FleetCells:
+) -> FleetCells:
     width_s, span_s = CELLS_S[period], PERIODS_S[period]
     if period == "day":
         # Hours tell how many batches there are, and serve where those are too many.
@@ -229,7 +313,7 @@ def _cells(
 
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
-) -> models.FleetCells:
+) -> FleetCells:
     """Sums as a table of spacecraft and time."""
     end_s = float(unix_seconds([as_of.tai_ns])[0])
     start_s = (end_s - span_s) // width_s * width_s + width_s
@@ -242,7 +326,7 @@ def _table(
         values = np.array([each[2] for each in kept], dtype=float).T
         for name, column in zip(COUNTS, values, strict=True):
             np.add.at(counts[name], tuple(at), column)
-    return models.FleetCells(start_s, width_s, counts)
+    return FleetCells(start_s, width_s, counts)
 
 
 def _hours(
@@ -303,7 +387,7 @@ def overview(
     run: str,
     now: Utc,
     spacecraft: Collection[str] | None = None,
-) -> models.Overview:
+) -> Overview:
     """Every mission in a run; the last hour and day end with the run's latest batch.
 
     With `spacecraft`, runs and batches of others are as if they did not exist.
@@ -314,7 +398,7 @@ def overview(
     found = active_alarms(connection, run, now.text)
     if spacecraft is not None:
         found = [each for each in found if each.spacecraft in spacecraft]
-    return models.Overview(
+    return Overview(
         run=run,
         default_run=default_run(connection, spacecraft),
         as_of=None if as_of is None else as_of.text,
@@ -345,7 +429,7 @@ def _item(
     as_of: Utc | None,
     now: Utc,
     active: Sequence[Alarm],
-) -> models.OverviewRow:
+) -> OverviewRow:
     state = live_state(connection, mission, run, now)
     batch, attitude = state.latest_batch, state.last_attitude
     item: Row = structs.asdict(state) | {
@@ -356,7 +440,7 @@ def _item(
         "alarms": [alarm for alarm in active if alarm.spacecraft == mission.name],
     }
     if batch is None or as_of is None:
-        return models.OverviewRow(**item)
+        return OverviewRow(**item)
     item["age_s"] = max(0.0, (as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9)
     item["received_age_s"] = (now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9
     for name, width_s in (("hour", HOUR_S), ("day", DAY_S)):
@@ -364,12 +448,10 @@ def _item(
         end = shifted(as_of, _TICK_S)
         span = BucketFilter(mission.name, run, shifted(end, -width_s), end)
         step_s, buckets = _read(connection, span, width_s)
-        window = models.WindowCounts(
-            start=span.start.text, end=as_of.text, **time_buckets.totals(buckets)
-        )
+        window = WindowCounts(start=span.start.text, end=as_of.text, **time_buckets.totals(buckets))
         item[f"last_{name}"] = window
         item[f"sparkline_{name}"] = _sparkline(buckets, step_s)
-    return models.OverviewRow(**item)
+    return OverviewRow(**item)
 
 
 def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
@@ -389,9 +471,9 @@ def _read(
     return STEPS[width_s], time_buckets.read_steps(connection, span, STEPS[width_s], COUNTS)
 
 
-def _sparkline(buckets: time_buckets.Columns, step_s: int) -> models.Sparkline:
+def _sparkline(buckets: time_buckets.Columns, step_s: int) -> Sparkline:
     observed = np.maximum(buckets["observed"], 1.0)
-    return models.Sparkline(
+    return Sparkline(
         bucket_s=step_s,
         unix_s=buckets["unix_s"].tolist(),
         batches=buckets["batches"].astype(int).tolist(),

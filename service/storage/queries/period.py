@@ -13,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, Select, bindparam, select
 
+from service import vectors
 from service.acquire.choices import aberration_velocity
 from service.identify.prior_attitude import PriorAttitude, search_region
 from service.missions.mission import Mission, Tracker
@@ -32,14 +33,7 @@ from service.storage.queries.time_buckets import BucketFilter, read_buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
 from service.times import HOUR_S, Utc, utc_of_unix
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    angle_between_deg,
-    matrix_from_quaternion,
-    unit,
-)
+from service.vectors import Matrix, Vector
 
 MOST_READ = 600
 """Batches that are read in full: their stars take less than a second."""
@@ -265,7 +259,7 @@ def _boresight(
 ) -> Vector:
     """The direction in which a tracker looked, inertial; NaN where nothing tells it."""
     if answer.attitude is not None:
-        attitude = matrix_from_quaternion(answer.attitude.quaternion)
+        attitude = vectors.matrix_from_quaternion(answer.attitude.quaternion)
     elif presumed is None or not _knows(tracker, presumed, mission):
         return np.array(_UNKNOWN_DIRECTION)
     else:
@@ -275,7 +269,7 @@ def _boresight(
 
 def _knows(tracker: Tracker, presumed: PriorAttitude, mission: Mission) -> bool:
     """True if a priori knowledge tells where a tracker looks: with the roll, or without it."""
-    off_deg = angle_between_deg(tracker.boresight_body, mission.axis_body)
+    off_deg = vectors.angle_between_deg(tracker.boresight_body, mission.axis_body)
     return presumed.roll_known or bool(off_deg <= ALIGNED_DEG)
 
 
@@ -310,7 +304,7 @@ def _add(
     into.catalog_mag.append(run_catalog.magnitude_mag[row])
     residual, expected = np.full((2, len(own), 2), np.nan)
     if answer.attitude is not None:
-        to_tracker = turned.T @ matrix_from_quaternion(answer.attitude.quaternion)
+        to_tracker = turned.T @ vectors.matrix_from_quaternion(answer.attitude.quaternion)
         natural = run_catalog.direction_at(batch.time)[row]
         predicted = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
         covariance = turned.T @ np.array(answer.attitude.covariance_arcsec2) @ turned
@@ -330,9 +324,9 @@ def _residuals(
     the tangent h by e . v and along v by -e . h.  The optimal attitude takes up just so
     much of the star's own noise, so that sigma^2 - v' P v remains along h.
     """
-    along_h = unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
+    along_h = vectors.unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
     along_v = np.cross(direction, along_h)
-    off = (direction - predicted) * ARCSEC_PER_RADIAN
+    off = (direction - predicted) * vectors.ARCSEC_PER_RADIAN
     residual = np.stack([np.sum(off * along_h, axis=1), np.sum(off * along_v, axis=1)], axis=1)
     taken = np.stack(
         [

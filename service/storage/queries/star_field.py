@@ -10,6 +10,7 @@ import math
 import numpy as np
 from msgspec import Struct
 
+from service import vectors
 from service.acquire.choices import aberration_velocity
 from service.errors import BadBatch, Fault
 from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
@@ -22,15 +23,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
 from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    angle_between_deg,
-    matrix_from_quaternion,
-    to_ra_dec,
-    unit,
-)
+from service.vectors import Matrix, Vector
 
 MARGIN = 1.25
 """How far beyond the field of view stars are given, in fields of view."""
@@ -109,7 +102,9 @@ def star_field_of(
     if presumed is None:
         message = "nothing is known of the attitude, neither beforehand nor from the stars"
         raise BadBatch(Fault("a_priori", message, "null"))
-    attitude = presumed.attitude if solved is None else matrix_from_quaternion(solved.quaternion)
+    attitude = (
+        presumed.attitude if solved is None else vectors.matrix_from_quaternion(solved.quaternion)
+    )
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
     trackers = zip(correct(batch, mission), answer.observations, strict=True)
@@ -156,7 +151,7 @@ def _tracker(
     natural = run_catalog.direction_at(batch.time)[shown]
     seen_at = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
     place_of = dict(zip(shown.tolist(), seen_at, strict=True))
-    ra_deg, dec_deg = to_ra_dec(to_tracker[2])
+    ra_deg, dec_deg = vectors.to_ra_dec(to_tracker[2])
     return TrackerField(
         tracker=tracker.name,
         boresight=Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
@@ -195,7 +190,7 @@ def _radius_deg(tracker: Tracker, seen: Vector, named: Vector, to_tracker: Matri
     """How far from the boresight the picture reaches: all that the answer speaks of, if it can."""
     boresight = np.array([0.0, 0.0, 1.0])
     spoken_of = np.concatenate([seen, named @ to_tracker.T])
-    farthest = float(np.max(angle_between_deg(spoken_of, boresight), initial=0.0))
+    farthest = float(np.max(vectors.angle_between_deg(spoken_of, boresight), initial=0.0))
     wide = tracker.field_of_view_radius_deg * MARGIN
     return max(wide, min(farthest * 1.05, WIDEST_DEG))
 
@@ -206,7 +201,7 @@ def _near(
     """Rows of the stars of the zone within the picture, its corners included."""
     most = min(90.0, radius_deg * math.sqrt(2.0))
     near = np.flatnonzero(run_catalog.direction @ boresight >= math.cos(math.radians(most)))
-    angle = angle_between_deg(run_catalog.direction[near], region.axis)
+    angle = vectors.angle_between_deg(run_catalog.direction[near], region.axis)
     return np.asarray(near[(angle >= region.least_deg) & (angle <= region.most_deg)])
 
 
@@ -215,7 +210,7 @@ def _zone_edges(
 ) -> list[list[list[float]]]:
     """The bounds of the zone where they cross the picture, as lines of [h, v] in degrees."""
     axis = to_tracker @ region.axis
-    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
+    first = vectors.unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
     lines: list[list[list[float]]] = []
     for bound_deg in (region.least_deg, region.most_deg):
@@ -238,9 +233,9 @@ def _residual(
     row = rows.get(star.star.id) if star.star else None
     if star.residual_arcsec is None or row is None:
         return None
-    along_h = unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
+    along_h = vectors.unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
     along_v = np.cross(seen, along_h)
-    off = (seen - place_of[row]) * ARCSEC_PER_RADIAN
+    off = (seen - place_of[row]) * vectors.ARCSEC_PER_RADIAN
     return float(off @ along_h), float(off @ along_v)
 
 

@@ -10,8 +10,7 @@ from starlette.responses import Response
 
 from service.alarms.limits import Severity
 from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
-from service.storage.models.overview import Fleet, FleetCells, FleetRow
-from service.storage.queries.fleet import PERIODS_S, Period
+from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
