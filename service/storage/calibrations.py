@@ -22,9 +22,9 @@ from service.storage.models.base import (
     doc,
 )
 from service.storage.recording.ids import following_ulid
-from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute
+from service.storage.sql.tables import calibration_adoptions, calibrations
 
 CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
 UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag", "magnitude"]

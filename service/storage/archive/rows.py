@@ -11,41 +11,22 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Connection,
-    Double,
-    Integer,
-    LargeBinary,
-    SmallInteger,
-    String,
-    Table,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.types import TypeEngine
 
+from service.storage.sql import tables
 from service.storage.sql.columns import PackedText
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import (
-    batches,
-    frames,
-    idempotency_keys,
-    results,
-    solutions,
-    star_results,
-    tracker_values,
-)
 
 Rows = dict[str, pa.Table]
 """Tables by the name of the SQL table: batches in order of time, the rest in their order."""
 
 CHILDREN = {
-    "stars": (star_results, "result_id", ("tracker", "position")),
-    "solution": (solutions, "result_id", ()),
-    "trackers": (tracker_values, "batch_id", ("tracker",)),
-    "frame": (frames, "batch_id", ()),
-    "keys": (idempotency_keys, "result_id", ("token_id", "key")),
+    "stars": (tables.star_results, "result_id", ("tracker", "position")),
+    "solution": (tables.solutions, "result_id", ()),
+    "trackers": (tables.tracker_values, "batch_id", ("tracker",)),
+    "frame": (tables.frames, "batch_id", ()),
+    "keys": (tables.idempotency_keys, "result_id", ("token_id", "key")),
 }
 """A partition's list columns: the table, what names its result, and its order within one.
 
@@ -57,18 +38,18 @@ _AT_ONCE = 1_000
 
 # Of two that fit, the narrower stands first; Text is a String.
 _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
-    (BigInteger, pa.int64()),
-    (SmallInteger, pa.int16()),
-    (Integer, pa.int32()),
-    (Boolean, pa.bool_()),
-    (Double, pa.float64()),
-    (LargeBinary, pa.binary()),
-    (String, pa.string()),
+    (sa.BigInteger, pa.int64()),
+    (sa.SmallInteger, pa.int16()),
+    (sa.Integer, pa.int32()),
+    (sa.Boolean, pa.bool_()),
+    (sa.Double, pa.float64()),
+    (sa.LargeBinary, pa.binary()),
+    (sa.String, pa.string()),
     (PackedText, pa.string()),
 )
 
 
-def schema_of(table: Table) -> pa.Schema:
+def schema_of(table: sa.Table) -> pa.Schema:
     """The Arrow schema of an SQL table."""
     return pa.schema(
         [
@@ -78,10 +59,10 @@ def schema_of(table: Table) -> pa.Schema:
     )
 
 
-def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
+def read_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> Rows:
     """All rows of these batches; ids of no batch are passed over."""
-    found = _ordered(_read(connection, batches, "id", batch_ids), ("time_ns", "id"))
-    made = _read(connection, results, "batch_id", batch_ids)
+    found = _ordered(_read(connection, tables.batches, "id", batch_ids), ("time_ns", "id"))
+    made = _read(connection, tables.results, "batch_id", batch_ids)
     made = _in_order_of(made, "batch_id", found["id"], ("id",))
     rows = {"batches": found, "results": made}
     ids = made["id"].to_pylist()
@@ -93,25 +74,28 @@ def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
     return rows
 
 
-def lock_rows(connection: Connection, batch_ids: Sequence[str]) -> None:
+def lock_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> None:
     """Let no other process add anything to these batches, or change it, before the commit.
 
     What others write refers to a result or to a batch.  Results come first, as where one is
     adopted.
     """
-    for table, owner in ((results, results.c.batch_id), (batches, batches.c.id)):
+    for table, owner in (
+        (tables.results, tables.results.c.batch_id),
+        (tables.batches, tables.batches.c.id),
+    ):
         for first in range(0, len(batch_ids), _AT_ONCE):
             chosen = owner.in_(batch_ids[first : first + _AT_ONCE])
-            query = select(table.c.id).where(chosen).order_by(table.c.id)
+            query = sa.select(table.c.id).where(chosen).order_by(table.c.id)
             connection.execute(query.with_for_update())
 
 
-def insert_rows(connection: Connection, rows: Rows) -> None:
+def insert_rows(connection: sa.Connection, rows: Rows) -> None:
     """Insert all rows, what others refer to first."""
     made = rows["results"]
     # A what-if refers to the result that it began with, which has a lower id.
     made = made.sort_by("id")
-    for table, read in ((batches, rows["batches"]), (results, made)):
+    for table, read in ((tables.batches, rows["batches"]), (tables.results, made)):
         insert_all(connection, table, read.to_pylist())
     for table, _, _ in CHILDREN.values():
         insert_all(connection, table, rows[table.name].to_pylist())
@@ -161,10 +145,10 @@ def from_partition(partition: pa.Table) -> Rows:
     """The rows that were put into a partition; columns of a later version than its are null."""
     partition = _with_copies(partition)
     is_first = pc.equal(partition["id"], partition["batch_id"])
-    names = [each.name for each in batches.columns]
+    names = [each.name for each in tables.batches.columns]
     rows = {
         "batches": partition.filter(is_first).select(names),
-        "results": _selected(partition, results),
+        "results": _selected(partition, tables.results),
     }
     for name, (table, owner, _) in CHILDREN.items():
         lists = partition[name]
@@ -175,7 +159,7 @@ def from_partition(partition: pa.Table) -> Rows:
     return rows
 
 
-def _selected(read: pa.Table, table: Table) -> pa.Table:
+def _selected(read: pa.Table, table: sa.Table) -> pa.Table:
     """The columns of an SQL table, in its order; null where they were not written."""
     for field in schema_of(table):
         if field.name not in read.column_names:
@@ -204,11 +188,11 @@ def _as_bits(table: pa.Table) -> pa.Table:
     return pa.table(columns)
 
 
-def _read(connection: Connection, table: Table, owner: str, ids: Sequence[str]) -> pa.Table:
+def _read(connection: sa.Connection, table: sa.Table, owner: str, ids: Sequence[str]) -> pa.Table:
     rows: list[tuple[object, ...]] = []
     for first in range(0, len(ids), _AT_ONCE):
         chosen = table.c[owner].in_(ids[first : first + _AT_ONCE])
-        rows += map(tuple, connection.execute(select(table).where(chosen)))
+        rows += map(tuple, connection.execute(sa.select(table).where(chosen)))
     schema = schema_of(table)
     columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
     arrays = [pa.array(each, field.type) for each, field in zip(columns, schema, strict=True)]

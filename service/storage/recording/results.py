@@ -19,22 +19,10 @@ from service.storage.recording.identity import (
 )
 from service.storage.recording.tracker_values import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
+from service.storage.sql import tables
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
-from service.storage.sql.tables import (
-    batches,
-    catalogs,
-    frames,
-    idempotency_keys,
-    mission_uses,
-    missions,
-    results,
-    runs,
-    solutions,
-    star_results,
-    tracker_values,
-)
 
 RecordOutcome = Answered | AcquisitionError
 
@@ -49,21 +37,21 @@ _REMEMBERED = 1_000
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
     """Note the settings and the catalog that results will name, unless they are known already."""
-    for table, rows in ((missions, mission_rows), (catalogs, [catalog_row])):
+    for table, rows in ((tables.missions, mission_rows), (tables.catalogs, [catalog_row])):
         insert_missing(
             connection, table, [row | {"row_digest": digest_of_row(table, row)} for row in rows]
         )
     for row in mission_rows:
         latest = (
-            select(mission_uses.c.digest)
-            .where(mission_uses.c.spacecraft == row["spacecraft"])
-            .order_by(mission_uses.c.id.desc())
+            select(tables.mission_uses.c.digest)
+            .where(tables.mission_uses.c.spacecraft == row["spacecraft"])
+            .order_by(tables.mission_uses.c.id.desc())
             .limit(1)
         )
         before = connection.execute(latest).scalar()
         if before != row["digest"]:
             if before is not None and _trackers(row["settings"]) > 1:
-                query = select(missions.c.settings).where(missions.c.digest == before)
+                query = select(tables.missions.c.settings).where(tables.missions.c.digest == before)
                 if _trackers(connection.execute(query).scalar_one()) == 1:
                     split_anew(connection, row["spacecraft"])
             use = {
@@ -71,8 +59,8 @@ def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: R
                 "digest": row["digest"],
                 "since": row["first_used"],
             }
-            use["row_digest"] = digest_of_row(mission_uses, use)
-            connection.execute(insert(mission_uses), use)
+            use["row_digest"] = digest_of_row(tables.mission_uses, use)
+            connection.execute(insert(tables.mission_uses), use)
 
 
 def _trackers(settings: str) -> int:
@@ -83,7 +71,7 @@ def _trackers(settings: str) -> int:
 def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) -> None:
     """Let limits be held against a run, or no longer; the run is made where there is none."""
     insert_runs(connection, {run: now}, alarms=watched)
-    connection.execute(update(runs).where(runs.c.name == run).values(alarms=watched))
+    connection.execute(update(tables.runs).where(tables.runs.c.name == run).values(alarms=watched))
 
 
 def record(
@@ -124,7 +112,7 @@ def record(
     _insert(connection, fresh, assume_new)
     insert_all(
         connection,
-        idempotency_keys,
+        tables.idempotency_keys,
         [
             key_row(key, taken)
             for key, taken in sorted(registry.keys.items())
@@ -204,11 +192,15 @@ def _insert(
     missing = [name for name in sorted(names) if not assume_new or name not in known]
     insert_runs(connection, {name: names[name] for name in missing})
     known.update(missing)
-    insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
+    insert_all(
+        connection, tables.batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch]
+    )
     require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])
-    insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
+    insert_all(connection, tables.frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
     _insert_results(connection, firsts)
-    insert_all(connection, tracker_values, [row for each, _ in firsts for row in each.trackers])
+    insert_all(
+        connection, tables.tracker_values, [row for each, _ in firsts for row in each.trackers]
+    )
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
     for unsaved, body in fresh:
         if unsaved.batch is None:
@@ -229,20 +221,28 @@ def _insert_results(
     rows = [
         unsaved.result_row(body, seq) for (unsaved, body), seq in zip(in_order, places, strict=True)
     ]
-    insert_all(connection, results, rows)
-    insert_all(connection, star_results, [row for unsaved, _ in in_order for row in unsaved.stars])
-    insert_all(connection, solutions, [d.solution for d, _ in in_order if d.solution is not None])
+    insert_all(connection, tables.results, rows)
+    insert_all(
+        connection, tables.star_results, [row for unsaved, _ in in_order for row in unsaved.stars]
+    )
+    insert_all(
+        connection, tables.solutions, [d.solution for d, _ in in_order if d.solution is not None]
+    )
 
 
 def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
     """Mark the current result of a batch as superseded by an unsaved one, tracker by tracker."""
     batch_id = unsaved.result["batch_id"]
     # The lock on the batch orders the adoptions of several processes.
-    connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
-    current = and_(results.c.batch_id == batch_id, results.c.current)
-    connection.execute(update(results).where(current).values(current=False))
-    connection.execute(delete(tracker_values).where(tracker_values.c.batch_id == batch_id))
-    insert_all(connection, tracker_values, unsaved.trackers)
+    connection.execute(
+        select(tables.batches.c.id).where(tables.batches.c.id == batch_id).with_for_update()
+    )
+    current = and_(tables.results.c.batch_id == batch_id, tables.results.c.current)
+    connection.execute(update(tables.results).where(current).values(current=False))
+    connection.execute(
+        delete(tables.tracker_values).where(tables.tracker_values.c.batch_id == batch_id)
+    )
+    insert_all(connection, tables.tracker_values, unsaved.trackers)
     spacecraft, run, _ = unsaved.identity
     about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id, "batch_id": batch_id}
     events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)

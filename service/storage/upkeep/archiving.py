@@ -46,18 +46,8 @@ from service.storage.archive.rows import (
 from service.storage.projections import rollups
 from service.storage.projections.rollups import keep_share
 from service.storage.recording.tracker_values import is_waiting
+from service.storage.sql import tables
 from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    archived_what_ifs,
-    catalogs,
-    missions,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    runs,
-)
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
@@ -111,7 +101,7 @@ def archive(
             claim(connection, folder)
             days = _days(connection, before)
             chosen = {day: _chosen(connection, day, before) for day in days}
-            counted = select(func.count()).select_from(results)
+            counted = select(func.count()).select_from(tables.results)
             total = sum(int(connection.scalar(counted.where(*w)) or 0) for w in chosen.values())
         archived = Archived(total)
         step(archived)
@@ -127,7 +117,7 @@ def archive(
 
 
 def _days(connection: Connection, before: Utc) -> list[_Day]:
-    daily = rollups_daily.c
+    daily = tables.rollups_daily.c
     query = select(daily.spacecraft, daily.run, daily.bucket).where(
         daily.bucket <= before.bucket(DAY_S)
     )
@@ -149,13 +139,13 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
     """The current results of a day that are to be archived, as SQL."""
     end_ns = min(bucket_start(day.number + 1, DAY_S).tai_ns, before.tai_ns)
     chosen: list[ColumnElement[bool]] = [
-        results.c.current,
-        results.c.spacecraft == day.spacecraft,
-        results.c.run == day.run,
-        results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
-        results.c.time_ns < end_ns,
+        tables.results.c.current,
+        tables.results.c.spacecraft == day.spacecraft,
+        tables.results.c.run == day.run,
+        tables.results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
+        tables.results.c.time_ns < end_ns,
     ]
-    hourly = rollups_hourly.c
+    hourly = tables.rollups_hourly.c
     for has in (hourly.batches, hourly.solved):
         newest = select(func.max(hourly.bucket)).where(
             hourly.spacecraft == day.spacecraft,
@@ -167,14 +157,14 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
         hour = connection.scalar(newest)
         if hour is not None:
             begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
-            chosen.append(~results.c.time_ns.between(begin_ns, end_ns - 1))
+            chosen.append(~tables.results.c.time_ns.between(begin_ns, end_ns - 1))
     return chosen
 
 
 def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[list[str]]:
     """The ids of the batches of one part after another, in order of time."""
-    query = select(results.c.batch_id).where(*chosen)
-    query = query.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
+    query = select(tables.results.c.batch_id).where(*chosen)
+    query = query.order_by(tables.results.c.time_ns, tables.results.c.batch_id).limit(MOST_BATCHES)
     while True:
         with store.reading() as connection:
             ids = list(connection.scalars(query))
@@ -193,7 +183,9 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
                 pc.unique(made[f"{kind}_digest"]).to_pylist() for kind in ("mission", "catalog")
             )
             keep_settings(connection, folder, *used)
-            tracked = connection.scalar(select(runs.c.tracked).where(runs.c.name == day.run))
+            tracked = connection.scalar(
+                select(tables.runs.c.tracked).where(tables.runs.c.name == day.run)
+            )
         file = _new_file(day_folder(folder, day.spacecraft, day.text))
         content = write_partition(file, to_partition(rows))
         part = described(file.name, day.run, rows, content)
@@ -243,7 +235,7 @@ def keep_settings(
     connection: Connection, folder: Path, of_missions: Sequence[str], of_catalogs: Sequence[str]
 ) -> None:
     """Keep in the archive what these digests stand for."""
-    for digests, table in ((of_missions, missions), (of_catalogs, catalogs)):
+    for digests, table in ((of_missions, tables.missions), (of_catalogs, tables.catalogs)):
         query = select(table).where(table.c.digest.in_(digests))
         for row in connection.execute(query).mappings():
             write_settings(folder, Settings(digest=row["digest"], row=dict(row)))
@@ -262,12 +254,14 @@ def note_part(
         "batches": part.batches,
         "sha256": part.sha256,
     }
-    part_id = connection.execute(insert(archived_parts).returning(archived_parts.c.id), row)
+    part_id = connection.execute(
+        insert(tables.archived_parts).returning(tables.archived_parts.c.id), row
+    )
     number = int(part_id.scalar_one())
-    columns = [each.name for each in archived_batches.columns if each.name != "part_id"]
+    columns = [each.name for each in tables.archived_batches.columns if each.name != "part_id"]
     numbers = pa.array([number] * len(found), pa.int32())
     noted = found.select(columns).append_column("part_id", numbers)
-    insert_all(connection, archived_batches, noted.to_pylist())
+    insert_all(connection, tables.archived_batches, noted.to_pylist())
     return number
 
 
@@ -280,7 +274,7 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     number = note_part(connection, day.spacecraft, part, path, written["batches"])
     made = written["results"]
     further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
-    insert_all(connection, archived_what_ifs, further.to_pylist())
+    insert_all(connection, tables.archived_what_ifs, further.to_pylist())
     of_hour = _by_hour(day, written)
     # Who counts an hour anew reads its results, then its shares: all of it before, or after.
     position = rollups.lock_position(connection)
@@ -318,7 +312,7 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
     manifest = manifest_of(folder, day.spacecraft, day.text)
     paths = {path_of(folder, manifest, part): part for part in manifest.parts}
     with store.reading() as connection:
-        query = select(archived_parts.c.path).where(archived_parts.c.path.in_(paths))
+        query = select(tables.archived_parts.c.path).where(tables.archived_parts.c.path.in_(paths))
         known = set(connection.scalars(query))
     for path, part in paths.items():
         if path in known or part.run != day.run:

@@ -34,14 +34,8 @@ from service.storage.recording import events
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    batches,
-    rollups_hourly,
-    runs,
-)
 from service.storage.store import Store
 from service.storage.upkeep.archiving import described, hours_of, note_part
 from service.storage.upkeep.restoring import put_back
@@ -134,8 +128,12 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     spacecraft, run = made.spacecraft, made.part.run
     # A batch that another process records in the run holds this row until its commit, and waits
     # for it: the table of archived batches and that of recorded ones have no unique key together.
-    connection.execute(select(runs.c.name).where(runs.c.name == run).with_for_update())
-    recorded = select(batches.c.id).where(batches.c.spacecraft == spacecraft, batches.c.run == run)
+    connection.execute(
+        select(tables.runs.c.name).where(tables.runs.c.name == run).with_for_update()
+    )
+    recorded = select(tables.batches.c.id).where(
+        tables.batches.c.spacecraft == spacecraft, tables.batches.c.run == run
+    )
     if connection.scalar(recorded.limit(1)) is not None:
         names = made.identities["batch"].to_pylist()
         for first in range(0, len(names), _AT_ONCE):
@@ -198,7 +196,7 @@ def _with(made: RunPart, manifest: Manifest, part: Part) -> RunPart:
 
 def _is_known(store: Store, path: str) -> bool:
     with store.reading() as connection:
-        query = select(archived_parts.c.id).where(archived_parts.c.path == path)
+        query = select(tables.archived_parts.c.id).where(tables.archived_parts.c.path == path)
         return connection.scalar(query) is not None
 
 
@@ -210,7 +208,7 @@ def _has_some(store: Store, ids: Sequence[str]) -> bool:
                 select(table.c.id).where(table.c.id.in_(ids[first : first + _AT_ONCE])).limit(1)
             )
             is not None
-            for table in (batches, archived_batches)
+            for table in (tables.batches, tables.archived_batches)
             for first in range(0, len(ids), _AT_ONCE)
         )
 
@@ -222,7 +220,7 @@ def restore_newest(store: Store, folder: Path, spacecraft: str, run: str) -> Non
     """
     wanted: dict[str, str] = {}
     with store.reading() as connection:
-        c, hourly = archived_parts.c, rollups_hourly.c
+        c, hourly = tables.archived_parts.c, tables.rollups_hourly.c
         own = c.spacecraft == spacecraft, c.run == run
         for has in (hourly.batches, hourly.solved):
             newest = select(func.max(hourly.bucket)).where(

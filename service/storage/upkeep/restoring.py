@@ -30,16 +30,8 @@ from service.storage.archive.folder import (
 from service.storage.archive.rows import Rows, from_partition, insert_rows
 from service.storage.projections import rollups, seals
 from service.storage.projections.rollups import forget_share
+from service.storage.sql import tables
 from service.storage.sql.statements import insert_missing, insert_runs
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    archived_what_ifs,
-    batches,
-    catalogs,
-    missions,
-    results,
-)
 from service.storage.store import Store
 from service.times import HOUR_S, Utc, parse_utc
 
@@ -115,13 +107,13 @@ def restore(
 def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
     """Insert the rows of a part; False: they are there."""
     ids = rows["batches"]["id"].to_pylist()
-    query = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
+    query = select(tables.batches.c.id).where(tables.batches.c.id.in_(ids[:1]))
     if connection.scalar(query) is not None:
         return False
     part_id = connection.scalar(
-        select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
+        select(tables.archived_batches.c.part_id).where(tables.archived_batches.c.id.in_(ids[:1]))
     )
-    for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
+    for digests, table in ((part.missions, tables.missions), (part.catalogs, tables.catalogs)):
         rows_of_settings = [read_settings(folder, each).row for each in digests]
         # An archive of an earlier version has none.
         insert_missing(connection, table, [{"row_digest": None} | row for row in rows_of_settings])
@@ -132,13 +124,18 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
         forget_share(connection, part_id, spacecraft, part.run)
         for first in range(0, len(ids), _AT_ONCE):
             some_ids = ids[first : first + _AT_ONCE]
-            for table, column in ((archived_batches, "id"), (archived_what_ifs, "batch_id")):
+            for table, column in (
+                (tables.archived_batches, "id"),
+                (tables.archived_what_ifs, "batch_id"),
+            ):
                 connection.execute(delete(table).where(table.c[column].in_(some_ids)))
-        connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
+        connection.execute(
+            delete(tables.archived_parts).where(tables.archived_parts.c.id == part_id)
+        )
     position = rollups.lock_position(connection)
     insert_rows(connection, _placed(rows, 0 if part_id is None else position))
     for first in range(0, len(ids), _AT_ONCE):
-        seals.add(connection, results.c.batch_id.in_(ids[first : first + _AT_ONCE]))
+        seals.add(connection, tables.results.c.batch_id.in_(ids[first : first + _AT_ONCE]))
     if part_id is None:
         # The trends have the share of a part that the database knows.
         _add_to_trends(connection, rows)
