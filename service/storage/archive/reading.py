@@ -230,46 +230,26 @@ def parts_with(
 
 def batch_of(connection: Connection, id: str) -> str:
     """The id of the batch of an archived result."""
-    of_what_if = select(tables.archived_what_ifs.c.batch_id).where(
-        tables.archived_what_ifs.c.id == id
-    )
-    return connection.scalar(of_what_if) or id
+    what_ifs = tables.archived_what_ifs.c
+    return connection.scalar(select(what_ifs.batch_id).where(what_ifs.id == id)) or id
 
 
 def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
     """The ids of archived results by the path of their part."""
+    batches, what_ifs = tables.archived_batches.c, tables.archived_what_ifs.c
+    path, has_part = tables.archived_parts.c.path, tables.archived_parts.c.id == batches.part_id
+    first = select(batches.id, path).where(has_part, batches.id.in_(ids))
+    further = select(what_ifs.id, path).where(has_part, what_ifs.batch_id == batches.id)
     found: dict[str, list[str]] = {}
-    wanted = list(ids)
-    first = select(tables.archived_batches.c.id, tables.archived_parts.c.path).where(
-        tables.archived_batches.c.id.in_(wanted)
-    )
-    of_batch = tables.archived_batches.join(
-        tables.archived_what_ifs,
-        tables.archived_what_ifs.c.batch_id == tables.archived_batches.c.id,
-    )
-    further = (
-        select(tables.archived_what_ifs.c.id, tables.archived_parts.c.path)
-        .select_from(of_batch)
-        .where(tables.archived_what_ifs.c.id.in_(wanted))
-    )
-    has_part = tables.archived_parts.c.id == tables.archived_batches.c.part_id
-    queries: tuple[Any, ...] = (first.where(has_part), further.where(has_part))
-    for query in queries:
-        for id, path in connection.execute(query):
-            found.setdefault(path, []).append(id)
+    for query in (first, further.where(what_ifs.id.in_(ids))):
+        for id, file in connection.execute(query):
+            found.setdefault(file, []).append(id)
     return found
 
 
 def holds_any(connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc) -> bool:
     """True if a part reaches into a period, so that batches of it may be archived."""
-    c = tables.archived_parts.c
-    query = select(c.id).where(
-        c.spacecraft == spacecraft,
-        c.run == run,
-        c.last_ns >= start.tai_ns,
-        c.first_ns < end.tai_ns,
-    )
-    return connection.scalar(query.limit(1)) is not None
+    return bool(parts_between(connection, spacecraft, run, start.tai_ns, end.tai_ns))
 
 
 def archived_paths(connection: Connection) -> dict[str, str]:

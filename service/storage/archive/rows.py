@@ -6,6 +6,7 @@ byte: archiving, verifying, restoring and the pages that read the archive share 
 
 import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,12 +15,14 @@ import pyarrow.compute as pc
 import sqlalchemy as sa
 from sqlalchemy.types import TypeEngine
 
+from service.storage.archive.folder import read_partition, whole_content
 from service.storage.sql import tables
 from service.storage.sql.columns import PackedText
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import insert_all, portions
 
 Rows = dict[str, pa.Table]
 """Tables by the name of the SQL table: batches in order of time, the rest in their order."""
+Columns = dict[str, pa.ChunkedArray]
 
 CHILDREN = {
     "stars": (tables.star_results, "result_id", ("tracker", "position")),
@@ -34,7 +37,6 @@ The first result of a batch has the batch's id, and so the rows of a batch are t
 """
 OF_BATCHES = ("batch", "time", "received", "fingerprint", "input")
 """The columns that results do not have."""
-_AT_ONCE = 1_000
 
 # Of two that fit, the narrower stands first; Text is a String.
 _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
@@ -84,9 +86,8 @@ def lock_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> None:
         (tables.results, tables.results.c.batch_id),
         (tables.batches, tables.batches.c.id),
     ):
-        for first in range(0, len(batch_ids), _AT_ONCE):
-            chosen = owner.in_(batch_ids[first : first + _AT_ONCE])
-            query = sa.select(table.c.id).where(chosen).order_by(table.c.id)
+        for ids in portions(batch_ids):
+            query = sa.select(table.c.id).where(owner.in_(ids)).order_by(table.c.id)
             connection.execute(query.with_for_update())
 
 
@@ -119,44 +120,50 @@ def to_partition(rows: Rows) -> pa.Table:
     return pa.table(_without_copies(columns))
 
 
-def _without_copies(columns: dict[str, pa.ChunkedArray]) -> dict[str, pa.ChunkedArray]:
+def _without_copies(columns: Columns) -> Columns:
     """The columns with nulls where a value follows from another one: a tenth of the space."""
-    digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
-    copies = {"batch_id": columns["id"], "received": columns["created"]}
-    copies["fingerprint"] = pa.array(digests, pa.string())
-    for name, copy in copies.items():
+    for name, copy in _copies(columns).items():
         own = columns[name]
         columns[name] = pc.if_else(pc.equal(own, copy), pa.scalar(None, own.type), own)
     return columns
 
 
-def _with_copies(partition: pa.Table) -> pa.Table:
-    copies = {"batch_id": partition["id"], "received": partition["created"]}
-    inputs = partition["input"].to_pylist()
-    digests = [hashlib.sha256(each.encode()).hexdigest() for each in inputs]
-    copies["fingerprint"] = pa.chunked_array([pa.array(digests, pa.string())])
-    for name, copy in copies.items():
-        place = partition.column_names.index(name)
-        partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
-    return partition
+def _copies(columns: Columns | pa.Table) -> Columns:
+    """The values that mostly follow from those of other columns, by the name of their column."""
+    digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
+    return {
+        "batch_id": columns["id"],
+        "received": columns["created"],
+        "fingerprint": pa.chunked_array([pa.array(digests, pa.string())]),
+    }
+
+
+def read_part(folder: Path, path: str, sha256: str) -> Rows:
+    """The rows of a part; raises `BadConfiguration` where its file is missing or damaged."""
+    return from_partition(read_partition(whole_content(folder, path, sha256)))
 
 
 def from_partition(partition: pa.Table) -> Rows:
     """The rows that were put into a partition; columns of a later version than its are null."""
-    partition = _with_copies(partition)
+    for name, copy in _copies(partition).items():
+        place = partition.column_names.index(name)
+        partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
     is_first = pc.equal(partition["id"], partition["batch_id"])
     names = [each.name for each in tables.batches.columns]
     rows = {
         "batches": partition.filter(is_first).select(names),
         "results": _selected(partition, tables.results),
     }
-    for name, (table, owner, _) in CHILDREN.items():
-        lists = partition[name]
-        parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
-        owners = partition["id"].take(pc.list_parent_indices(lists))
-        parts = parts.append_column(owner, owners)
-        rows[table.name] = _selected(parts, table)
+    for name, (table, _, _) in CHILDREN.items():
+        rows[table.name] = _selected(children_of(partition, name), table)
     return rows
+
+
+def children_of(partition: pa.Table, name: str) -> pa.Table:
+    """The rows in a list column of a partition, each with the id of its result."""
+    lists, owner = partition[name], CHILDREN[name][1]
+    parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
+    return parts.append_column(owner, partition["id"].take(pc.list_parent_indices(lists)))
 
 
 def _selected(read: pa.Table, table: sa.Table) -> pa.Table:
@@ -190,9 +197,9 @@ def _as_bits(table: pa.Table) -> pa.Table:
 
 def _read(connection: sa.Connection, table: sa.Table, owner: str, ids: Sequence[str]) -> pa.Table:
     rows: list[tuple[object, ...]] = []
-    for first in range(0, len(ids), _AT_ONCE):
-        chosen = table.c[owner].in_(ids[first : first + _AT_ONCE])
-        rows += map(tuple, connection.execute(sa.select(table).where(chosen)))
+    for some_ids in portions(ids):
+        query = sa.select(table).where(table.c[owner].in_(some_ids))
+        rows += map(tuple, connection.execute(query))
     schema = schema_of(table)
     columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
     arrays = [pa.array(each, field.type) for each, field in zip(columns, schema, strict=True)]

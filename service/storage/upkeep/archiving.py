@@ -21,7 +21,6 @@ from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service.errors import BadConfiguration
 from service.storage.archive.folder import (
-    Manifest,
     Part,
     Settings,
     claim,
@@ -30,7 +29,7 @@ from service.storage.archive.folder import (
     manifest_of,
     path_of,
     read_partition,
-    whole_content,
+    remove_part,
     write_manifest,
     write_partition,
     write_settings,
@@ -40,6 +39,7 @@ from service.storage.archive.rows import (
     differing,
     from_partition,
     lock_rows,
+    read_part,
     read_rows,
     to_partition,
 )
@@ -47,7 +47,7 @@ from service.storage.projections import rollups
 from service.storage.projections.rollups import keep_share
 from service.storage.recording.tracker_values import is_waiting
 from service.storage.sql import tables
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import count, insert_all
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
@@ -70,7 +70,7 @@ class Archived:
     bytes: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class _Day:
     spacecraft: str
     run: str
@@ -101,8 +101,7 @@ def archive(
             claim(connection, folder)
             days = _days(connection, before)
             chosen = {day: _chosen(connection, day, before) for day in days}
-            counted = select(func.count()).select_from(tables.results)
-            total = sum(int(connection.scalar(counted.where(*w)) or 0) for w in chosen.values())
+            total = sum(count(connection, tables.results, *each) for each in chosen.values())
         archived = Archived(total)
         step(archived)
         for day in days:
@@ -121,7 +120,7 @@ def _days(connection: Connection, before: Utc) -> list[_Day]:
     query = select(daily.spacecraft, daily.run, daily.bucket).where(
         daily.bucket <= before.bucket(DAY_S)
     )
-    found = sorted({_Day(*row) for row in connection.execute(query)}, key=_order)
+    found = sorted(_Day(*row) for row in connection.execute(query))
     for spacecraft, run in sorted({(day.spacecraft, day.run) for day in found}):
         if is_waiting(connection, spacecraft, run):
             raise BadConfiguration(
@@ -129,10 +128,6 @@ def _days(connection: Connection, before: Utc) -> list[_Day]:
                 "yet: run `acquire database split-trackers` first"
             )
     return found
-
-
-def _order(day: _Day) -> tuple[str, str, int]:
-    return day.spacecraft, day.run, day.number
 
 
 def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElement[bool]]:
@@ -145,20 +140,28 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
         tables.results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
         tables.results.c.time_ns < end_ns,
     ]
-    hourly = tables.rollups_hourly.c
-    for has in (hourly.batches, hourly.solved):
-        newest = select(func.max(hourly.bucket)).where(
-            hourly.spacecraft == day.spacecraft,
-            hourly.run == day.run,
-            # A batch that is dated ahead is not the newest one.
-            hourly.bucket <= utc_now().bucket(HOUR_S),
-            has > 0,
-        )
-        hour = connection.scalar(newest)
-        if hour is not None:
-            begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
-            chosen.append(~tables.results.c.time_ns.between(begin_ns, end_ns - 1))
+    # A batch that is dated ahead is not the newest one.
+    until = utc_now().bucket(HOUR_S)
+    for begin_ns, end_ns in newest_hours(connection, day.spacecraft, day.run, until):
+        chosen.append(~tables.results.c.time_ns.between(begin_ns, end_ns - 1))
     return chosen
+
+
+def newest_hours(
+    connection: Connection, spacecraft: str, run: str, until: int | None = None
+) -> Iterator[tuple[int, int]]:
+    """The begin and end of the hours of a run's newest batch and of its newest attitude.
+
+    `until` is the last hour that is looked at.
+    """
+    hourly = tables.rollups_hourly.c
+    own = [hourly.spacecraft == spacecraft, hourly.run == run]
+    if until is not None:
+        own.append(hourly.bucket <= until)
+    for has in (hourly.batches, hourly.solved):
+        hour = connection.scalar(select(func.max(hourly.bucket)).where(*own, has > 0))
+        if hour is not None:
+            yield bucket_start(hour, HOUR_S).tai_ns, bucket_start(hour + 1, HOUR_S).tai_ns
 
 
 def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[list[str]]:
@@ -190,8 +193,7 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
         content = write_partition(file, to_partition(rows))
         part = described(file.name, day.run, rows, content)
         part = msgspec.structs.replace(part, tracked=bool(tracked))
-        manifest = manifest_of(folder, day.spacecraft, day.text)
-        manifest = msgspec.structs.replace(manifest, parts=[*manifest.parts, part])
+        manifest = manifest_of(folder, day.spacecraft, day.text).with_part(part)
         write_manifest(folder, manifest)
         path = path_of(folder, manifest, part)
         written = from_partition(read_partition(content))
@@ -245,15 +247,8 @@ def note_part(
     connection: Connection, spacecraft: str, part: Part, path: str, found: pa.Table
 ) -> int:
     """Note the batches of a part as archived; returns the id of the part."""
-    row = {
-        "path": path,
-        "spacecraft": spacecraft,
-        "run": part.run,
-        "first_ns": part.first_ns,
-        "last_ns": part.last_ns,
-        "batches": part.batches,
-        "sha256": part.sha256,
-    }
+    names = ("run", "first_ns", "last_ns", "batches", "sha256")
+    row = {name: getattr(part, name) for name in names} | {"path": path, "spacecraft": spacecraft}
     part_id = connection.execute(
         insert(tables.archived_parts).returning(tables.archived_parts.c.id), row
     )
@@ -317,7 +312,7 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
     for path, part in paths.items():
         if path in known or part.run != day.run:
             continue
-        rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
+        rows = read_part(folder, path, part.sha256)
         with store.reading() as connection:
             present = read_rows(connection, rows["batches"]["id"].to_pylist())
         if not len(present["results"]):
@@ -329,12 +324,3 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
                 "it with `acquire archive restore`, or move it away"
             )
         manifest = remove_part(folder, manifest, part)
-
-
-def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
-    """Take a part out of the manifest, then delete its file."""
-    left = [each for each in manifest.parts if each.file != part.file]
-    manifest = msgspec.structs.replace(manifest, parts=left)
-    write_manifest(folder, manifest)
-    (day_folder(folder, manifest.spacecraft, manifest.day) / part.file).unlink()
-    return manifest
