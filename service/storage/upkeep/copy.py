@@ -23,7 +23,7 @@ from service.storage.sql import engines, migrations
 from service.storage.sql.access_tables import webhook_sender
 from service.storage.sql.database_file import writing_alone
 from service.storage.sql.projector_lock import ProjectorLock
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import count, insert_all
 from service.storage.sql.tables import event_counter, projector
 from service.storage.upkeep.verify import verify
 
@@ -148,10 +148,7 @@ def _copy(reading: sa.Connection, writing: sa.Connection, step: Step) -> int:
 
 
 def _counted(connection: sa.Connection, tables: Sequence[sa.Table]) -> Counts:
-    return {
-        table.name: int(connection.scalar(sa.select(sa.func.count()).select_from(table)) or 0)
-        for table in tables
-    }
+    return {table.name: count(connection, table) for table in tables}
 
 
 def _begin(connection: sa.Connection, tables: Sequence[sa.Table], counts: Counts) -> bool:

@@ -10,7 +10,7 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from typing import Any, get_args
 
 import msgspec
@@ -36,7 +36,7 @@ from service.storage.sql.migrations import check, disposed, reading, reported
 from service.storage.sql.statements import count, owned_rows, rows_of
 from service.times import unix_seconds, utc_of_unix
 
-AT_ONCE = 500
+AT_ONCE, BLOCKS_AT_ONCE = 500, 50
 OUTCOMES = ("unique", "ambiguous", "unmatched")
 TOLERANCE = 1e-9
 """Relative, for sums of the same numbers in another order."""
@@ -116,17 +116,28 @@ def _of_the_references(engine: sa.Engine) -> Iterator[str]:
 def _of_the_batches(engine: sa.Engine, step: Step) -> Iterator[str]:
     with engine.begin() as connection:
         total = count(connection, tables.batches)
-    c = tables.batches.c
-    query = sa.select(tables.batches).order_by(c.id).limit(AT_ONCE)
-    done, last = 0, ""
+    done = 0
+    for connection, rows in _pages(engine, tables.batches, ("id",), AT_ONCE):
+        yield from _of_a_chunk(connection, {row["id"]: row for row in rows})
+        done += len(rows)
+        step(done, max(total, done))
+
+
+def _pages(
+    engine: sa.Engine, table: sa.Table, order: Sequence[str], at_once: int
+) -> Iterator[tuple[sa.Connection, list[Row]]]:
+    """The rows of a table in the order of unique columns, each page as of one moment."""
+    columns = [table.c[name] for name in order]
+    query = sa.select(table).order_by(*columns).limit(at_once)
+    beyond = query
     while True:
         with engine.begin() as connection:
-            chunk = {row["id"]: row for row in rows_of(connection, query.where(c.id > last))}
-            if not chunk:
-                return
-            yield from _of_a_chunk(connection, chunk)
-        done, last = done + len(chunk), max(chunk)
-        step(done, max(total, done))
+            if rows := rows_of(connection, beyond):
+                yield connection, rows
+        if len(rows) < at_once:
+            return
+        last = [rows[-1][name] for name in order]
+        beyond = query.where(sa.tuple_(*columns) > sa.tuple_(*last))
 
 
 def _of_a_chunk(connection: sa.Connection, chunk: Mapping[str, Row]) -> Iterator[str]:
@@ -360,20 +371,11 @@ def _of_the_grades(engine: sa.Engine) -> Iterator[str]:
     The samples of a current day must be those that were digested, in order of time, within the
     day and as many as it says; an earlier revision has none.
     """
-    last = ""
-    while True:
-        query = (
-            sa.select(graded_days.c.id).where(graded_days.c.id > last).order_by(graded_days.c.id)
-        )
-        with engine.begin() as connection:
-            ids = connection.scalars(query.limit(AT_ONCE)).all()
-        for id in ids:
+    for _, days in _pages(engine, graded_days, ("id",), AT_ONCE):
+        for day in days:
             # As of one moment: a new revision takes the samples from the one before.
             with engine.begin() as connection:
-                yield from _of_a_day(connection, id)
-        if len(ids) < AT_ONCE:
-            return
-        last = ids[-1]
+                yield from _of_a_day(connection, day["id"])
 
 
 def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
@@ -385,7 +387,7 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
     name = f"graded day {id}"
     c = graded_blocks.c
     if not row["current"]:
-        if connection.scalar(sa.select(sa.func.count()).where(c.day_id == id)):
+        if count(connection, graded_blocks, c.day_id == id):
             yield f"{name}: it has samples, though it is not the current revision"
         return
     digest, samples = hashlib.sha256(), Counter[str]()
@@ -416,17 +418,15 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
         yield f"{name}: its samples are not those that were digested"
 
 
-BLOCKS_AT_ONCE = 50
-ORDER = (gyro_blocks.c.spacecraft, gyro_blocks.c.run, gyro_blocks.c.start_ns, gyro_blocks.c.id)
-
-
 def _of_the_gyro_blocks(engine: sa.Engine) -> Iterator[str]:
     """The faults of the gyro blocks, a sentence each.
 
     A block must be the one that was sent, and no two of a spacecraft and a run may share a time.
     """
     before: list[tuple[Any, Nanoseconds]] = []
-    for row in _block_rows(engine):
+    order = ("spacecraft", "run", "start_ns", "id")
+    pages = _pages(engine, gyro_blocks, order, BLOCKS_AT_ONCE)
+    for row in chain.from_iterable(rows for _, rows in pages):
         name = f"gyro block {row['id']}"
         try:
             block = block_of(row)
@@ -451,16 +451,3 @@ def _of_the_gyro_blocks(engine: sa.Engine) -> Iterator[str]:
             if first_shared_ns(times_ns, others_ns) is not None:
                 yield f"{name}: it shares a time with gyro block {other['id']}"
         before.append((row, times_ns))
-
-
-def _block_rows(engine: sa.Engine) -> Iterator[Any]:
-    query = sa.select(gyro_blocks).order_by(*ORDER).limit(BLOCKS_AT_ONCE)
-    beyond = query
-    while True:
-        with engine.begin() as connection:
-            rows = connection.execute(beyond).mappings().all()
-        yield from rows
-        if len(rows) < BLOCKS_AT_ONCE:
-            return
-        last = [rows[-1][column.name] for column in ORDER]
-        beyond = query.where(sa.tuple_(*ORDER) > sa.tuple_(*last))
