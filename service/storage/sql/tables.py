@@ -265,7 +265,7 @@ results = sa.Table(
     sa.Index("ix_results_what_ifs", "batch_id", **rows_where("parent_id IS NOT NULL")),
     # The projector takes results in their order.
     sa.Index("ix_results_seq", "seq"),
-    # Empty, or what `upkeep.older_digests` still has to do.
+    # Empty, or what `OlderDigests` still has to do.
     sa.Index("ix_results_without_digest", "id", **rows_where("digest IS NULL")),
     # Deleting a batch checks the foreign key of its results, and finds them.
     sa.Index("ix_results_batch_id", "batch_id"),
