@@ -337,16 +337,13 @@ def _same(one: float | None, other: float | None) -> bool:
 
 def _of_the_archived(engine: sa.Engine) -> Iterator[str]:
     """The faults: batches in no part, in fewer than their part has, and recorded ones."""
-    counted = sa.select(tables.archived_batches.c.part_id, sa.func.count()).group_by(
-        tables.archived_batches.c.part_id
-    )
-    both = sa.select(tables.batches.c.id).join(
-        tables.archived_batches,
-        sa.and_(*(tables.archived_batches.c[name] == tables.batches.c[name] for name in _IDENTITY)),
-    )
+    archived, recorded_ones = tables.archived_batches.c, tables.batches.c
+    counted = sa.select(archived.part_id, sa.func.count()).group_by(archived.part_id)
+    same = (archived[name] == recorded_ones[name] for name in ("spacecraft", "run", "batch"))
+    both = sa.select(recorded_ones.id).where(*same)
     with engine.begin() as connection:
         found = dict(map(tuple, connection.execute(counted)))
-        parts = connection.execute(sa.select(tables.archived_parts)).mappings().all()
+        parts = rows_of(connection, sa.select(tables.archived_parts))
         recorded = list(connection.scalars(both)) if found else []
     for part in parts:
         if found.pop(part["id"], 0) != part["batches"]:
@@ -355,9 +352,6 @@ def _of_the_archived(engine: sa.Engine) -> Iterator[str]:
         yield f"archived batches are noted of a part that is not there: {part_id}"
     for id in recorded:
         yield f"batch {id}: it is recorded and archived"
-
-
-_IDENTITY = ("spacecraft", "run", "batch")
 
 
 _UNPACKED: dict[str, Callable[[bytes, int], GradedSamples | MeasuredInnovations]] = {
@@ -371,19 +365,18 @@ def _of_the_grades(engine: sa.Engine) -> Iterator[str]:
     The samples of a current day must be those that were digested, in order of time, within the
     day and as many as it says; an earlier revision has none.
     """
-    for _, days in _pages(engine, graded_days, ("id",), AT_ONCE):
-        for day in days:
-            # As of one moment: a new revision takes the samples from the one before.
-            with engine.begin() as connection:
-                yield from _of_a_day(connection, day["id"])
+    pages = _pages(engine, graded_days, ("id",), AT_ONCE)
+    for id in [day["id"] for _, days in pages for day in days]:
+        # As of one moment: a new revision takes the samples from the one before.
+        with engine.begin() as connection:
+            yield from _of_a_day(connection, id)
 
 
 def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
-    row = (
-        connection.execute(sa.select(graded_days).where(graded_days.c.id == id)).mappings().first()
-    )
-    if row is None:
+    rows = rows_of(connection, sa.select(graded_days).where(graded_days.c.id == id))
+    if not rows:
         return
+    (row,) = rows
     name = f"graded day {id}"
     c = graded_blocks.c
     if not row["current"]:
