@@ -13,20 +13,11 @@ from operator import itemgetter
 import msgspec
 from sqlalchemy import Double, Table
 
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    batches,
-    catalogs,
-    frames,
-    mission_uses,
-    missions,
-    results,
-    solutions,
-    star_results,
-)
 
 BYTES = 8
-SETTINGS = (missions, catalogs, mission_uses)
+SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
 """The tables whose rows have a digest each, `row_digest`."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
 """Columns without content: the mark of the current result, places in an order, digests."""
@@ -47,10 +38,14 @@ def digest_of(
     `batch` and `frame` are given for the first result of a batch, and not for a what-if.
     """
     content: list[object] = [
-        _content(results)(result),
-        sorted(map(_content(star_results), stars), key=_in_order),
+        _content(tables.results)(result),
+        sorted(map(_content(tables.star_results), stars), key=_in_order),
     ]
-    for table, row in ((solutions, solution), (batches, batch), (frames, frame)):
+    for table, row in (
+        (tables.solutions, solution),
+        (tables.batches, batch),
+        (tables.frames, frame),
+    ):
         content.append(None if row is None else _content(table)(row))
     return _digest(content)
 

@@ -19,13 +19,7 @@ from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.models.answers import Answer, Star
 from service.storage.recording.digests import digest_of_row
-from service.storage.sql.tables import (
-    MEASURED,
-    results,
-    rollups_daily,
-    tracker_splits,
-    tracker_values,
-)
+from service.storage.sql import tables
 from service.vectors import Vector
 
 Row = dict[str, Any]
@@ -83,7 +77,7 @@ def tracker_rows(
         used = list(_residuals(stars.stars))
         predicted = scale * math.fsum(squares[k] for k, _ in used)
         offsets = (seen.magnitude_mag - magnitudes)[np.isfinite(seen.magnitude_mag - magnitudes)]
-        row = dict.fromkeys(MEASURED) | {
+        row = dict.fromkeys(tables.MEASURED) | {
             "batch_id": batch_id,
             "tracker": stars.tracker,
             "observed": len(outcomes),
@@ -97,7 +91,7 @@ def tracker_rows(
             "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
             "alignment_offset_arcsec": alignment[k],
         }
-        rows.append(row | {"row_digest": digest_of_row(tracker_values, row)})
+        rows.append(row | {"row_digest": digest_of_row(tables.tracker_values, row)})
     return rows
 
 
@@ -152,19 +146,21 @@ def _rms(squares: float, count: int) -> float | None:
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
     """True if batches of a spacecraft's run are still to be split."""
-    query = select(tracker_splits.c.run).where(
-        tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
+    query = select(tables.tracker_splits.c.run).where(
+        tables.tracker_splits.c.spacecraft == spacecraft, tables.tracker_splits.c.run == run
     )
     return connection.execute(query).first() is not None
 
 
 def split_anew(connection: Connection, spacecraft: str) -> None:
     """Have all batches of a spacecraft looked at: from now on it has several trackers."""
-    connection.execute(delete(tracker_splits).where(tracker_splits.c.spacecraft == spacecraft))
+    connection.execute(
+        delete(tables.tracker_splits).where(tables.tracker_splits.c.spacecraft == spacecraft)
+    )
     recorded, trends = (
         select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
-        for table in (results, rollups_daily)
+        for table in (tables.results, tables.rollups_daily)
     )
     # Archived batches are in the trends alone, and the latest ones in the record alone.
     runs = recorded.union(trends)
-    connection.execute(insert(tracker_splits).from_select(["spacecraft", "run"], runs))
+    connection.execute(insert(tables.tracker_splits).from_select(["spacecraft", "run"], runs))

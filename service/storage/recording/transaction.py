@@ -7,15 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
-from sqlalchemy import Connection
-from sqlalchemy.exc import (
-    DataError,
-    DBAPIError,
-    IntegrityError,
-    InterfaceError,
-    OperationalError,
-    ProgrammingError,
-)
+from sqlalchemy import Connection, exc
 
 from service.storage.recording import events
 from service.storage.recording.identity import ArchivedMeanwhile
@@ -91,7 +83,7 @@ def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) ->
         try:
             with _savepoint(connection):
                 return list(record(connection, unsaved_results))
-        except (IntegrityError, ArchivedMeanwhile) as error:
+        except (exc.IntegrityError, ArchivedMeanwhile) as error:
             failure = error  # perhaps another process was faster: look again
         except Exception as error:
             if is_of_the_database(error):
@@ -137,11 +129,11 @@ def _savepoint(connection: Connection) -> Iterator[None]:
 
 def is_of_the_database(error: BaseException) -> bool:
     """True if an error is the database's, its disk's or its connection's, and no single row's."""
-    about_a_row = (IntegrityError, DataError, ProgrammingError)
-    return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)
+    about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
+    return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
 
 
-def may_pass(error: DBAPIError) -> bool:
+def may_pass(error: exc.DBAPIError) -> bool:
     """True if the trouble is with the database's disk or connection, and not with what was asked.
 
     SQLite says of a table that is missing, and of a write through a connection
@@ -149,4 +141,4 @@ def may_pass(error: DBAPIError) -> bool:
     """
     code = getattr(error.orig, "sqlite_errorcode", None)
     ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
-    return isinstance(error, OperationalError | InterfaceError) and not ours
+    return isinstance(error, exc.OperationalError | exc.InterfaceError) and not ours

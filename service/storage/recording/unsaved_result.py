@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 from service.acquire import Acquisition
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
-from service.storage.models.answers import Answer, FrameSummary, FrameTimings
+from service.storage.models.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.digests import digest_of
 from service.storage.recording.result_metrics import metrics_of
@@ -133,10 +133,10 @@ def unsaved_submission(
         frame=UNSET if submission.frame is None else _frame_of(submission.frame),
         warnings=[warning] if is_ahead else (),
     )
-    result = _result_row(
+    unsaved = _unsaved_result(
         acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
-    unsaved = _unsaved_result(acquisition, answer, row, result, key)
+    unsaved.batch, unsaved.key = row, key
     if submission.frame is not None:
         unsaved.frame = _frame_row(submission.frame, id)
     return unsaved
@@ -153,31 +153,50 @@ def unsaved_what_if(
 ) -> UnsavedResult:
     """A further result of a batch, current if it is to be adopted."""
     answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
-    result = _result_row(
+    return _unsaved_result(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
-    return _unsaved_result(acquisition, answer, None, result, None)
 
 
 def _unsaved_result(
     acquisition: Acquisition,
     answer: Answer,
-    batch_row: Row | None,
-    result: Row,
-    key: tuple[str, str] | None,
+    *,
+    batch_id: str,
+    parent: str | None,
+    current: bool,
+    created: Utc,
 ) -> UnsavedResult:
-    batch = acquisition.batch
-    stars = rows_of_stars(answer)
-    solution = _solution_row(acquisition, answer, result["id"])
+    batch, attitude = acquisition.batch, answer.attitude
+    named = structs.asdict(batch.options)
+    result = {
+        "id": answer.id,
+        "batch_id": batch_id,
+        "parent_id": parent,
+        "current": current,
+        "created": created.text,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "time_ns": batch.time.tai_ns,
+        "identifier": answer.identifier,
+        # What was not named is left out.
+        "options": json.dumps({k: value for k, value in named.items() if value not in (None, {})}),
+        "mission_digest": answer.provenance.mission,
+        "catalog_digest": answer.provenance.catalog,
+        **structs.asdict(answer.counts),
+        "status": attitude and attitude.status,
+        "reason": answer.reason,
+        **metrics_of(acquisition),
+    }
     return UnsavedResult(
-        (batch.spacecraft, batch.run, batch.batch),
-        msgspec.json.encode(answer),
-        batch_row,
-        result,
-        stars,
-        solution,
-        key,
-        trackers=values_of_trackers(acquisition, answer, result["batch_id"]),
+        identity=(batch.spacecraft, batch.run, batch.batch),
+        answer=msgspec.json.encode(answer),
+        batch=None,
+        result=result,
+        stars=rows_of_stars(answer),
+        solution=None if attitude is None else _solution_row(attitude, answer.id),
+        key=None,
+        trackers=values_of_trackers(acquisition, answer, batch_id),
     )
 
 
@@ -198,62 +217,13 @@ def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
     }
 
 
-def _result_row(
-    acquisition: Acquisition,
-    answer: Answer,
-    *,
-    batch_id: str,
-    parent: str | None,
-    current: bool,
-    created: Utc,
-) -> Row:
-    batch = acquisition.batch
-    attitude = answer.attitude
-    return {
-        "id": answer.id,
-        "batch_id": batch_id,
-        "parent_id": parent,
-        "current": current,
-        "created": created.text,
-        "spacecraft": batch.spacecraft,
-        "run": batch.run,
-        "time_ns": batch.time.tai_ns,
-        "identifier": answer.identifier,
-        "options": options_text(acquisition),
-        "mission_digest": answer.provenance.mission,
-        "catalog_digest": answer.provenance.catalog,
-        **structs.asdict(answer.counts),
-        "status": attitude and attitude.status,
-        "reason": answer.reason,
-        **metrics_of(acquisition),
-    }
-
-
-def options_text(acquisition: Acquisition) -> str:
-    """The options that a result was computed with, as JSON, what was not named left out."""
-    named = structs.asdict(acquisition.batch.options)
-    return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
-
-
-def _solution_row(acquisition: Acquisition, answer: Answer, result_id: str) -> Row | None:
-    attitude, solution = answer.attitude, acquisition.solution
-    if attitude is None or solution is None:
-        return None
-    q1, q2, q3, qc = attitude.quaternion
-    (p11, p12, p13), (_, p22, p23), (_, _, p33) = attitude.covariance_arcsec2
+def _solution_row(attitude: Attitude, result_id: str | None) -> Row:
+    covariance = attitude.covariance_arcsec2
     return {
         "result_id": result_id,
-        "q1": q1,
-        "q2": q2,
-        "q3": q3,
-        "qc": qc,
+        **dict(zip(("q1", "q2", "q3", "qc"), attitude.quaternion, strict=True)),
         "frame": attitude.frame,
-        "p11": p11,
-        "p12": p12,
-        "p13": p13,
-        "p22": p22,
-        "p23": p23,
-        "p33": p33,
+        **{f"p{i + 1}{k + 1}": covariance[i][k] for i in range(3) for k in range(i, 3)},
         # Of a measured attitude they are unknown; the columns take no null.
         "residual_rms_arcsec": attitude.residual_rms_arcsec or 0.0,
         "predicted_rms_arcsec": attitude.predicted_rms_arcsec or 0.0,
