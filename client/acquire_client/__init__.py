@@ -5,11 +5,11 @@ It imports nothing of the service, and is built alone.
 
 from . import models
 from ._async.client import AsyncClient
+from ._async.connection import AsyncItems
 from ._async.events import AsyncEvents
-from ._async.pages import AsyncItems
 from ._sync.client import Client
+from ._sync.connection import Items
 from ._sync.events import Events
-from ._sync.pages import Items
 from .errors import (
     BadInput,
     Busy,

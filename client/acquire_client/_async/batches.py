@@ -3,21 +3,20 @@
 from collections.abc import AsyncIterator, Mapping
 from typing import Any, Literal, overload
 
+from .. import models
 from ..base import Outcome, Status
 from ..encoding import Batch, Time, decoded, path_of
 from ..errors import Problem
-from ..models import Answer, Picture, Result, Summary, WhatIf
 from ..outcomes import BatchOutcome, RecordedAnswer
 from ..retrying import Repeat
 from .backend import Source, bounded_map
-from .connection import AsyncConnection
-from .pages import AsyncItems
+from .connection import AsyncConnection, AsyncItems
 
 
 class AsyncBatches(AsyncConnection):
     """The part of the client that is about batches."""
 
-    async def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> Answer:
+    async def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> models.Answer:
         """Identify the stars of a batch, solve for the attitude, and record both.
 
         Spacecraft, run and batch id identify the batch: to send it again is harmless, and gives
@@ -78,7 +77,7 @@ class AsyncBatches(AsyncConnection):
         outcome: Outcome | None = None,
         status: Status | Literal["no_attitude"] | None = None,
         batch: str | None = None,
-    ) -> AsyncItems[Summary]:
+    ) -> AsyncItems[models.Summary]:
         """The current results of recorded batches, newest first by batch time.
 
         `run` is `*` for all runs; `end` is excluded; `outcome` asks for at least one such star.
@@ -95,39 +94,41 @@ class AsyncBatches(AsyncConnection):
             "status": status,
             "batch": batch,
         }
-        return AsyncItems(self, Summary, path_of("batches"), query)
+        return AsyncItems(self, models.Summary, path_of("batches"), query)
 
-    async def batch(self, id: str) -> Result:
+    async def batch(self, id: str) -> models.Result:
         """One recorded result with its batch; raises `NotFound`."""
-        return await self.get(Result, path_of("batches", id))
+        return await self.get(models.Result, path_of("batches", id))
 
-    async def latest(self, spacecraft: str, *, run: str = "live") -> Result:
+    async def latest(self, spacecraft: str, *, run: str = "live") -> models.Result:
         """The newest result of a spacecraft by batch time; raises `NotFound` without a batch.
 
         >>> latest = await client.latest("XTE")
         >>> latest.answer.attitude.status
         'good'
         """
-        return await self.get(Result, path_of("spacecraft", spacecraft, "latest"), {"run": run})
+        return await self.get(
+            models.Result, path_of("spacecraft", spacecraft, "latest"), {"run": run}
+        )
 
     @overload
     async def what_if(
         self, id: str, options: Mapping[str, Any], *, record: Literal[True]
-    ) -> Answer: ...
+    ) -> models.Answer: ...
 
     @overload
     async def what_if(
         self, id: str, options: Mapping[str, Any], *, record: Literal[False] = False
-    ) -> WhatIf: ...
+    ) -> models.WhatIf: ...
 
     @overload
     async def what_if(
         self, id: str, options: Mapping[str, Any], *, record: bool
-    ) -> Answer | WhatIf: ...
+    ) -> models.Answer | models.WhatIf: ...
 
     async def what_if(
         self, id: str, options: Mapping[str, Any], *, record: bool = False
-    ) -> Answer | WhatIf:
+    ) -> models.Answer | models.WhatIf:
         """Process a recorded batch again with other options; `record` keeps the result beside it.
 
         >>> latest = await client.latest("XTE")
@@ -138,10 +139,10 @@ class AsyncBatches(AsyncConnection):
         body = {"options": dict(options), "record": record}
         path = path_of("batches", id, "what-if")
         if record:
-            return await self.post(Answer, path, body)
-        return await self.post(WhatIf, path, body, Repeat.ALWAYS)
+            return await self.post(models.Answer, path, body)
+        return await self.post(models.WhatIf, path, body, Repeat.ALWAYS)
 
-    async def adopt(self, id: str, options: Mapping[str, Any]) -> Answer:
+    async def adopt(self, id: str, options: Mapping[str, Any]) -> models.Answer:
         """Process a recorded batch again, and let the result stand for the batch.
 
         >>> latest = await client.latest("XTE")
@@ -151,7 +152,7 @@ class AsyncBatches(AsyncConnection):
         True
         """
         body = {"options": dict(options), "adopt": True}
-        return await self.post(Answer, path_of("batches", id, "what-if"), body)
+        return await self.post(models.Answer, path_of("batches", id, "what-if"), body)
 
     async def solve_picture(
         self,
@@ -159,7 +160,7 @@ class AsyncBatches(AsyncConnection):
         *,
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
-    ) -> Picture:
+    ) -> models.Picture:
         """Find the attitude, the lens and the stars of a picture of any camera; records nothing.
 
         `picture` is the content of its file; a `spacecraft` is the one whose camera took it.
@@ -172,5 +173,4 @@ class AsyncBatches(AsyncConnection):
             headers={"Content-Type": "application/octet-stream"},
             repeat=Repeat.ALWAYS,
         )
-        found: Picture = decoded(response, Picture)
-        return found
+        return decoded(response, models.Picture)

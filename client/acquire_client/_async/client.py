@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 
+from .. import models
 from ..encoding import decoded, path_of
-from ..models import NewToken, Session, Token, TokenList
-from .alarms import AsyncAlarms
 from .batches import AsyncBatches
-from .calibrations import AsyncCalibrations
 from .events import AsyncEvents
-from .gyro import AsyncGyro
+from .operations import AsyncAlarms, AsyncCalibrations
 from .replays import AsyncReplays
-from .spacecraft import AsyncSpacecraft
+from .spacecraft import AsyncGyro, AsyncSpacecraft
 
 
 class AsyncClient(
@@ -28,7 +26,7 @@ class AsyncClient(
     raises `NoAnswer` and the `Problem` of the service's answer.
     """
 
-    async def session(self) -> Session:
+    async def session(self) -> models.Session:
         """The caller as the service knows it: the token's name, its scopes and spacecraft.
 
         Raises `Unauthenticated` where the service asks for a token, or for another one.
@@ -37,11 +35,11 @@ class AsyncClient(
         >>> session.scopes
         ['operate', 'read', 'submit']
         """
-        return await self.get(Session, path_of("session"))
+        return await self.get(models.Session, path_of("session"))
 
-    async def tokens(self) -> Sequence[Token]:
+    async def tokens(self) -> Sequence[models.Token]:
         """Every token without its secret, the oldest first."""
-        return (await self.get(TokenList, path_of("tokens"))).items
+        return (await self.get(models.TokenList, path_of("tokens"))).items
 
     async def create_token(
         self,
@@ -51,23 +49,18 @@ class AsyncClient(
         spacecraft: Sequence[str] | None = None,
         days: int = 365,
         rate_per_s: float | None = None,
-    ) -> NewToken:
+    ) -> models.NewToken:
         """Make a token; its secret is in this answer alone.  The first one ends open access."""
         asked = {"name": name, "scopes": list(scopes), "days": days, "rate_per_s": rate_per_s}
         asked["spacecraft"] = None if spacecraft is None else list(spacecraft)
-        return await self.post(NewToken, path_of("tokens"), asked)
+        return await self.post(models.NewToken, path_of("tokens"), asked)
 
-    async def revoke_token(self, name: str) -> Token:
+    async def revoke_token(self, name: str) -> models.Token:
         """End a token at once, with the sessions that were begun with it; raises `NotFound`."""
-        revoked: Token = decoded(await self.request("DELETE", path_of("tokens", name)), Token)
-        return revoked
+        return decoded(await self.request("DELETE", path_of("tokens", name)), models.Token)
 
     def events(
-        self,
-        *,
-        run: str | None = None,
-        spacecraft: str | None = None,
-        after: int | None = None,
+        self, *, run: str | None = None, spacecraft: str | None = None, after: int | None = None
     ) -> AsyncEvents:
         """Live events from now on, or those after the event of that number.
 

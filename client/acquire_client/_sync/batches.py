@@ -3,21 +3,20 @@
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, overload
 
+from .. import models
 from ..base import Outcome, Status
 from ..encoding import Batch, Time, decoded, path_of
 from ..errors import Problem
-from ..models import Answer, Picture, Result, Summary, WhatIf
 from ..outcomes import BatchOutcome, RecordedAnswer
 from ..retrying import Repeat
 from .backend import Source, bounded_map
-from .connection import Connection
-from .pages import Items
+from .connection import Connection, Items
 
 
 class Batches(Connection):
     """The part of the client that is about batches."""
 
-    def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> Answer:
+    def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> models.Answer:
         """Identify the stars of a batch, solve for the attitude, and record both.
 
         Spacecraft, run and batch id identify the batch: to send it again is harmless, and gives
@@ -73,7 +72,7 @@ class Batches(Connection):
         outcome: Outcome | None = None,
         status: Status | Literal["no_attitude"] | None = None,
         batch: str | None = None,
-    ) -> Items[Summary]:
+    ) -> Items[models.Summary]:
         """The current results of recorded batches, newest first by batch time.
 
         `run` is `*` for all runs; `end` is excluded; `outcome` asks for at least one such star.
@@ -90,35 +89,39 @@ class Batches(Connection):
             "status": status,
             "batch": batch,
         }
-        return Items(self, Summary, path_of("batches"), query)
+        return Items(self, models.Summary, path_of("batches"), query)
 
-    def batch(self, id: str) -> Result:
+    def batch(self, id: str) -> models.Result:
         """One recorded result with its batch; raises `NotFound`."""
-        return self.get(Result, path_of("batches", id))
+        return self.get(models.Result, path_of("batches", id))
 
-    def latest(self, spacecraft: str, *, run: str = "live") -> Result:
+    def latest(self, spacecraft: str, *, run: str = "live") -> models.Result:
         """The newest result of a spacecraft by batch time; raises `NotFound` without a batch.
 
         >>> latest = client.latest("XTE")
         >>> latest.answer.attitude.status
         'good'
         """
-        return self.get(Result, path_of("spacecraft", spacecraft, "latest"), {"run": run})
+        return self.get(models.Result, path_of("spacecraft", spacecraft, "latest"), {"run": run})
 
     @overload
-    def what_if(self, id: str, options: Mapping[str, Any], *, record: Literal[True]) -> Answer: ...
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[True]
+    ) -> models.Answer: ...
 
     @overload
     def what_if(
         self, id: str, options: Mapping[str, Any], *, record: Literal[False] = False
-    ) -> WhatIf: ...
+    ) -> models.WhatIf: ...
 
     @overload
-    def what_if(self, id: str, options: Mapping[str, Any], *, record: bool) -> Answer | WhatIf: ...
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool
+    ) -> models.Answer | models.WhatIf: ...
 
     def what_if(
         self, id: str, options: Mapping[str, Any], *, record: bool = False
-    ) -> Answer | WhatIf:
+    ) -> models.Answer | models.WhatIf:
         """Process a recorded batch again with other options; `record` keeps the result beside it.
 
         >>> latest = client.latest("XTE")
@@ -129,10 +132,10 @@ class Batches(Connection):
         body = {"options": dict(options), "record": record}
         path = path_of("batches", id, "what-if")
         if record:
-            return self.post(Answer, path, body)
-        return self.post(WhatIf, path, body, Repeat.ALWAYS)
+            return self.post(models.Answer, path, body)
+        return self.post(models.WhatIf, path, body, Repeat.ALWAYS)
 
-    def adopt(self, id: str, options: Mapping[str, Any]) -> Answer:
+    def adopt(self, id: str, options: Mapping[str, Any]) -> models.Answer:
         """Process a recorded batch again, and let the result stand for the batch.
 
         >>> latest = client.latest("XTE")
@@ -142,7 +145,7 @@ class Batches(Connection):
         True
         """
         body = {"options": dict(options), "adopt": True}
-        return self.post(Answer, path_of("batches", id, "what-if"), body)
+        return self.post(models.Answer, path_of("batches", id, "what-if"), body)
 
     def solve_picture(
         self,
@@ -150,7 +153,7 @@ class Batches(Connection):
         *,
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
-    ) -> Picture:
+    ) -> models.Picture:
         """Find the attitude, the lens and the stars of a picture of any camera; records nothing.
 
         `picture` is the content of its file; a `spacecraft` is the one whose camera took it.
@@ -163,5 +166,4 @@ class Batches(Connection):
             headers={"Content-Type": "application/octet-stream"},
             repeat=Repeat.ALWAYS,
         )
-        found: Picture = decoded(response, Picture)
-        return found
+        return decoded(response, models.Picture)

@@ -2,15 +2,13 @@
 
 from collections.abc import Sequence
 
+from .. import models
 from ..encoding import decoded, path_of
-from ..models import NewToken, Session, Token, TokenList
-from .alarms import Alarms
 from .batches import Batches
-from .calibrations import Calibrations
 from .events import Events
-from .gyro import Gyro
+from .operations import Alarms, Calibrations
 from .replays import Replays
-from .spacecraft import Spacecraft
+from .spacecraft import Gyro, Spacecraft
 
 
 class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
@@ -26,7 +24,7 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
     raises `NoAnswer` and the `Problem` of the service's answer.
     """
 
-    def session(self) -> Session:
+    def session(self) -> models.Session:
         """The caller as the service knows it: the token's name, its scopes and spacecraft.
 
         Raises `Unauthenticated` where the service asks for a token, or for another one.
@@ -35,11 +33,11 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
         >>> session.scopes
         ['operate', 'read', 'submit']
         """
-        return self.get(Session, path_of("session"))
+        return self.get(models.Session, path_of("session"))
 
-    def tokens(self) -> Sequence[Token]:
+    def tokens(self) -> Sequence[models.Token]:
         """Every token without its secret, the oldest first."""
-        return (self.get(TokenList, path_of("tokens"))).items
+        return (self.get(models.TokenList, path_of("tokens"))).items
 
     def create_token(
         self,
@@ -49,23 +47,18 @@ class Client(Batches, Spacecraft, Alarms, Replays, Gyro, Calibrations):
         spacecraft: Sequence[str] | None = None,
         days: int = 365,
         rate_per_s: float | None = None,
-    ) -> NewToken:
+    ) -> models.NewToken:
         """Make a token; its secret is in this answer alone.  The first one ends open access."""
         asked = {"name": name, "scopes": list(scopes), "days": days, "rate_per_s": rate_per_s}
         asked["spacecraft"] = None if spacecraft is None else list(spacecraft)
-        return self.post(NewToken, path_of("tokens"), asked)
+        return self.post(models.NewToken, path_of("tokens"), asked)
 
-    def revoke_token(self, name: str) -> Token:
+    def revoke_token(self, name: str) -> models.Token:
         """End a token at once, with the sessions that were begun with it; raises `NotFound`."""
-        revoked: Token = decoded(self.request("DELETE", path_of("tokens", name)), Token)
-        return revoked
+        return decoded(self.request("DELETE", path_of("tokens", name)), models.Token)
 
     def events(
-        self,
-        *,
-        run: str | None = None,
-        spacecraft: str | None = None,
-        after: int | None = None,
+        self, *, run: str | None = None, spacecraft: str | None = None, after: int | None = None
     ) -> Events:
         """Live events from now on, or those after the event of that number.
 

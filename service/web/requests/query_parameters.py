@@ -1,9 +1,10 @@
 """Parameters of requests: each is checked, unknown ones are refused."""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self, TypedDict
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypedDict, TypeVar
 
 from fastapi import Depends, Path
+from fastapi import Query as InQuery
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -34,6 +35,10 @@ from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
 
 MAX_LIMIT = 500
+
+T = TypeVar("T")
+FromQuery: TypeAlias = Annotated[T, InQuery()]
+"""A model whose fields are the query parameters of a route."""
 
 
 def _time(value: object) -> Utc:

@@ -5,9 +5,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.app.factory import App
@@ -19,6 +17,7 @@ from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import FromQuery
 
 LEAST_FREE = 0.1
 """The share of the disk, and of the memory, below which there is little room left."""
@@ -39,7 +38,7 @@ class Check:
 
 
 @console_page("/about", "Service", Policy("read", "nothing"), position=80)
-def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """The service's health, version, catalog, missions, database and credits."""
     about = context.app.service.about(context.caller.spacecraft)
     # Queues and machine tell what others send: a token of some spacecraft does not see them.

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
@@ -20,14 +18,11 @@ from service.storage.queries.alarms import TimeOut
 from service.times import Utc, parse_utc, recorded_utc, shifted
 from service.web.console.formatting import with_day_of_year
 from service.web.console.page_context import ContextDep, PageContext, PageQuery, SortedQuery
-from service.web.console.pages.spacecraft import (
-    charts_by_quantity,
-    history_address,
-)
+from service.web.console.pages.spacecraft import charts_by_quantity, history_address
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import Cursor, Query
+from service.web.requests.query_parameters import Cursor, FromQuery, Query
 
 ROWS = 200
 State = Literal["active", "open", "returned", "acknowledged", "shelved", "cleared", "all"]
@@ -102,7 +97,7 @@ class AlarmGroup:
 
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
-def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -> Response:
+def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
     """The alarms of a run, those that left their limits last first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -210,9 +205,7 @@ class AlarmQuery(Query):
 
 
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
-def alarm_page(
-    id: Annotated[str, Path()], query: Annotated[AlarmQuery, InQuery()], context: ContextDep
-) -> Response:
+def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Response:
     """One alarm: how it was raised, its usual cause, and what operators did about it."""
     alarm = context.app.alarms.get(id)
     if not context.caller.may_see(alarm.spacecraft):
@@ -312,9 +305,7 @@ class LimitsQuery(PageQuery):
 
 
 @console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
-def limits_page(
-    name: Annotated[str, Path()], query: Annotated[LimitsQuery, InQuery()], context: ContextDep
-) -> Response:
+def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -> Response:
     """The bounds of every quantity, which can be previewed and changed, with their history."""
     app, tracker = context.app, query.tracker
     limits = app.limits.all(name, tracker)
@@ -352,9 +343,7 @@ class AnnotationsQuery(PageQuery):
 
 
 @console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
-def annotations_page(
-    query: Annotated[AnnotationsQuery, InQuery()], context: ContextDep
-) -> Response:
+def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) -> Response:
     """The annotations of a period, the latest written first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)

@@ -6,10 +6,9 @@ import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import FastAPI, Path
-from fastapi import Query as InQuery
+from fastapi import FastAPI
 from markupsafe import Markup, escape
 from starlette.requests import Request
 from starlette.responses import Response
@@ -18,13 +17,14 @@ from service.errors import NotFound
 from service.web.console.page_context import PageQuery, open_layout
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered, rendered_part
-from service.web.openapi.route import SCHEMAS
+from service.web.openapi import SCHEMAS
 from service.web.requests.access import OPEN
 from service.web.requests.problem_types import types_with_pages
+from service.web.requests.query_parameters import FromQuery
 
 
 @console_page("/docs", "API", OPEN)
-def api_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+def api_page(request: Request, query: FromQuery[PageQuery]) -> Response:
     """Every route of the API with its parameters, answers and examples."""
     layout = open_layout(query.run, "API", "/docs")
     shown = _operations(request.app)
@@ -32,7 +32,7 @@ def api_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Respon
 
 
 @console_page("/docs/shapes", "API shapes", OPEN, section="/docs")
-def api_shapes_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+def api_shapes_page(request: Request, query: FromQuery[PageQuery]) -> Response:
     """The shapes of requests and answers, field by field."""
     layout = open_layout(query.run, "API shapes", "/docs")
     shown = _shapes(request.app)
@@ -52,7 +52,7 @@ def _shapes(app: FastAPI) -> Markup:
 
 
 @console_page("/problems", "Problems", OPEN, section="/docs")
-def problems_page(query: Annotated[PageQuery, InQuery()]) -> Response:
+def problems_page(query: FromQuery[PageQuery]) -> Response:
     """Every type of problem."""
     kinds = list(types_with_pages().values())
     return rendered(
@@ -64,7 +64,7 @@ def problems_page(query: Annotated[PageQuery, InQuery()]) -> Response:
 
 
 @console_page("/problems/{slug}", "Problem", OPEN, section="/docs")
-def problem_page(slug: Annotated[str, Path()], query: Annotated[PageQuery, InQuery()]) -> Response:
+def problem_page(slug: str, query: FromQuery[PageQuery]) -> Response:
     """One type of problem."""
     kind = types_with_pages().get(slug)
     if kind is None:

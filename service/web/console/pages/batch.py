@@ -5,7 +5,6 @@ from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
 from fastapi import Path
-from fastapi import Query as InQuery
 from msgspec import structs
 from pydantic import Field
 from starlette.requests import Request
@@ -37,7 +36,7 @@ from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import Cursor
+from service.web.requests.query_parameters import Cursor, FromQuery
 
 VIEWS = ("all", "field")
 """The content of the chart: all candidates of the answer, or the field of view alone."""
@@ -144,9 +143,7 @@ def _adoption(before: Answer, after: Answer) -> list[str]:
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
-def latest_batch(
-    name: str, query: Annotated[PageQuery, InQuery()], context: ContextDep
-) -> Response:
+def latest_batch(name: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Redirect to the latest batch of a spacecraft in a run."""
     items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
@@ -236,7 +233,7 @@ class BatchesQuery(PageQuery):
 
 
 @console_page("/batches", "Batches", Policy("read", "nothing"), position=30)
-def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep) -> Response:
+def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Response:
     """The batches of a run, newest first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)

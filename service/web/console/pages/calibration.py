@@ -3,8 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
@@ -19,6 +17,7 @@ from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import FromQuery
 
 SHOWN = 50
 CERTAIN_SIGMAS = 3.0
@@ -34,8 +33,8 @@ class CalibrationPageQuery(PageQuery):
     "/spacecraft/{name}/calibration", "Calibration", Policy("read", "path"), section="/missions"
 )
 def calibration_page(
-    name: Annotated[str, Path()],
-    query: Annotated[CalibrationPageQuery, InQuery()],
+    name: str,
+    query: FromQuery[CalibrationPageQuery],
     context: ContextDep,
 ) -> Response:
     """Residual maps, parameters and their history, and what was adopted when."""

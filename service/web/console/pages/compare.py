@@ -5,7 +5,6 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import Depends
-from fastapi import Query as InQuery
 from pydantic import Field, ValidationError
 from starlette.requests import Request
 from starlette.responses import Response
@@ -22,6 +21,7 @@ from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import READ, Policy
+from service.web.requests.query_parameters import FromQuery
 
 SAMPLE = 100
 SIDES = ("a", "b")
@@ -149,7 +149,7 @@ def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
 
 
 @console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
-def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every run, and the replays and reprocessings with their progress.
 
     A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
@@ -167,7 +167,7 @@ def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Re
 
 
 @console_page("/replays/{id}", "Replay", READ, section="/runs")
-def replay_page(id: str, query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """One replay: how far it is, and every line that was refused."""
     return rendered(
         "replay.html.jinja",

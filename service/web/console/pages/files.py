@@ -5,8 +5,6 @@ from itertools import islice
 from typing import Annotated
 from urllib.parse import quote, urlencode
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
@@ -24,6 +22,7 @@ from service.web.console.pages.spacecraft import (
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import FromQuery
 
 GRADES: dict[ProductGrade, str] = {
     "smoothed": "The definitive attitude: every measurement of the day, before and after each "
@@ -70,9 +69,7 @@ class GradeOfFile:
 
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
-def files_page(
-    name: Annotated[str, Path()], query: Annotated[FilesQuery, InQuery()], context: ContextDep
-) -> Response:
+def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Attitudes of a period as files of every grade and format, and its tables."""
     context.app.context.mission(name)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import Query as InQuery
 from pydantic import model_validator
 from starlette.responses import Response
 
@@ -21,6 +20,7 @@ from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import READ, Policy
+from service.web.requests.query_parameters import FromQuery
 
 MOST_SHOWN = 8
 """Missions whose settings are shown whole without being asked for."""
@@ -62,7 +62,7 @@ class MissionsQuery(PageQuery):
 
 
 @console_page("/missions", "Missions", Policy("read", "nothing"), position=70)
-def missions_page(query: Annotated[MissionsQuery, InQuery()], context: ContextDep) -> Response:
+def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Response:
     """Settings with their history: of a few missions all, of many those of the chosen one."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -158,7 +158,7 @@ class ZonesQuery(PageQuery):
 
 
 @console_page("/zones", "Zones", READ, position=75)
-def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> Response:
+def zones_page(query: FromQuery[ZonesQuery], context: ContextDep) -> Response:
     """The size of a zone, and cached zones and run catalogs, the most recently used first."""
     name = query.spacecraft or context.filled_spacecraft(query.run)
     size, costs = context.app.zones.size(name, query.run)
@@ -192,9 +192,7 @@ class AdviceForm(AdviceQuery):
 
 
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
-def advice_page(
-    name: str, query: Annotated[AdviceForm, InQuery()], context: ContextDep
-) -> Response:
+def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
     """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
     advice = context.app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S)
     return rendered(

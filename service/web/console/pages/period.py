@@ -1,10 +1,7 @@
 """The page of a period's stars and attitudes: sky, residuals, magnitudes, attitude and rate."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.storage.models.charts import TrackerStarsOfPeriod
@@ -18,14 +15,11 @@ from service.web.console.charts.histogram import (
     residual_histogram,
 )
 from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import (
-    RANGES_S,
-    SpacecraftQuery,
-    shown_period,
-)
+from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import FromQuery
 
 MOST_LINKED = 600
 """Batches whose tracks are looked for: reading and linking them takes about a second."""
@@ -45,9 +39,7 @@ class TrackerCharts:
 @console_page(
     "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
 )
-def period_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
     mission = context.app.context.mission(name)
     retired = context.app.context.retired.trackers.get(name, ())

@@ -1,21 +1,19 @@
 """The page that solves a picture of any camera; only its script talks to the API."""
 
-from typing import Annotated
-
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.web.console.page_context import ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import HEADERS, rendered
 from service.web.requests.access import Policy
+from service.web.requests.query_parameters import FromQuery
 
 # The script shows the drawn picture, which no address of the service has.
 _POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
 
 
 @console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
-def pictures_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
     missions = context.app.missions
     cameras = [

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
@@ -25,7 +23,7 @@ from service.web.console.page_context import ContextDep, PageContext, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import End, Start
+from service.web.requests.query_parameters import End, FromQuery, Start
 
 RANGES_S: dict[str, int] = {
     "hour": HOUR_S,
@@ -130,9 +128,7 @@ class ShownPeriod:
 
 
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
-def spacecraft_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
     state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items

@@ -2,7 +2,6 @@
 
 from typing import Annotated
 
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
@@ -12,7 +11,7 @@ from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
 from service.web.console.registry import console_page
 from service.web.console.rendering import rendered
 from service.web.requests.access import OPEN, OPERATE
-from service.web.requests.query_parameters import Cursor, Query
+from service.web.requests.query_parameters import Cursor, FromQuery, Query
 
 ROWS = 100
 
@@ -24,14 +23,14 @@ class AuditPageQuery(PageQuery):
 
 
 @console_page("/audit", "Audit list", OPERATE, section="/about")
-def audit_page(query: Annotated[AuditPageQuery, InQuery()], context: ContextDep) -> Response:
+def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
     page = context.app.audit.page(ROWS, query.cursor)
     return rendered("audit.html.jinja", context.layout(query.run), page=page)
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")
-def tokens_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def tokens_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every token without its secret."""
     return rendered(
         "tokens.html.jinja",
@@ -55,7 +54,7 @@ class SignInQuery(Query):
 
 
 @console_page("/sign-in", "Sign in", OPEN)
-def sign_in_page(query: Annotated[SignInQuery, InQuery()]) -> Response:
+def sign_in_page(query: FromQuery[SignInQuery]) -> Response:
     """Ask for a token."""
     return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
 
@@ -65,7 +64,7 @@ SEVERITIES = ("watch", "warning", "critical")
 
 
 @console_page("/webhooks", "Webhooks", OPERATE, section="/about")
-def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every webhook with what waits for it."""
     webhooks = context.app.webhooks.all()
     waiting = {
