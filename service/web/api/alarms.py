@@ -12,33 +12,12 @@ from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, Wire
-from service.storage.models.alarms import (
-    AlarmPage,
-    AlarmWithActions,
-    Annotation,
-    AnnotationPage,
-    Limit,
-    LimitHistory,
-    LimitList,
-    LimitPreview,
-)
+from service.storage.models import alarms as models
 from service.web.openapi import LINK, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import AuditDep, CallerDep, author, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import (
-    AlarmQuery,
-    AnnotationQuery,
-    AuthorQuery,
-    Comment,
-    FromQuery,
-    LimitQuery,
-    LimitStatementQuery,
-    RunQuery,
-    SpacecraftPath,
-    Time,
-    Who,
-    without_nul,
-)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("alarms")
@@ -49,7 +28,7 @@ AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
 
 class _Statement(Wire):
     who: Who = None
-    comment: Comment = None
+    comment: params.Comment = None
 
 
 class StatementIn(_Statement):
@@ -68,7 +47,9 @@ class ShelveIn(_Statement):
 class CommentIn(_Statement):
     """A comment on an alarm."""
 
-    comment: Annotated[str, Field(min_length=1, max_length=2_000), AfterValidator(without_nul)]
+    comment: Annotated[
+        str, Field(min_length=1, max_length=2_000), AfterValidator(params.without_nul)
+    ]
 
 
 class LimitTrialIn(Wire):
@@ -77,7 +58,7 @@ class LimitTrialIn(Wire):
     settings: LimitSettings
 
 
-class LimitPreviewQuery(LimitQuery, RunQuery):
+class LimitPreviewQuery(params.LimitQuery, params.RunQuery):
     """What a limit is tried on."""
 
     days: Annotated[int, Field(ge=1, le=30, description="Up to the run's latest batch.")] = 7
@@ -89,19 +70,21 @@ class LimitIn(_Statement):
     settings: LimitSettings
 
 
-@router.serves("GET /spacecraft/{name}/limits", Returns("Every limit.", LimitList), problems=(404,))
-def list_limits(name: SpacecraftPath, query: FromQuery[LimitQuery], app: AppDep) -> Response:
+@router.serves(
+    "GET /spacecraft/{name}/limits", Returns("Every limit.", models.LimitList), problems=(404,)
+)
+def list_limits(name: SpacecraftPath, query: FromQuery[params.LimitQuery], app: AppDep) -> Response:
     """The limits of every quantity of a spacecraft or a tracker, set or shipped."""
     return json_response({"items": app.limits.all(name, query.tracker)})
 
 
 @router.serves(
     "GET /spacecraft/{name}/limits/{quantity}",
-    Returns("The limit and its history.", LimitHistory),
+    Returns("The limit and its history.", models.LimitHistory),
     problems=(404,),
 )
 def get_limit(
-    name: SpacecraftPath, quantity: QuantityPath, query: FromQuery[LimitQuery], app: AppDep
+    name: SpacecraftPath, quantity: QuantityPath, query: FromQuery[params.LimitQuery], app: AppDep
 ) -> Response:
     """The limit of one quantity, the shipped limit, and the history of changes."""
     return json_response(app.limits.get(name, _quantity_with_limits(quantity), query.tracker))
@@ -109,14 +92,14 @@ def get_limit(
 
 @router.serves(
     "PUT /spacecraft/{name}/limits/{quantity}",
-    Returns("The limit, which applies from the next batch on.", Limit),
+    Returns("The limit, which applies from the next batch on.", models.Limit),
     body=LimitIn,
     problems=(404,),
 )
 def set_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: FromQuery[LimitQuery],
+    query: FromQuery[params.LimitQuery],
     body: JsonBody,
     app: AppDep,
     caller: CallerDep,
@@ -140,7 +123,7 @@ def set_limit(
 
 @router.serves(
     "POST /spacecraft/{name}/limits/{quantity}/preview",
-    Returns("How this limit and the one in force evaluate them.", LimitPreview),
+    Returns("How this limit and the one in force evaluate them.", models.LimitPreview),
     body=LimitTrialIn,
     problems=(404,),
 )
@@ -159,13 +142,13 @@ def preview_limit(
 
 @router.serves(
     "DELETE /spacecraft/{name}/limits/{quantity}",
-    Returns("The shipped limit, which applies again.", Limit),
+    Returns("The shipped limit, which applies again.", models.Limit),
     problems=(404, 503),
 )
 def reset_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: FromQuery[LimitStatementQuery],
+    query: FromQuery[params.LimitStatementQuery],
     app: AppDep,
     caller: CallerDep,
     audited: AuditDep,
@@ -185,13 +168,13 @@ def reset_limit(
     )
 
 
-@router.serves("GET /alarms", Returns("A page of alarms.", AlarmPage, LINK))
-def list_alarms(request: Request, query: FromQuery[AlarmQuery], app: AppDep) -> Response:
+@router.serves("GET /alarms", Returns("A page of alarms.", models.AlarmPage, LINK))
+def list_alarms(request: Request, query: FromQuery[params.AlarmQuery], app: AppDep) -> Response:
     """Alarms, newest first; by default those that are not cleared."""
     return page_response(request, app.alarms.page(**query.asked()))
 
 
-@router.serves("GET /alarms/{id}", Returns("The alarm.", AlarmWithActions), problems=(404,))
+@router.serves("GET /alarms/{id}", Returns("The alarm.", models.AlarmWithActions), problems=(404,))
 def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     """One alarm with its history."""
     return json_response(_visible_alarm(app, id, caller))
@@ -199,7 +182,7 @@ def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
 
 @router.serves(
     "POST /alarms/{id}/acknowledge",
-    Returns("The alarm, now acknowledged.", AlarmWithActions),
+    Returns("The alarm, now acknowledged.", models.AlarmWithActions),
     body=StatementIn,
     problems=(404, 409),
 )
@@ -215,7 +198,7 @@ def acknowledge_alarm(
 
 @router.serves(
     "POST /alarms/{id}/shelve",
-    Returns("The alarm, now shelved.", AlarmWithActions),
+    Returns("The alarm, now shelved.", models.AlarmWithActions),
     body=ShelveIn,
     problems=(404, 409),
 )
@@ -231,7 +214,7 @@ def shelve_alarm(
 
 @router.serves(
     "POST /alarms/{id}/unshelve",
-    Returns("The alarm.", AlarmWithActions),
+    Returns("The alarm.", models.AlarmWithActions),
     body=StatementIn,
     problems=(404, 409),
 )
@@ -247,7 +230,7 @@ def unshelve_alarm(
 
 @router.serves(
     "POST /alarms/{id}/comment",
-    Returns("The alarm.", AlarmWithActions),
+    Returns("The alarm.", models.AlarmWithActions),
     body=CommentIn,
     problems=(404,),
 )
@@ -268,7 +251,7 @@ def _quantity_with_limits(quantity: str) -> QuantityName:
     return quantity
 
 
-def _visible_alarm(app: AppDep, id: str, caller: Caller) -> AlarmWithActions:
+def _visible_alarm(app: AppDep, id: str, caller: Caller) -> models.AlarmWithActions:
     """An alarm of the caller's spacecraft; raises `NotFound` for those of others."""
     found = app.alarms.get(id)
     if not caller.may_see(found.spacecraft):
@@ -308,15 +291,19 @@ class AnnotationIn(Wire):
 
 
 @annotations_router.serves(
-    "GET /annotations", Returns("A page of annotations.", AnnotationPage, LINK)
+    "GET /annotations", Returns("A page of annotations.", models.AnnotationPage, LINK)
 )
-def list_annotations(request: Request, query: FromQuery[AnnotationQuery], app: AppDep) -> Response:
+def list_annotations(
+    request: Request, query: FromQuery[params.AnnotationQuery], app: AppDep
+) -> Response:
     """Notes that touch a period, the latest written first."""
     return page_response(request, app.annotations.page(**query.asked()))
 
 
 @annotations_router.serves(
-    "POST /annotations", Returns("The annotation.", Annotation, status=201), body=AnnotationIn
+    "POST /annotations",
+    Returns("The annotation.", models.Annotation, status=201),
+    body=AnnotationIn,
 )
 def add_annotation(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
     """Write a note on a time or a period; the name of its author is stored with it."""
@@ -335,12 +322,12 @@ def add_annotation(body: JsonBody, app: AppDep, caller: CallerDep, audited: Audi
 
 @annotations_router.serves(
     "DELETE /annotations/{id}",
-    Returns("The annotation that was deleted.", Annotation),
+    Returns("The annotation that was deleted.", models.Annotation),
     problems=(404, 503),
 )
 def delete_annotation(
     id: AnnotationId,
-    query: FromQuery[AuthorQuery],
+    query: FromQuery[params.AuthorQuery],
     app: AppDep,
     caller: CallerDep,
     audited: AuditDep,

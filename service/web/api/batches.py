@@ -15,6 +15,7 @@ from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, 
 from service.storage.models.compare import Comparison
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import AuditDep, CallerDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
@@ -24,14 +25,7 @@ from service.web.requests.dependencies import (
     page_response,
 )
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import (
-    BatchQuery,
-    Comment,
-    FromQuery,
-    Time,
-    Who,
-    require_no_query,
-)
+from service.web.requests.query_parameters import FromQuery, Time, Who
 from service.web.requests.request_body import (
     BINARY,
     NO_IDEMPOTENCY_KEY,
@@ -64,7 +58,7 @@ class WhatIfIn(Wire):
         Field(description="Record the result, and make it the current one of its batch."),
     ] = False
     who: Who = None
-    comment: Comment = None
+    comment: params.Comment = None
 
 
 @router.serves(
@@ -77,7 +71,7 @@ class WhatIfIn(Wire):
 )
 async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
-    await require_no_query(request)
+    await params.require_no_query(request)
     body = await json_body(request)
     key = await idempotency_key(request)
     held = request.app.state
@@ -126,7 +120,7 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
 
 
 @router.serves("GET /batches", Returns("A page of results.", BatchPage, LINK))
-def list_batches(request: Request, query: FromQuery[BatchQuery], app: AppDep) -> Response:
+def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: AppDep) -> Response:
     """The current results of recorded batches, newest first by batch time."""
     return page_response(request, app.results.page(**query.asked()))
 

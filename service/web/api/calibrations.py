@@ -13,28 +13,14 @@ from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
-from service.storage.calibrations import (
-    Calibration,
-    CalibrationAdoption,
-    CalibrationInForce,
-    CalibrationPage,
-)
+from service.storage import calibrations as models
 from service.storage.models.compare import Comparison
 from service.web.api.batches import COMPARISON_S
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import AuditDep, CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import (
-    Cursor,
-    FromQuery,
-    PageLimit,
-    Query,
-    SpacecraftFilter,
-    SpacecraftPath,
-    Time,
-    Who,
-    without_nul,
-)
+from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("calibrations")
@@ -114,7 +100,7 @@ class _Signed(Wire):
     note: Annotated[
         str,
         Field(max_length=2_000, description="The reason, in plain text."),
-        AfterValidator(without_nul),
+        AfterValidator(params.without_nul),
     ] = ""
 
 
@@ -133,12 +119,14 @@ class CalibrationRevertIn(_Signed):
 class CalibrationQuery(Query):
     """Which calibrations."""
 
-    spacecraft: SpacecraftFilter = None
-    limit: PageLimit = 100
-    cursor: Cursor = None
+    spacecraft: params.SpacecraftFilter = None
+    limit: params.PageLimit = 100
+    cursor: params.Cursor = None
 
 
-@router.serves("GET /calibrations", Returns("A page of calibrations.", CalibrationPage, LINK))
+@router.serves(
+    "GET /calibrations", Returns("A page of calibrations.", models.CalibrationPage, LINK)
+)
 def list_calibrations(
     request: Request, query: FromQuery[CalibrationQuery], app: AppDep
 ) -> Response:
@@ -148,7 +136,7 @@ def list_calibrations(
 
 @router.serves(
     "POST /calibrations",
-    Returns("The calibration, which is computed now.", Calibration, LOCATION, status=202),
+    Returns("The calibration, which is computed now.", models.Calibration, LOCATION, status=202),
     body=CalibrationIn,
     problems=(404,),
 )
@@ -163,7 +151,9 @@ def start_calibration(
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
-@router.serves("GET /calibrations/{id}", Returns("The calibration.", Calibration), problems=(404,))
+@router.serves(
+    "GET /calibrations/{id}", Returns("The calibration.", models.Calibration), problems=(404,)
+)
 def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Response:
     """One calibration with covariance and residual maps."""
     return json_response(_visible(app, id, caller))
@@ -184,7 +174,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
 
 @router.serves(
     "POST /calibrations/{id}/adopt",
-    Returns("The adoption.", CalibrationAdoption),
+    Returns("The adoption.", models.CalibrationAdoption),
     body=CalibrationAdoptIn,
     problems=(404, 409),
 )
@@ -200,7 +190,7 @@ def adopt_calibration(
 
 @router.serves(
     "GET /spacecraft/{name}/calibration",
-    Returns("The calibration in force.", CalibrationInForce),
+    Returns("The calibration in force.", models.CalibrationInForce),
     problems=(404,),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
@@ -210,7 +200,7 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
 
 @router.serves(
     "POST /spacecraft/{name}/calibration/revert",
-    Returns("The change.", CalibrationAdoption),
+    Returns("The change.", models.CalibrationAdoption),
     body=CalibrationRevertIn,
     problems=(404, 409),
 )
@@ -223,7 +213,7 @@ def revert_calibration(
     return json_response(app.adoptions.revert(name, asked.to, who, asked.note, audited.entry()))
 
 
-def _visible(app: AppDep, id: str, caller: Caller) -> Calibration:
+def _visible(app: AppDep, id: str, caller: Caller) -> models.Calibration:
     """A calibration of the caller's spacecraft; raises `NotFound` for those of others."""
     found = app.calibrations.get(id)
     if not caller.may_see(found.spacecraft):

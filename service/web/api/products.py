@@ -22,24 +22,11 @@ from service.storage.grades.rows import LiveAttitude
 from service.storage.models.products import AttitudeAtMoment, AttitudeProduct
 from service.storage.tracks import TrackList
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.exports import ExportsDep, attached_as
-from service.web.requests.query_parameters import (
-    TDM_MEDIA_TYPE,
-    AttitudeAtQuery,
-    AttitudeQuery,
-    End,
-    FromQuery,
-    PeriodPageQuery,
-    SpacecraftPath,
-    Start,
-    TableKindPath,
-    TableQuery,
-    TracksQuery,
-    Who,
-    require_order,
-)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("products")
@@ -52,7 +39,7 @@ router = ApiRouter("products")
 )
 def get_attitude(
     name: SpacecraftPath,
-    query: FromQuery[AttitudeQuery],
+    query: FromQuery[params.AttitudeQuery],
     app: AppDep,
     exports: ExportsDep,
     caller: CallerDep,
@@ -77,7 +64,7 @@ def get_attitude(
     problems=(404,),
 )
 def get_attitude_at(
-    name: SpacecraftPath, query: FromQuery[AttitudeAtQuery], app: AppDep
+    name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
 ) -> Response:
     """The attitude at a moment with its error: interpolated within a stretch, or the nearest.
 
@@ -100,8 +87,8 @@ def get_attitude_at(
 )
 def get_table(
     name: SpacecraftPath,
-    kind: TableKindPath,
-    query: FromQuery[TableQuery],
+    kind: params.TableKindPath,
+    query: FromQuery[params.TableQuery],
     app: AppDep,
     exports: ExportsDep,
     caller: CallerDep,
@@ -139,7 +126,7 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     problems=(404,),
 )
 def list_innovations(
-    request: Request, name: SpacecraftPath, query: FromQuery[PeriodPageQuery], app: AppDep
+    request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
 ) -> Response:
     """How each measured attitude met the filter, and how far it is from the smoothed one.
 
@@ -152,13 +139,13 @@ class DefinitiveIn(Wire):
     """Which days get a definitive attitude."""
 
     run: RunName = "live"
-    start: Start = None
-    end: End = None
+    start: params.Start = None
+    end: params.End = None
     who: Who = None
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        require_order(self.start, self.end)
+        params.require_order(self.start, self.end)
         return self
 
 
@@ -210,10 +197,12 @@ tracks_router = ApiRouter("products")
 
 @tracks_router.serves(
     "GET /spacecraft/{name}/tracks",
-    Returns("The tracks.", TrackList, also=TDM_MEDIA_TYPE),
+    Returns("The tracks.", TrackList, also=params.TDM_MEDIA_TYPE),
     problems=(404, 503),
 )
-def list_tracks(name: SpacecraftPath, query: FromQuery[TracksQuery], app: AppDep) -> Response:
+def list_tracks(
+    name: SpacecraftPath, query: FromQuery[params.TracksQuery], app: AppDep
+) -> Response:
     """Tracks of a period: points that no catalog star explains and that move together.
 
     They are computed from the record: unmatched stars of the batches with an attitude, of at most
@@ -224,4 +213,4 @@ def list_tracks(name: SpacecraftPath, query: FromQuery[TracksQuery], app: AppDep
     if query.format == "json":
         return json_response(found)
     attached = {"Content-Disposition": f'attachment; filename="{name}-{query.run}-tracks.tdm"'}
-    return Response(b"".join(app.tracks.tdm(found)), 200, attached, TDM_MEDIA_TYPE)
+    return Response(b"".join(app.tracks.tdm(found)), 200, attached, params.TDM_MEDIA_TYPE)

@@ -11,14 +11,7 @@ from service.access.tokens import Caller
 from service.observations.schema import Key, RunName, Wire
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
-from service.storage.webhooks.registered import (
-    Webhook,
-    WebhookDeliveryPage,
-    WebhookList,
-    WebhookQueued,
-    WebhookTest,
-    WebhookWithSecret,
-)
+from service.storage.webhooks import registered
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests.access import AuditDep, CallerDep, require_scope
 from service.web.requests.dependencies import AppDep, json_response, page_response
@@ -117,13 +110,13 @@ class DeliveryQuery(Query):
     cursor: Cursor = None
 
 
-@router.serves("GET /webhooks", Returns("All webhooks.", WebhookList))
+@router.serves("GET /webhooks", Returns("All webhooks.", registered.WebhookList))
 def list_webhooks(app: AppDep) -> Response:
     """Every webhook, with its state and its last failure."""
     return json_response({"items": app.webhooks.all()})
 
 
-@router.serves("GET /webhooks/{id}", Returns("The webhook.", Webhook), problems=(404,))
+@router.serves("GET /webhooks/{id}", Returns("The webhook.", registered.Webhook), problems=(404,))
 def get_webhook(id: WebhookId, app: AppDep) -> Response:
     """One webhook."""
     return json_response(app.webhooks.get(id))
@@ -131,7 +124,9 @@ def get_webhook(id: WebhookId, app: AppDep) -> Response:
 
 @router.serves(
     "POST /webhooks",
-    Returns("The webhook, and its secret this once.", WebhookWithSecret, LOCATION, status=201),
+    Returns(
+        "The webhook, and its secret this once.", registered.WebhookWithSecret, LOCATION, status=201
+    ),
     body=WebhookIn,
     problems=(409,),
 )
@@ -144,7 +139,10 @@ def add_webhook(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDe
 
 
 @router.serves(
-    "PUT /webhooks/{id}", Returns("The webhook.", Webhook), body=WebhookIn, problems=(404,)
+    "PUT /webhooks/{id}",
+    Returns("The webhook.", registered.Webhook),
+    body=WebhookIn,
+    problems=(404,),
 )
 def change_webhook(
     id: WebhookId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
@@ -156,7 +154,9 @@ def change_webhook(
 
 
 @router.serves(
-    "DELETE /webhooks/{id}", Returns("The webhook that was deleted.", Webhook), problems=(404, 503)
+    "DELETE /webhooks/{id}",
+    Returns("The webhook that was deleted.", registered.Webhook),
+    problems=(404, 503),
 )
 def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
     """Delete a webhook with its queue and its dead letters."""
@@ -165,7 +165,7 @@ def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
 
 @router.serves(
     "POST /webhooks/{id}/secret",
-    Returns("The webhook, and its new secret this once.", WebhookWithSecret),
+    Returns("The webhook, and its new secret this once.", registered.WebhookWithSecret),
     body=SecretIn,
     body_required=False,
     problems=(404, 409),
@@ -183,7 +183,7 @@ def rotate_webhook_secret(
 
 @router.serves(
     "POST /webhooks/{id}/test",
-    Returns("What came of the attempt.", WebhookTest),
+    Returns("What came of the attempt.", registered.WebhookTest),
     problems=(404, 409, 503),
 )
 def test_webhook(id: WebhookId, app: AppDep) -> Response:
@@ -193,7 +193,7 @@ def test_webhook(id: WebhookId, app: AppDep) -> Response:
 
 @router.serves(
     "GET /webhooks/{id}/deliveries",
-    Returns("A page of deliveries.", WebhookDeliveryPage, LINK),
+    Returns("A page of deliveries.", registered.WebhookDeliveryPage, LINK),
     problems=(404,),
 )
 def list_webhook_deliveries(
@@ -209,7 +209,7 @@ def list_webhook_deliveries(
 
 @router.serves(
     "POST /webhooks/{id}/retry",
-    Returns("How many were queued.", WebhookQueued),
+    Returns("How many were queued.", registered.WebhookQueued),
     body=RetryIn,
     body_required=False,
     problems=(404,),
@@ -224,7 +224,7 @@ def retry_dead_letters(
 
 @router.serves(
     "POST /webhooks/{id}/replay",
-    Returns("How many were queued.", WebhookQueued),
+    Returns("How many were queued.", registered.WebhookQueued),
     body=ReplayEventsIn,
     problems=(404,),
 )

@@ -156,8 +156,7 @@ class BatchQuery(PeriodPageQuery):
         Field(description="Only batches with a good attitude, with a suspect one, or with none."),
     ] = None
     batch: Annotated[
-        Key | None,
-        Field(description="Only the batch with this batch id; needs `spacecraft`."),
+        Key | None, Field(description="Only the batch with this batch id; needs `spacecraft`.")
     ] = None
 
     @model_validator(mode="after")
@@ -261,8 +260,7 @@ class WorstQuery(PeriodQuery):
     """Which batches are worst, by what."""
 
     by: Annotated[
-        RankedName,
-        Field(description="The quantity. For an offset, its absolute value."),
+        RankedName, Field(description="The quantity. For an offset, its absolute value.")
     ] = "ambiguous_share"
     tracker: OfTracker = None
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20
@@ -319,9 +317,7 @@ Who = Annotated[
     AfterValidator(without_nul),
 ]
 Comment = Annotated[
-    str | None,
-    Field(max_length=2_000, description="A comment."),
-    AfterValidator(without_nul),
+    str | None, Field(max_length=2_000, description="A comment."), AfterValidator(without_nul)
 ]
 
 
@@ -383,8 +379,7 @@ LargestGap = Annotated[
     ),
 ]
 Statuses = Annotated[
-    StatusWanted,
-    Field(description="Only good attitudes, only suspect ones, or `all`."),
+    StatusWanted, Field(description="Only good attitudes, only suspect ones, or `all`.")
 ]
 Grades = Annotated[
     ProductGrade,
@@ -464,7 +459,5 @@ class TableQuery(PeriodQuery):
     """A table of a period, in a format."""
 
     format: Annotated[
-        str,
-        FormatNames(lambda: [*table_formats()]),
-        Field(description="The format of the file."),
+        str, FormatNames(lambda: [*table_formats()]), Field(description="The format of the file.")
     ] = "csv"

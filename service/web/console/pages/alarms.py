@@ -17,12 +17,17 @@ from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, L
 from service.storage.queries.alarms import TimeOut
 from service.times import Utc, parse_utc, recorded_utc, shifted
 from service.web.console.formatting import with_day_of_year
-from service.web.console.page_context import ContextDep, PageContext, PageQuery, SortedQuery
+from service.web.console.page import (
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    SortedQuery,
+    console_page,
+)
 from service.web.console.pages.spacecraft import charts_by_quantity, history_address
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import Cursor, FromQuery, Query
+from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 200
 State = Literal["active", "open", "returned", "acknowledged", "shelved", "cleared", "all"]
@@ -109,9 +114,9 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
         for alarm, times in zip(found, context.app.alarms.times_out(found), strict=True)
     ]
     lines = _sorted(lines, query)
-    return rendered(
+    return context.rendered(
         "alarms.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         groups=_grouped(lines[:ROWS], query.group),
         left_out=max(0, len(lines) - ROWS),
@@ -216,9 +221,9 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
     of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
     is_retired = context.app.alarms.is_retired(alarm.spacecraft, alarm.tracker)
     (times,) = context.app.alarms.times_out([alarm])
-    return rendered(
+    return context.rendered(
         "alarm.html.jinja",
-        context.layout(alarm.run),
+        alarm.run,
         alarm=alarm,
         line=AlarmLine(alarm, times),
         is_retired=is_retired,
@@ -309,9 +314,9 @@ def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -
     """The bounds of every quantity, which can be previewed and changed, with their history."""
     app, tracker = context.app, query.tracker
     limits = app.limits.all(name, tracker)
-    return rendered(
+    return context.rendered(
         "limits.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         tracker=tracker,
         trackers=limited_trackers(app.context.known[name]),
@@ -319,7 +324,7 @@ def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -
         severities=SEVERITIES,
         days=PREVIEW_DAYS,
         charts=charts_by_quantity(),
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
     )
 
 
@@ -356,9 +361,9 @@ def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) ->
         limit=ANNOTATION_ROWS,
         cursor=query.cursor,
     )
-    return rendered(
+    return context.rendered(
         "annotations.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         page=page,
         around=_around,

@@ -32,11 +32,9 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import Cursor, FromQuery
+from service.web.requests.query_parameters import Cursor
 
 VIEWS = ("all", "field")
 """The content of the chart: all candidates of the answer, or the field of view alone."""
@@ -94,10 +92,9 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     field = context.app.results.star_field(id, tried)
     mission = context.app.context.known[answer.spacecraft]
     fields = fields_of(asked, batch_settings(held), mission=mission)
-    layout = context.layout(answer.run)
-    return rendered(
+    return context.rendered(
         "batch.html.jinja",
-        layout,
+        answer.run,
         record=record,
         answer=answer,
         tried=tried,
@@ -247,9 +244,9 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
         if len(found) == 1:
             address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
             return RedirectResponse(address, 303)
-        return rendered(
+        return context.rendered(
             "batches.html.jinja",
-            context.layout(query.run),
+            query.run,
             query=query,
             page=Page(found, None),
             spacecraft=context.spacecraft,
@@ -264,12 +261,8 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
         limit=ROWS,
         cursor=query.cursor,
     )
-    return rendered(
-        "batches.html.jinja",
-        context.layout(query.run),
-        query=query,
-        page=page,
-        spacecraft=context.spacecraft,
+    return context.rendered(
+        "batches.html.jinja", query.run, query=query, page=page, spacecraft=context.spacecraft
     )
 
 

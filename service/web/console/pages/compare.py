@@ -17,11 +17,8 @@ from service.times import DAY_S, parse_utc, utc_now
 from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import asked_options, fields_of, settings_of_mission
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
-from service.web.requests.query_parameters import FromQuery
 
 SAMPLE = 100
 SIDES = ("a", "b")
@@ -101,9 +98,9 @@ def compare_page(
     run = pair[0] if pair and runs else query.run
     name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
     mission = context.app.context.known.get(name)
-    return rendered(
+    return context.rendered(
         "compare.html.jinja",
-        context.layout(run),
+        run,
         query=query,
         name=name,
         other=pair[1] if pair else None,
@@ -155,9 +152,9 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
     """
     bound = context.caller.spacecraft is not None
-    return rendered(
+    return context.rendered(
         "runs.html.jinja",
-        context.layout(query.run),
+        query.run,
         runs=context.app.runs.all(context.caller.spacecraft),
         reprocessings=[] if bound else context.app.runs.reprocessings(),
         replays=context.app.replays.all(context.caller.spacecraft),
@@ -169,8 +166,4 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 @console_page("/replays/{id}", "Replay", READ, section="/runs")
 def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """One replay: how far it is, and every line that was refused."""
-    return rendered(
-        "replay.html.jinja",
-        context.layout(query.run),
-        replay=context.app.replays.get(id),
-    )
+    return context.rendered("replay.html.jinja", query.run, replay=context.app.replays.get(id))

@@ -12,17 +12,14 @@ from service.app.products import TABLE_KINDS
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products.attitudes import AttitudeSeries, ProductGrade
 from service.products.formats import attitude_formats, table_formats
-from service.web.console.page_context import ContextDep, PageContext
+from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.spacecraft import (
     RANGES_S,
     ShownPeriod,
     SpacecraftQuery,
     shown_period,
 )
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import FromQuery
 
 GRADES: dict[ProductGrade, str] = {
     "smoothed": "The definitive attitude: every measurement of the day, before and after each "
@@ -87,9 +84,9 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
             asked["largest_gap_s"] = f"{query.gap_s:g}"
         return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked | more)}"
 
-    return rendered(
+    return context.rendered(
         "files.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         query=query,
         stretch=shown,

@@ -6,14 +6,11 @@ from starlette.responses import Response
 
 from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
-from service.web.console.charts.grade_panels import GradeChart, Strip, TimeAxis, strips
 from service.web.console.charts.grades import grade_charts, innovation_charts
-from service.web.console.page_context import ContextDep
+from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
+from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import FromQuery
 
 JOBS = 8
 """The latest that the page lists."""
@@ -52,9 +49,9 @@ def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
                 strips(found, axis),
                 axis.ticks(),
             )
-    return rendered(
+    return context.rendered(
         "grades.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         has_gyro=mission.gyro is not None,
         stretch=shown,

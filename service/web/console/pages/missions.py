@@ -16,11 +16,8 @@ from service.observations.schema import Key
 from service.storage.models.spacecraft import MissionThen
 from service.web.api.spacecraft import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.options import SYMBOLS
-from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page
 from service.web.requests.access import READ, Policy
-from service.web.requests.query_parameters import FromQuery
 
 MOST_SHOWN = 8
 """Missions whose settings are shown whole without being asked for."""
@@ -90,9 +87,9 @@ def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Respo
                 "history": list(reversed(_entries(state.history))),
             }
         )
-    return rendered(
+    return context.rendered(
         "missions.html.jinja",
-        context.layout(query.run),
+        query.run,
         missions=missions,
         known=[context.app.context.known[name] for name in names],
         changed=changed,
@@ -164,9 +161,9 @@ def zones_page(query: FromQuery[ZonesQuery], context: ContextDep) -> Response:
     size, costs = context.app.zones.size(name, query.run)
     cache = context.app.zones.state()
     epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
-    return rendered(
+    return context.rendered(
         "zones.html.jinja",
-        context.layout(query.run),
+        query.run,
         cache=cache,
         zones=cache.items[::-1][:MOST_ZONES_SHOWN],
         epochs=epochs,
@@ -175,7 +172,7 @@ def zones_page(query: FromQuery[ZonesQuery], context: ContextDep) -> Response:
         size=size,
         costs=costs,
         verdicts=VERDICTS,
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
     )
 
 
@@ -195,9 +192,9 @@ class AdviceForm(AdviceQuery):
 def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
     """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
     advice = context.app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S)
-    return rendered(
+    return context.rendered(
         "advice.html.jinja",
-        context.layout(query.run),
+        query.run,
         advice=advice,
         query=query,
         asked=urlencode(

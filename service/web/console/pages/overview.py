@@ -15,11 +15,15 @@ from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
-from service.web.console.page_context import ContextDep, PageContext, SortedQuery, alarm_counts
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import (
+    ContextDep,
+    FromQuery,
+    PageContext,
+    SortedQuery,
+    alarm_counts,
+    console_page,
+)
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import FromQuery
 
 STALE_AFTER_S = 3600.0
 """A spacecraft is silent, or behind the latest batch of its run, from this long on."""
@@ -126,9 +130,9 @@ def overview_page(query: FromQuery[OverviewQuery], context: ContextDep) -> Respo
         for place in range(len(fleet.rows))
     ]
     lines = _sorted([line for line in every if _is_shown(line, query)], query)
-    return rendered(
+    return context.rendered(
         "overview.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         fleet=fleet,
         lines=lines,

@@ -14,12 +14,9 @@ from service.web.console.charts.histogram import (
     magnitude_chart,
     residual_histogram,
 )
-from service.web.console.page_context import ContextDep
+from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import FromQuery
 
 MOST_LINKED = 600
 """Batches whose tracks are looked for: reading and linking them takes about a second."""
@@ -56,9 +53,9 @@ def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
             )
         trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
     is_any = found is not None and found.read > 0
-    return rendered(
+    return context.rendered(
         "period.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         tracker=query.tracker,
         tracker_names=[*(each.name for each in mission.trackers), *retired],

@@ -2,11 +2,8 @@
 
 from starlette.responses import Response
 
-from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import HEADERS, rendered
+from service.web.console.page import HEADERS, ContextDep, FromQuery, PageQuery, console_page
 from service.web.requests.access import Policy
-from service.web.requests.query_parameters import FromQuery
 
 # The script shows the drawn picture, which no address of the service has.
 _POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
@@ -22,9 +19,9 @@ def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
         if name in missions
         for tracker in [each for each in missions[name].trackers if each.camera][:1]
     ]
-    page = rendered(
+    page = context.rendered(
         "pictures.html.jinja",
-        context.layout(query.run),
+        query.run,
         cameras=cameras,
         most_mb=context.app.settings.frame_mb,
         most_megapixels=context.app.settings.frame_megapixels,

@@ -7,11 +7,16 @@ from starlette.responses import Response
 
 from service.access.tokens import MAX_DAYS, SCOPES
 from service.storage.recording.events import EVENT_KINDS
-from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import (
+    EMPTY_LAYOUT,
+    ContextDep,
+    FromQuery,
+    PageQuery,
+    console_page,
+    rendered,
+)
 from service.web.requests.access import OPEN, OPERATE
-from service.web.requests.query_parameters import Cursor, FromQuery, Query
+from service.web.requests.query_parameters import Cursor, Query
 
 ROWS = 100
 
@@ -26,15 +31,15 @@ class AuditPageQuery(PageQuery):
 def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
     page = context.app.audit.page(ROWS, query.cursor)
-    return rendered("audit.html.jinja", context.layout(query.run), page=page)
+    return context.rendered("audit.html.jinja", query.run, page=page)
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")
 def tokens_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every token without its secret."""
-    return rendered(
+    return context.rendered(
         "tokens.html.jinja",
-        context.layout(query.run),
+        query.run,
         tokens=context.app.tokens.all(),
         scopes=SCOPES,
         max_days=MAX_DAYS,
@@ -73,9 +78,9 @@ def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
         ).items
         for each in webhooks
     }
-    return rendered(
+    return context.rendered(
         "webhooks.html.jinja",
-        context.layout(query.run),
+        query.run,
         webhooks=webhooks,
         deliveries=waiting,
         most=SHOWN_DELIVERIES,
