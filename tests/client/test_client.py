@@ -30,8 +30,10 @@ from acquire_client import (
     Unauthenticated,
     UnexpectedAnswer,
     errors,
+    operations,
+    spacecraft,
 )
-from acquire_client._sync import batches, connection, operations, replays, spacecraft
+from acquire_client._sync import batches, connection, replays
 from acquire_client._sync import client as whole
 from acquire_client.encoding import json_of
 from acquire_client.errors import problem_of

@@ -9,6 +9,7 @@ import httpx
 import msgspec
 
 from ..base import Page
+from ..calls import Call, Listing
 from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
@@ -131,6 +132,16 @@ class AsyncConnection:
                 raise problem_of(response)
             yield response.aiter_bytes()
 
+    async def _carry_out(self, call: Call[T]) -> T:
+        """Send a request, and read its answer."""
+        asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
+        response = await self.request(call.method, call.path, repeat=call.repeat, **asked)
+        return call.read(response)
+
+    def _listed(self, listing: Listing[Row]) -> "AsyncItems[Row]":
+        """The items of a long list."""
+        return AsyncItems(self, listing)
+
     async def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
         """The answer to a GET as a model."""
         return decoded(await self.request("GET", path, query=query), kind)
@@ -148,17 +159,14 @@ class AsyncItems(Generic[Row]):
     What is recorded meanwhile neither repeats nor hides items.
     """
 
-    def __init__(
-        self, connection: AsyncConnection, kind: type[Row], path: str, query: Query
-    ) -> None:
-        self._connection, self._kind = connection, kind
-        self._path, self._query = path, query
+    def __init__(self, connection: AsyncConnection, listing: Listing[Row]) -> None:
+        self._connection, self._listing = connection, listing
 
     async def __aiter__(self) -> AsyncIterator[Row]:
-        page_kind: Any = Page[self._kind]  # type: ignore[name-defined]
-        query = {"limit": ITEMS_A_PAGE, **self._query}
+        page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
+        query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:
-            page = await self._connection.get(page_kind, self._path, query)
+            page = await self._connection.get(page_kind, self._listing.path, query)
             for item in page.items:
                 yield item
             if page.next_cursor is None:
@@ -171,7 +179,7 @@ class AsyncItems(Generic[Row]):
 
     async def to_arrow(self) -> "pa.Table":
         """A table with a row for each item; raises `PackageMissing` without pyarrow."""
-        return table_of(await self.all(), self._kind)
+        return table_of(await self.all(), self._listing.kind)
 
     async def to_pandas(self) -> "pd.DataFrame":
         """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""

@@ -5,7 +5,6 @@ from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
 from .. import models
-from ..base import Page
 from ..encoding import decoded, path_of, pieces_of
 from ..errors import ReplayEnded
 from ..retrying import Repeat
@@ -22,16 +21,6 @@ corrects that with its next lines, which a busy machine may take a while for."""
 
 class AsyncReplays(AsyncConnection):
     """The part of the client that is about runs and replays."""
-
-    async def runs(self) -> list[models.Run]:
-        """Every run with batches."""
-        page = await self.get(Page[models.Run], path_of("runs"))
-        return page.items
-
-    async def watch_run(self, run: str, *, alarms: bool = True) -> models.RunState:
-        """Switch the alarms of a run on or off; creates the run if it does not exist."""
-        response = await self.request("PUT", path_of("runs", run), body={"alarms": alarms})
-        return decoded(response, models.RunState)
 
     async def replay(
         self,
@@ -106,12 +95,3 @@ class AsyncReplays(AsyncConnection):
             elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
                 return
             await sleep(every_s)
-
-    async def replays(self) -> list[models.Replay]:
-        """The latest hundred replays, newest first."""
-        page = await self.get(Page[models.Replay], path_of("replays"))
-        return page.items
-
-    async def cancel_replay(self, id: str) -> models.Replay:
-        """Cancel a replay; what it recorded stays.  Raises `WrongState` where it has ended."""
-        return decoded(await self.request("DELETE", path_of("replays", id)), models.Replay)

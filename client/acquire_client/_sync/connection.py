@@ -9,6 +9,7 @@ import httpx
 import msgspec
 
 from ..base import Page
+from ..calls import Call, Listing
 from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
@@ -131,6 +132,16 @@ class Connection:
                 raise problem_of(response)
             yield response.iter_bytes()
 
+    def _carry_out(self, call: Call[T]) -> T:
+        """Send a request, and read its answer."""
+        asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
+        response = self.request(call.method, call.path, repeat=call.repeat, **asked)
+        return call.read(response)
+
+    def _listed(self, listing: Listing[Row]) -> "Items[Row]":
+        """The items of a long list."""
+        return Items(self, listing)
+
     def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
         """The answer to a GET as a model."""
         return decoded(self.request("GET", path, query=query), kind)
@@ -146,15 +157,14 @@ class Items(Generic[Row]):
     What is recorded meanwhile neither repeats nor hides items.
     """
 
-    def __init__(self, connection: Connection, kind: type[Row], path: str, query: Query) -> None:
-        self._connection, self._kind = connection, kind
-        self._path, self._query = path, query
+    def __init__(self, connection: Connection, listing: Listing[Row]) -> None:
+        self._connection, self._listing = connection, listing
 
     def __iter__(self) -> Iterator[Row]:
-        page_kind: Any = Page[self._kind]  # type: ignore[name-defined]
-        query = {"limit": ITEMS_A_PAGE, **self._query}
+        page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
+        query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:
-            page = self._connection.get(page_kind, self._path, query)
+            page = self._connection.get(page_kind, self._listing.path, query)
             yield from page.items
             if page.next_cursor is None:
                 return
@@ -166,7 +176,7 @@ class Items(Generic[Row]):
 
     def to_arrow(self) -> "pa.Table":
         """A table with a row for each item; raises `PackageMissing` without pyarrow."""
-        return table_of(self.all(), self._kind)
+        return table_of(self.all(), self._listing.kind)
 
     def to_pandas(self) -> "pd.DataFrame":
         """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""

@@ -5,7 +5,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from .. import models
-from ..base import Page
 from ..encoding import decoded, path_of, pieces_of
 from ..errors import ReplayEnded
 from ..retrying import Repeat
@@ -22,16 +21,6 @@ corrects that with its next lines, which a busy machine may take a while for."""
 
 class Replays(Connection):
     """The part of the client that is about runs and replays."""
-
-    def runs(self) -> list[models.Run]:
-        """Every run with batches."""
-        page = self.get(Page[models.Run], path_of("runs"))
-        return page.items
-
-    def watch_run(self, run: str, *, alarms: bool = True) -> models.RunState:
-        """Switch the alarms of a run on or off; creates the run if it does not exist."""
-        response = self.request("PUT", path_of("runs", run), body={"alarms": alarms})
-        return decoded(response, models.RunState)
 
     def replay(
         self,
@@ -102,12 +91,3 @@ class Replays(Connection):
             elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
                 return
             sleep(every_s)
-
-    def replays(self) -> list[models.Replay]:
-        """The latest hundred replays, newest first."""
-        page = self.get(Page[models.Replay], path_of("replays"))
-        return page.items
-
-    def cancel_replay(self, id: str) -> models.Replay:
-        """Cancel a replay; what it recorded stays.  Raises `WrongState` where it has ended."""
-        return decoded(self.request("DELETE", path_of("replays", id)), models.Replay)
