@@ -4,12 +4,10 @@ It imports nothing of the service, and is built alone.
 """
 
 from . import models
-from ._async.client import AsyncClient
-from ._async.events import AsyncEvents
-from ._async.pages import AsyncItems
-from ._sync.client import Client
-from ._sync.events import Events
-from ._sync.pages import Items
+from ._async.client import AsyncClient, AsyncEvents
+from ._async.connection import AsyncItems
+from ._sync.client import Client, Events
+from ._sync.connection import Items
 from .errors import (
     BadInput,
     Busy,
@@ -44,7 +42,7 @@ from .event_lines import (
     ReplayEvent,
     TrackingEvent,
 )
-from .outcomes import BatchOutcome, RecordedAnswer
+from .operations import BatchOutcome, RecordedAnswer
 from .retrying import Repeat
 
 __version__ = "0.2.0"

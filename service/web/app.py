@@ -38,10 +38,10 @@ from service.web.api import (
 )
 from service.web.api import tokens as access
 from service.web.console import console_router
-from service.web.console.rendering import page_or_problem
+from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
-from service.web.openapi.document import add_reference
+from service.web.openapi import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics

@@ -2,8 +2,7 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
+from fastapi import Path
 from msgspec import Raw
 from pydantic import Field, StrictBool
 from starlette.requests import Request
@@ -15,14 +14,8 @@ from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.models.compare import Comparison
 from service.storage.recording.unsaved_result import Answered
-from service.web.openapi.route import (
-    IDEMPOTENCY_KEY,
-    LINK,
-    LOCATION,
-    REPLAYED,
-    ResponseDoc,
-    route_docs,
-)
+from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import AuditDep, CallerDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
@@ -32,14 +25,7 @@ from service.web.requests.dependencies import (
     page_response,
 )
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    BatchQuery,
-    Comment,
-    Time,
-    Who,
-    require_no_query,
-)
+from service.web.requests.query_parameters import FromQuery, Time, Who
 from service.web.requests.request_body import (
     BINARY,
     NO_IDEMPOTENCY_KEY,
@@ -51,7 +37,7 @@ from service.web.requests.request_body import (
     refused,
 )
 
-router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
+router = ApiRouter("batches")
 
 PNG = "image/png"
 
@@ -72,24 +58,20 @@ class WhatIfIn(Wire):
         Field(description="Record the result, and make it the current one of its batch."),
     ] = False
     who: Who = None
-    comment: Comment = None
+    comment: params.Comment = None
 
 
-@router.post(
-    "",
-    **route_docs(
-        {
-            201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
-            200: ResponseDoc("The answer that was recorded before.", Answer, REPLAYED),
-        },
-        body=BatchIn,
-        problems=(409, 503),
-        parameters=(IDEMPOTENCY_KEY,),
-    ),
+@router.serves(
+    "POST /batches",
+    Returns("The answer, now recorded.", Answer, LOCATION, status=201),
+    Returns("The answer that was recorded before.", Answer, REPLAYED),
+    body=BatchIn,
+    problems=(409,),
+    parameters=(IDEMPOTENCY_KEY,),
 )
 async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
-    await require_no_query(request)
+    await params.require_no_query(request)
     body = await json_body(request)
     key = await idempotency_key(request)
     held = request.app.state
@@ -102,13 +84,11 @@ async def submit_batch(request: Request) -> Response:
     return answer_response(answered)
 
 
-@router.post(
-    "/many",
-    dependencies=[NO_QUERY, NO_KEY_OF_MANY],
-    **route_docs(
-        {200: ResponseDoc("An outcome for each batch, in the order sent.", BatchOutcomes)},
-        array_of=(BatchIn, MAX_ARRAY),
-    ),
+@router.serves(
+    "POST /batches/many",
+    Returns("An outcome for each batch, in the order sent.", BatchOutcomes),
+    array_of=(BatchIn, MAX_ARRAY),
+    dependencies=[NO_KEY_OF_MANY],
 )
 async def submit_batches(
     request: Request, body: JsonBody, app: AppDep, caller: CallerDep, metrics: MetricsDep
@@ -139,31 +119,20 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
     return BatchOutcome(status=problem.status, answer=None, problem=problem)
 
 
-@router.get("", **route_docs({200: ResponseDoc("A page of results.", BatchPage, LINK)}))
-def list_batches(
-    request: Request, query: Annotated[BatchQuery, InQuery()], app: AppDep
-) -> Response:
+@router.serves("GET /batches", Returns("A page of results.", BatchPage, LINK))
+def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: AppDep) -> Response:
     """The current results of recorded batches, newest first by batch time."""
     return page_response(request, app.results.page(**query.asked()))
 
 
-@router.get(
-    "/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The result and its batch.", Result)}, problems=(404,)),
-)
+@router.serves("GET /batches/{id}", Returns("The result and its batch.", Result), problems=(404,))
 def get_batch(id: ResultId, app: AppDep) -> Response:
     """One recorded result with its batch."""
     return json_response(app.results.get(id))
 
 
-@router.get(
-    "/{id}/overlay",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The image.", media_type=PNG, also=BINARY)},
-        problems=(404,),
-    ),
+@router.serves(
+    "GET /batches/{id}/overlay", Returns("The image.", media_type=PNG, also=BINARY), problems=(404,)
 )
 def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     """An image of a frame's result: the stars, their names, and residual arrows.
@@ -175,19 +144,13 @@ def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     return Response(app.frames.overlay(id), media_type=media_type, headers={"Vary": "Accept"})
 
 
-@router.post(
-    "/{id}/what-if",
-    dependencies=[NO_QUERY, NO_IDEMPOTENCY_KEY],
-    **route_docs(
-        {
-            200: ResponseDoc("The answer, which was not recorded.", Answer),
-            201: ResponseDoc(
-                "The answer, now recorded in addition to the first one.", Answer, LOCATION
-            ),
-        },
-        body=WhatIfIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /batches/{id}/what-if",
+    Returns("The answer, which was not recorded.", Answer),
+    Returns("The answer, now recorded in addition to the first one.", Answer, LOCATION, status=201),
+    body=WhatIfIn,
+    problems=(404,),
+    dependencies=[NO_IDEMPOTENCY_KEY],
 )
 def what_if(
     request: Request,
@@ -208,7 +171,7 @@ def what_if(
     return answer_response(answered, recorded=record)
 
 
-compare_router = APIRouter(prefix="/api/v1", tags=["batches"])
+compare_router = ApiRouter("batches")
 
 COMPARISON_S = 10.0
 """The duration of one comparison; the rest is left out, and the answer says so."""
@@ -231,14 +194,11 @@ class CompareIn(Wire):
     b: SideOptions = OptionsIn()
 
 
-@compare_router.post(
-    "/compare",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The results of both sides.", Comparison)},
-        body=CompareIn,
-        problems=(404, 503),
-    ),
+@compare_router.serves(
+    "POST /compare",
+    Returns("The results of both sides.", Comparison),
+    body=CompareIn,
+    problems=(404,),
 )
 def compare(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Process recorded batches again with two sets of options; nothing is recorded."""

@@ -2,35 +2,30 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
+from fastapi import Path
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.errors import BadInput
 from service.gyro import GyroBlockIn
 from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
-from service.web.openapi.route import LINK, LOCATION, REPLAYED, ResponseDoc, route_docs
+from service.web.openapi import LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response, page_response
-from service.web.requests.query_parameters import NO_QUERY, PeriodPageQuery, SpacecraftPath
+from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath
 from service.web.requests.request_body import NO_KEY_OF_A_BLOCK, JsonBody, refused
 
-router = APIRouter(prefix="/api/v1/spacecraft", tags=["gyro"])
+router = ApiRouter("gyro")
 
 BlockId = Annotated[str, Path(description="The `id` of a recorded gyro block.")]
 
 
-@router.post(
-    "/{name}/gyro",
-    dependencies=[NO_QUERY, NO_KEY_OF_A_BLOCK],
-    **route_docs(
-        {
-            201: ResponseDoc("The block, now recorded.", GyroBlockRow, LOCATION),
-            200: ResponseDoc("The block that was recorded before.", GyroBlockRow, REPLAYED),
-        },
-        body=GyroBlockIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /spacecraft/{name}/gyro",
+    Returns("The block, now recorded.", GyroBlockRow, LOCATION, status=201),
+    Returns("The block that was recorded before.", GyroBlockRow, REPLAYED),
+    body=GyroBlockIn,
+    problems=(404, 409),
+    dependencies=[NO_KEY_OF_A_BLOCK],
 )
 def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: MetricsDep) -> Response:
     """Record a block of gyro samples.
@@ -49,15 +44,13 @@ def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: Metr
     return json_response(recorded.row, 201, {"Location": location})
 
 
-@router.get(
-    "/{name}/gyro",
-    **route_docs({200: ResponseDoc("A page of blocks.", GyroBlockPage, LINK)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/gyro",
+    Returns("A page of blocks.", GyroBlockPage, LINK),
+    problems=(404,),
 )
 def list_gyro(
-    request: Request,
-    name: SpacecraftPath,
-    query: Annotated[PeriodPageQuery, InQuery()],
-    app: AppDep,
+    request: Request, name: SpacecraftPath, query: FromQuery[PeriodPageQuery], app: AppDep
 ) -> Response:
     """The gyro blocks that touch a period, without their samples, the earliest first.
 
@@ -66,10 +59,10 @@ def list_gyro(
     return page_response(request, app.gyro.page(name, **query.asked()))
 
 
-@router.get(
-    "/{name}/gyro/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The block and its samples.", GyroSamples)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/gyro/{id}",
+    Returns("The block and its samples.", GyroSamples),
+    problems=(404,),
 )
 def get_gyro(name: SpacecraftPath, id: BlockId, app: AppDep) -> Response:
     """One gyro block with its samples."""

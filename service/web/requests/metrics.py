@@ -135,19 +135,13 @@ def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
         value=cache.hits,
     )
     yield CounterMetricFamily(
-        "starid_zone_cache_misses",
-        "Zones and run catalogs built.",
-        value=cache.misses,
+        "starid_zone_cache_misses", "Zones and run catalogs built.", value=cache.misses
     )
     yield CounterMetricFamily(
-        "starid_zone_build_seconds",
-        "Time spent building them.",
-        value=cache.build_us / 1e6,
+        "starid_zone_build_seconds", "Time spent building them.", value=cache.build_us / 1e6
     )
     yield GaugeMetricFamily(
-        "starid_zone_cache_bytes",
-        "Memory that the cache holds.",
-        value=cache.bytes,
+        "starid_zone_cache_bytes", "Memory that the cache holds.", value=cache.bytes
     )
 
 

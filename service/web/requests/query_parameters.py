@@ -1,9 +1,10 @@
 """Parameters of requests: each is checked, unknown ones are refused."""
 
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self, TypedDict
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypedDict, TypeVar
 
 from fastapi import Depends, Path
+from fastapi import Query as InQuery
 from pydantic import (
     AfterValidator,
     BaseModel,
@@ -34,6 +35,10 @@ from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
 
 MAX_LIMIT = 500
+
+T = TypeVar("T")
+FromQuery: TypeAlias = Annotated[T, InQuery()]
+"""A model whose fields are the query parameters of a route."""
 
 
 def _time(value: object) -> Utc:
@@ -151,8 +156,7 @@ class BatchQuery(PeriodPageQuery):
         Field(description="Only batches with a good attitude, with a suspect one, or with none."),
     ] = None
     batch: Annotated[
-        Key | None,
-        Field(description="Only the batch with this batch id; needs `spacecraft`."),
+        Key | None, Field(description="Only the batch with this batch id; needs `spacecraft`.")
     ] = None
 
     @model_validator(mode="after")
@@ -256,8 +260,7 @@ class WorstQuery(PeriodQuery):
     """Which batches are worst, by what."""
 
     by: Annotated[
-        RankedName,
-        Field(description="The quantity. For an offset, its absolute value."),
+        RankedName, Field(description="The quantity. For an offset, its absolute value.")
     ] = "ambiguous_share"
     tracker: OfTracker = None
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20
@@ -314,9 +317,7 @@ Who = Annotated[
     AfterValidator(without_nul),
 ]
 Comment = Annotated[
-    str | None,
-    Field(max_length=2_000, description="A comment."),
-    AfterValidator(without_nul),
+    str | None, Field(max_length=2_000, description="A comment."), AfterValidator(without_nul)
 ]
 
 
@@ -378,8 +379,7 @@ LargestGap = Annotated[
     ),
 ]
 Statuses = Annotated[
-    StatusWanted,
-    Field(description="Only good attitudes, only suspect ones, or `all`."),
+    StatusWanted, Field(description="Only good attitudes, only suspect ones, or `all`.")
 ]
 Grades = Annotated[
     ProductGrade,
@@ -459,7 +459,5 @@ class TableQuery(PeriodQuery):
     """A table of a period, in a format."""
 
     format: Annotated[
-        str,
-        FormatNames(lambda: [*table_formats()]),
-        Field(description="The format of the file."),
+        str, FormatNames(lambda: [*table_formats()]), Field(description="The format of the file.")
     ] = "csv"

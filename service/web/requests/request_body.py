@@ -27,14 +27,7 @@ from service.web.requests.problem_types import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
-FRAMES = (
-    "application/fits",
-    "image/fits",
-    "image/tiff",
-    "image/png",
-    "application/x-npy",
-    BINARY,
-)
+FRAMES = ("application/fits", "image/fits", "image/tiff", "image/png", "application/x-npy", BINARY)
 """Media types of frames; the first bytes tell the format."""
 NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
 """Generated clients can send the last one: most know no type for lines."""
@@ -217,9 +210,7 @@ class Spooled:
 
 
 async def telemetry_body(
-    request: Request,
-    new_file: Callable[[], IO[bytes]],
-    discard: Callable[[IO[bytes]], object],
+    request: Request, new_file: Callable[[], IO[bytes]], discard: Callable[[IO[bytes]], object]
 ) -> Spooled:
     """A body of lines or of packets in a new file; one that did not arrive is discarded.
 

@@ -5,7 +5,6 @@ from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
 from fastapi import Path
-from fastapi import Query as InQuery
 from msgspec import structs
 from pydantic import Field
 from starlette.requests import Request
@@ -33,9 +32,7 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
@@ -95,10 +92,9 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     field = context.app.results.star_field(id, tried)
     mission = context.app.context.known[answer.spacecraft]
     fields = fields_of(asked, batch_settings(held), mission=mission)
-    layout = context.layout(answer.run)
-    return rendered(
+    return context.rendered(
         "batch.html.jinja",
-        layout,
+        answer.run,
         record=record,
         answer=answer,
         tried=tried,
@@ -144,9 +140,7 @@ def _adoption(before: Answer, after: Answer) -> list[str]:
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
-def latest_batch(
-    name: str, query: Annotated[PageQuery, InQuery()], context: ContextDep
-) -> Response:
+def latest_batch(name: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Redirect to the latest batch of a spacecraft in a run."""
     items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
@@ -236,7 +230,7 @@ class BatchesQuery(PageQuery):
 
 
 @console_page("/batches", "Batches", Policy("read", "nothing"), position=30)
-def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep) -> Response:
+def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Response:
     """The batches of a run, newest first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -250,9 +244,9 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
         if len(found) == 1:
             address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
             return RedirectResponse(address, 303)
-        return rendered(
+        return context.rendered(
             "batches.html.jinja",
-            context.layout(query.run),
+            query.run,
             query=query,
             page=Page(found, None),
             spacecraft=context.spacecraft,
@@ -267,12 +261,8 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
         limit=ROWS,
         cursor=query.cursor,
     )
-    return rendered(
-        "batches.html.jinja",
-        context.layout(query.run),
-        query=query,
-        page=page,
-        spacecraft=context.spacecraft,
+    return context.rendered(
+        "batches.html.jinja", query.run, query=query, page=page, spacecraft=context.spacecraft
     )
 
 

@@ -1,24 +1,15 @@
 """The page of grades: attitude over time, its sigmas, what the filter met, and the gyro's bias."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
-from service.web.console.charts.grade_panels import GradeChart, Strip, TimeAxis, strips
 from service.web.console.charts.grades import grade_charts, innovation_charts
-from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import (
-    RANGES_S,
-    SpacecraftQuery,
-    shown_period,
-)
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
+from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
 JOBS = 8
@@ -40,9 +31,7 @@ class Drawn:
 @console_page(
     "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
 )
-def grades_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
     mission = context.app.context.mission(name)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
@@ -60,9 +49,9 @@ def grades_page(
                 strips(found, axis),
                 axis.ticks(),
             )
-    return rendered(
+    return context.rendered(
         "grades.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         has_gyro=mission.gyro is not None,
         stretch=shown,

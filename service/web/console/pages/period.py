@@ -1,10 +1,7 @@
 """The page of a period's stars and attitudes: sky, residuals, magnitudes, attitude and rate."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.storage.queries.period import TrackerStarsOfPeriod
@@ -17,14 +14,8 @@ from service.web.console.charts.histogram import (
     magnitude_chart,
     residual_histogram,
 )
-from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import (
-    RANGES_S,
-    SpacecraftQuery,
-    shown_period,
-)
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
 MOST_LINKED = 600
@@ -45,9 +36,7 @@ class TrackerCharts:
 @console_page(
     "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
 )
-def period_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
     mission = context.app.context.mission(name)
     retired = context.app.context.retired.trackers.get(name, ())
@@ -64,9 +53,9 @@ def period_page(
             )
         trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
     is_any = found is not None and found.read > 0
-    return rendered(
+    return context.rendered(
         "period.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         tracker=query.tracker,
         tracker_names=[*(each.name for each in mission.trackers), *retired],

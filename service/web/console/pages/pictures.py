@@ -1,13 +1,8 @@
 """The page that solves a picture of any camera; only its script talks to the API."""
 
-from typing import Annotated
-
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import HEADERS, rendered
+from service.web.console.page import HEADERS, ContextDep, FromQuery, PageQuery, console_page
 from service.web.requests.access import Policy
 
 # The script shows the drawn picture, which no address of the service has.
@@ -15,7 +10,7 @@ _POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 
 
 
 @console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
-def pictures_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
     missions = context.app.missions
     cameras = [
@@ -24,9 +19,9 @@ def pictures_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
         if name in missions
         for tracker in [each for each in missions[name].trackers if each.camera][:1]
     ]
-    page = rendered(
+    page = context.rendered(
         "pictures.html.jinja",
-        context.layout(query.run),
+        query.run,
         cameras=cameras,
         most_mb=context.app.settings.frame_mb,
         most_megapixels=context.app.settings.frame_megapixels,
