@@ -4,21 +4,14 @@ import getpass
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_group,
-    add_json,
-    print_json,
-)
-from service.cli.configuration import settings_of, settings_of_existing
+from service.cli import arguments
+from service.cli.configuration import progress_bar, settings_of, settings_of_existing
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -31,7 +24,7 @@ MAX_PROBLEMS = 100
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "database",
         "Maintain the database: schema, backup, verification, and deleting old batches.",
@@ -42,15 +35,15 @@ def add(commands: Any) -> None:
         acquire database verify
         """,
     )
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "upgrade",
         "Create missing tables and migrate the schema to this version; all data are kept.",
         "acquire database upgrade",
         upgrade,
     )
-    add_database(parser)
-    parser = add_command(
+    arguments.add_database(parser)
+    parser = arguments.add_command(
         group,
         "check",
         "Compare the schema with the code; exit code 1 if they differ.",
@@ -63,9 +56,9 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--fresh", action="store_true", help="check the migrations on an empty database"
     )
-    add_json(parser, "the differences")
-    add_database(parser)
-    parser = add_command(
+    arguments.add_json(parser, "the differences")
+    arguments.add_database(parser)
+    parser = arguments.add_command(
         group,
         "backup",
         "Copy the whole database as it is now, also while the service is running: SQLite to a "
@@ -77,8 +70,8 @@ def add(commands: Any) -> None:
         backup,
     )
     parser.add_argument("output", type=Path, metavar="FILE", help="must not exist yet")
-    add_database(parser)
-    parser = add_command(
+    arguments.add_database(parser)
+    parser = arguments.add_command(
         group,
         "restore",
         "Make a database from a backup: an SQLite file that does not exist yet, or an empty "
@@ -90,7 +83,7 @@ def add(commands: Any) -> None:
         restore,
     )
     parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
-    add_database(parser)
+    arguments.add_database(parser)
     _add_verify(group)
     _add_copy(group)
     _add_rebuild(group)
@@ -100,7 +93,7 @@ def add(commands: Any) -> None:
 
 
 def _add_verify(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "verify",
         "Read everything and report faults: the file, the schema, every batch with its results, "
@@ -112,12 +105,12 @@ def _add_verify(group: Any) -> None:
         """,
         verify,
     )
-    add_json(parser, "the faults")
-    add_database(parser)
+    arguments.add_json(parser, "the faults")
+    arguments.add_database(parser)
 
 
 def _add_copy(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "copy",
         "Copy the whole record to another database, SQLite to PostgreSQL or back, compare every "
@@ -135,7 +128,7 @@ def _add_copy(group: Any) -> None:
 
 
 def _add_rebuild(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "rebuild",
         "Count the trends anew from the recorded batches.  They are kept up by themselves: this is "
@@ -144,11 +137,11 @@ def _add_rebuild(group: Any) -> None:
         "acquire database rebuild",
         rebuild,
     )
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def _add_split_trackers(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "split-trackers",
         "Split the batches of earlier versions by tracker, for trends of each tracker of a "
@@ -157,11 +150,11 @@ def _add_split_trackers(group: Any) -> None:
         "acquire database split-trackers",
         split_trackers,
     )
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def _add_prune(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "prune",
         "Delete the batches before a time, with their results and their part in the trends, and "
@@ -178,7 +171,7 @@ def _add_prune(group: Any) -> None:
     )
     parser.add_argument("--run", metavar="NAME", help="only this run; default: all runs")
     parser.add_argument("--dry-run", action="store_true", help="only print the number of batches")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def upgrade(parsed: Namespace) -> int:
@@ -197,7 +190,7 @@ def check(parsed: Namespace) -> int:
 
     differences = check_fresh() if parsed.fresh else check_schema(settings_of(parsed).database)
     if parsed.json:
-        print_json({"differences": differences})
+        arguments.print_json({"differences": differences})
         return 1 if differences else 0
     for difference in differences:
         print(difference if len(difference) <= 120 else difference[:119] + "…")
@@ -210,8 +203,9 @@ def backup(parsed: Namespace) -> int:
     """Copy the database."""
     from service.storage.upkeep.backup import back_up
 
-    with _pages("copying") as step:
-        back_up(settings_of(parsed).database, parsed.output, step)
+    with progress_bar("pages", "copying") as bar:
+        database = settings_of(parsed).database
+        back_up(database, parsed.output, lambda left, total: bar(total - left, total))
     print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
     return 0
 
@@ -221,53 +215,32 @@ def restore(parsed: Namespace) -> int:
     from service.storage.sql.migrations import HEAD
     from service.storage.upkeep.backup import restore as restore_backup
 
-    with _pages("restoring") as step:
-        revision = restore_backup(settings_of(parsed).database, parsed.backup, step)
+    with progress_bar("pages", "restoring") as bar:
+        database = settings_of(parsed).database
+        revision = restore_backup(
+            database, parsed.backup, lambda left, total: bar(total - left, total)
+        )
     print(f"{parsed.backup}: restored; its schema is at {revision}")
     if revision != HEAD:
         print(f"this version needs {HEAD}: run `acquire database upgrade`")
     return 0
 
 
-@contextmanager
-def _pages(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar of a database's pages."""
-    from tqdm import tqdm
-
-    with tqdm(total=None, unit=" pages", desc=what, disable=None, leave=False) as bar:
-
-        def step(left: int, total: int) -> None:
-            bar.total = total
-            bar.update(total - left - bar.n)
-
-        yield step
-
-
 def verify(parsed: Namespace) -> int:
     """Tell what is wrong with the database."""
-    from tqdm import tqdm
-
     from service.storage.upkeep.verify import earlier_results
     from service.storage.upkeep.verify import verify as verify_records
 
     database = settings_of(parsed).database
-    seen = 0
-    with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            nonlocal seen
-            bar.total = total
-            bar.update(done - seen)
-            seen = done
-
-        problems = verify_records(database, step)
+    with progress_bar("batches", "reading") as bar:
+        problems = verify_records(database, bar)
     if parsed.json:
-        print_json({"batches": seen, "faults": problems})
+        arguments.print_json({"batches": bar.done, "faults": problems})
         return 1 if problems else 0
     _print_problems(problems)
     if problems:
         return 1
-    print(f"nothing is wrong with {seen} batches")
+    print(f"nothing is wrong with {bar.done} batches")
     without, later = earlier_results(database)
     if later:
         print(f"{later} results got their digest at an upgrade: changes before it are not found")
@@ -307,73 +280,55 @@ def copy(parsed: Namespace) -> int:
 
 def rebuild(parsed: Namespace) -> int:
     """Count the trends anew."""
-    from tqdm import tqdm
-
     from service.storage.projections.projector import projected, rebuild_trends
     from service.storage.store import Store
 
-    store = Store(settings_of_existing(parsed).database, create=False)
-    try:
-        with (
-            projected(store),
-            tqdm(total=None, unit=" hours", desc="counting", disable=None, leave=False) as bar,
-        ):
-
-            def step(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            hours = rebuild_trends(store, step)
-    finally:
-        store.close()
+    with (
+        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        projected(store),
+        progress_bar("hours", "counting") as bar,
+    ):
+        hours = rebuild_trends(store, bar)
     print(f"the trends of {hours} hours were counted anew")
     return 0
 
 
 def split_trackers(parsed: Namespace) -> int:
     """Split older batches by tracker."""
-    from tqdm import tqdm
-
     from service.app.factory import open_app
 
-    app = open_app(settings_of_existing(parsed))
-    try:
-        with tqdm(total=None, unit=" batches", desc="splitting", disable=None, leave=False) as bar:
-            done = app.upgrade.splitter.split(lambda done: bar.update(done - bar.n))
-    finally:
-        app.close()
+    with (
+        closing(open_app(settings_of_existing(parsed))) as app,
+        progress_bar("batches", "splitting") as bar,
+    ):
+        done = app.upgrade.splitter.split(bar)
     print(f"{done} batches were looked at; every batch is split by tracker")
     return 0
 
 
 def prune(parsed: Namespace) -> int:
     """Delete old batches."""
-    from tqdm import tqdm
-
     from service.storage.projections.projector import projected
     from service.storage.store import Store
-    from service.storage.upkeep.prune import Pruned
     from service.storage.upkeep.prune import prune as prune_records
     from service.times import parse_utc
 
     before = parse_utc(parsed.before, "--before")
-    store = Store(settings_of_existing(parsed).database, create=False)
-    try:
-        with (
-            projected(store),
-            tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar,
-        ):
-
-            def step(pruned: Pruned) -> None:
-                bar.total = pruned.total
-                bar.update(pruned.batches - bar.n)
-
-            if not parsed.dry_run:
-                asked = {"before": before.text, "run": parsed.run}
-                store.writer.change(partial(note, action="prune", about="database", asked=asked))
-            pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
-    finally:
-        store.close()
+    with (
+        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        projected(store),
+        progress_bar("batches", "deleting") as bar,
+    ):
+        if not parsed.dry_run:
+            asked = {"before": before.text, "run": parsed.run}
+            store.writer.change(partial(note, action="prune", about="database", asked=asked))
+        pruned = prune_records(
+            store,
+            before,
+            parsed.run,
+            dry_run=parsed.dry_run,
+            step=lambda pruned: bar(pruned.batches, pruned.total),
+        )
     if parsed.dry_run:
         more = _beside(pruned.total_gyro_blocks, pruned.total_graded_days)
         print(f"{pruned.total} batches{more} are before {before.text}; nothing was deleted")
@@ -392,7 +347,7 @@ def _beside(gyro_blocks: int, graded_days: int) -> str:
 
 def add_forget(group: Any) -> None:
     """Declare the command."""
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "forget",
         "Remove what was recorded wrongly: a run, or some of its batches and gyro blocks, with "
@@ -408,7 +363,7 @@ def add_forget(group: Any) -> None:
         forget,
     )
     parser.add_argument("--run", required=True, metavar="NAME", help="the run")
-    parser.add_argument("--spacecraft", metavar="NAME", help=MISSION)
+    parser.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
     parser.add_argument(
         "--batch", nargs="+", default=[], metavar="BATCH", help="only these batches"
     )
@@ -422,14 +377,12 @@ def add_forget(group: Any) -> None:
         help="the archive with batches of the run; default: ACQUIRE_ARCHIVE_FOLDER",
     )
     parser.add_argument("--yes", action="store_true", help="remove without asking")
-    add_json(parser, "the counts")
-    add_database(parser)
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
 
 
 def forget(parsed: Namespace) -> int:
     """Show what is removed, ask, and remove it."""
-    from tqdm import tqdm
-
     from service.storage.store import Store
     from service.storage.upkeep import forget as forgetting
 
@@ -438,27 +391,23 @@ def forget(parsed: Namespace) -> int:
         parsed.run, parsed.spacecraft, tuple(parsed.batch), tuple(parsed.gyro_block)
     )
     folder = parsed.archive or settings.archive_folder
-    store = Store(settings.database, create=False)
-    try:
+    with closing(Store(settings.database, create=False)) as store:
         with store.reading() as connection:
             total = forgetting.found(connection, selected)
         print(_removal_text(total), file=sys.stderr if parsed.json else sys.stdout)
         if not parsed.yes and not _is_confirmed(parsed.run):
             print("nothing was removed", file=sys.stderr)
             return 1
-        with tqdm(total=None, unit=" batches", desc="removing", disable=None, leave=False) as b:
+        with progress_bar("batches", "removing") as bar:
 
             def step(done: int, whole: "Forgotten") -> None:
-                b.total = whole.batches + whole.archived_batches
-                b.update(done - b.n)
+                bar(done, whole.batches + whole.archived_batches)
 
             forgetting.forget(store, selected, folder, note=_note(parsed), step=step)
-    finally:
-        store.close()
     if parsed.json:
         from msgspec import to_builtins
 
-        print_json(to_builtins(total))
+        arguments.print_json(to_builtins(total))
     else:
         print("it was removed")
     return 0

@@ -5,7 +5,7 @@ import math
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from service.cli.arguments import (
     degrees,
     positive,
 )
-from service.cli.configuration import service_url, settings_of
+from service.cli.configuration import http_client, refusal_of, service_url, settings_of
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
 
@@ -216,20 +216,11 @@ def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubm
     if parsed.in_process:
         from service.app.factory import open_app
 
-        app = open_app(settings)
-        try:
+        with closing(open_app(settings)) as app:
             app.service.ready()
             yield _InProcess(app)
-        finally:
-            app.close()
     else:
-        import httpx
-
-        headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
-        # The service may listen to this machine alone, where no proxy reaches it.
-        with httpx.Client(
-            base_url=service_url(parsed), timeout=TIMEOUT_S, trust_env=False, headers=headers
-        ) as client:
+        with http_client(settings, service_url(parsed), TIMEOUT_S) as client:
             yield _OverHttp(client)
 
 
@@ -269,11 +260,11 @@ class _OverHttp:
     def overlay(self, id: str) -> bytes:
         return self._request("GET", f"/api/v1/batches/{id}/overlay")
 
-    def _request(self, method: str, url: str, **arguments: Any) -> bytes:
+    def _request(self, method: str, url: str, **request: Any) -> bytes:
         import httpx
 
         try:
-            response = self._client.request(method, url, **arguments)
+            response = self._client.request(method, url, **request)
         except (httpx.TransportError, httpx.InvalidURL) as error:
             raise Busy(
                 f"no service answers at {self._client.base_url} ({error}); "
@@ -283,8 +274,4 @@ class _OverHttp:
             return bytes(response.content)
         if response.status_code == 401:
             raise Unauthenticated("the service asks for a token: set ACQUIRE_TOKEN")
-        try:
-            detail = str(response.json()["detail"])
-        except (ValueError, KeyError, TypeError):
-            detail = f"HTTP {response.status_code}: {response.text[:200]}"
-        raise FrameRefused(detail)
+        raise FrameRefused(refusal_of(response))

@@ -3,16 +3,10 @@
 import json
 from argparse import Namespace
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_output,
-    add_period,
-    written_to,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of_existing
 from service.products.formats import table_formats, write_table
 from service.products.tables import Table
@@ -20,7 +14,7 @@ from service.products.tables import Table
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
+    parser = arguments.add_command(
         commands,
         "history",
         "Write the quantities of every recorded batch of a spacecraft, one row per batch.",
@@ -30,13 +24,13 @@ def add(commands: Any) -> None:
         """,
         run,
     )
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    add_period(parser, "the run that is read; default live")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
     way.add_argument("--json", action="store_true", help="write one JSON object per line")
-    add_output(parser)
-    add_database(parser)
+    arguments.add_output(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
@@ -45,15 +39,12 @@ def run(parsed: Namespace) -> int:
     from service.app.spacecraft import batch_table
 
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed), reads_only=True)
-    try:
+    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         pages = app.spacecraft.every_batch(parsed.spacecraft, run=parsed.run, start=start, end=end)
         table = batch_table(pages)
-        written_to(
+        arguments.written_to(
             parsed.output, _lines(table) if parsed.json else write_table(parsed.format, table)
         )
-    finally:
-        app.close()
     return 0
 
 

@@ -200,7 +200,7 @@ def _changed(mission: "Mission", table: str, key: str, value: float, option: str
 
 def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") -> str:
     from service.sky.geometry.pairs import MAX_PAIRS
-    from studies.paper_1994.tables import markdown
+    from studies.documents import markdown
 
     header = (
         *("zone", "HMAX", "to mag", "NCAP least", "median", "most", "NTOT least", "median"),

@@ -1,18 +1,11 @@
 """`acquire replay`: send files of batches through the service."""
 
 from argparse import ArgumentParser, Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    add_command,
-    add_database,
-    add_json,
-    add_url_or_in_process,
-    count,
-    print_json,
-    speed,
-)
+from service.cli import arguments
 from service.cli.configuration import service_url, settings_of
 from service.errors import BadFile, BadInput, Fault, shown_value
 
@@ -42,7 +35,7 @@ times of a scan) or a measured attitude."""
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
+    parser = arguments.add_command(
         commands,
         "replay",
         "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) "
@@ -64,7 +57,7 @@ def add(commands: Any) -> None:
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
     _add_packets(parser)
-    add_url_or_in_process(parser)
+    arguments.add_url_or_in_process(parser)
     parser.add_argument(
         "--run", help="the run for every batch; default: the first file's name without its ending"
     )
@@ -77,14 +70,14 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=speed,
+        type=arguments.speed,
         default=None,
         metavar="FACTOR|max",
         help="multiple of real time, by the batch times; default max",
     )
     parser.add_argument(
         "--concurrency",
-        type=count,
+        type=arguments.count,
         metavar="N",
         help="post batch by batch, N at a time; --results (default 4) and --speed also post "
         "batch by batch. Without these options the service receives whole files, which is "
@@ -94,8 +87,8 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--progress", action="store_true", help="show the progress bar even without a terminal"
     )
-    add_json(parser, "the counts")
-    add_database(parser)
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
 
 
 def _add_knowledge(parser: ArgumentParser) -> None:
@@ -168,15 +161,12 @@ def run(parsed: Namespace) -> int:
         from service.app.factory import open_app
         from service.replay.in_process import replay_in_process
 
-        app = open_app(settings_of(parsed))
-        try:
+        with closing(open_app(settings_of(parsed))) as app:
             app.service.ready()
             if parsed.alarms:
                 app.runs.watch(run)
             with ReplaySummary(sized, parsed.results, progress) as summary:
                 replay_in_process(app, items, summary.add, pace, carrier)
-        finally:
-            app.close()
     else:
         from service.replay.over_http import replay_in_bulk, replay_over_http
 
@@ -213,7 +203,7 @@ def run(parsed: Namespace) -> int:
         summary.packets = to_builtins(reader.totals())
     if parsed.json:
         supplied = {source.key: source.supplied for source in sources}
-        print_json({"run": run, **summary.counts(), **supplied})
+        arguments.print_json({"run": run, **summary.counts(), **supplied})
     else:
         print(f"{'run':<20}{run}")
         print(summary.table())

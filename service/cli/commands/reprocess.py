@@ -2,18 +2,11 @@
 
 import sys
 from argparse import Namespace
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import (
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    count,
-    print_json,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
@@ -24,7 +17,7 @@ settings name, and tcp:// only in a network that you trust.  The extra `dask` ha
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
+    parser = arguments.add_command(
         commands,
         "reprocess",
         "Process recorded batches again, on all cores, with the present settings or with a "
@@ -44,7 +37,9 @@ def add(commands: Any) -> None:
         run,
         notes=SCHEDULER,
     )
-    add_period(parser, "the run for the results; default: a name derived from the settings")
+    arguments.add_period(
+        parser, "the run for the results; default: a name derived from the settings"
+    )
     parser.add_argument(
         "--source", metavar="NAME", default="live", help="the run to read; default live"
     )
@@ -58,7 +53,9 @@ def add(commands: Any) -> None:
         help="use this mission file in place of the mission of the same name, and process only "
         "its batches",
     )
-    parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+    parser.add_argument(
+        "--processes", type=arguments.count, metavar="N", help="default: one per core"
+    )
     parser.add_argument(
         "--archive",
         type=Path,
@@ -77,9 +74,9 @@ def add(commands: Any) -> None:
         "the results, one batch after another",
     )
     parser.add_argument("--no-comparison", action="store_true", help="do not compare both runs")
-    add_json(parser, "the comparison")
+    arguments.add_json(parser, "the comparison")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
@@ -112,9 +109,7 @@ def run(parsed: Namespace) -> int:
     settings = settings_of_existing(parsed)
     if parsed.archive is not None:
         settings = dataclasses.replace(settings, archive_folder=parsed.archive)
-    with ExitStack() as held:
-        app = open_app(settings, mission)
-        held.callback(app.close)
+    with closing(open_app(settings, mission)) as app:
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
@@ -151,7 +146,7 @@ def run(parsed: Namespace) -> int:
         counts = {
             name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
         }
-        print_json(counts | ({} if compared is None else msgspec.to_builtins(compared)))
+        arguments.print_json(counts | ({} if compared is None else msgspec.to_builtins(compared)))
     else:
         print(progress_text(progress))
         if compared is not None:

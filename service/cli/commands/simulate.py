@@ -5,16 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from service.cli.arguments import (
-    CAMERA_MISSION,
-    MISSION,
-    STANDARD_OUTPUT,
-    add_command,
-    add_group,
-    add_json_file,
-    count,
-    positive,
-)
+from service.cli import arguments
 from service.cli.configuration import mission_and_catalog
 from service.cli.simulated_rates import add_mission, add_paper
 from service.errors import BadInput, Fault, shown_value
@@ -27,7 +18,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Declare the group with its commands."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "simulate",
         "Simulate telemetry and frames with known truth, and repeat published experiments.",
@@ -41,7 +32,7 @@ def add(commands: Any) -> None:
 
 
 def _add_frames(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "frames",
         "Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds "
@@ -54,8 +45,10 @@ def _add_frames(group: Any) -> None:
         _run_frames,
     )
     parser.add_argument("output", type=Path, metavar="OUTDIR")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=CAMERA_MISSION)
-    parser.add_argument("--frames", required=True, type=count, metavar="N")
+    parser.add_argument(
+        "--spacecraft", required=True, metavar="NAME", help=arguments.CAMERA_MISSION
+    )
+    parser.add_argument("--frames", required=True, type=arguments.count, metavar="N")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--tracker", metavar="NAME", help="default: the first tracker with a camera"
@@ -139,13 +132,13 @@ def _run_frames(parsed: Namespace) -> int:
     )
     drawn = draw_frames(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
     bar = tqdm(drawn, total=wanted.frames, unit="frame", disable=None)
-    count = write_frames(bar, parsed.output, parsed.format)
-    print(f"{parsed.output}: {count} frames of {mission.name}; truth: {parsed.output / TRUTH}")
+    written = write_frames(bar, parsed.output, parsed.format)
+    print(f"{parsed.output}: {written} frames of {mission.name}; truth: {parsed.output / TRUTH}")
     return 0
 
 
 def _add_imaging(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "imaging",
         "Compare every claim of the star image detection report with a measurement: crosses of "
@@ -162,7 +155,7 @@ def _add_imaging(group: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
-    add_json_file(parser, "the claims with their figures")
+    arguments.add_json_file(parser, "the claims with their figures")
     parser.add_argument(
         "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
     )
@@ -178,7 +171,7 @@ def _run_imaging(parsed: Namespace) -> int:
     """Hold the star image detection report beside what is measured; 1 where a claim is off."""
     from studies.star_image_report.command import as_json, run_imaging
 
-    prints_json = parsed.json == STANDARD_OUTPUT
+    prints_json = parsed.json == arguments.STANDARD_OUTPUT
     rows = run_imaging(
         parsed.row,
         parsed.seed,
@@ -203,7 +196,7 @@ _SERIOUS_SHARE = 0.1
 
 
 def _add_telemetry(group: Any) -> None:
-    parser = add_command(
+    parser = arguments.add_command(
         group,
         "telemetry",
         "Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the "
@@ -218,8 +211,8 @@ def _add_telemetry(group: Any) -> None:
         _run_telemetry,
     )
     parser.add_argument("output", type=Path, metavar="OUT.ndjson")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    parser.add_argument("--batches", required=True, type=count, metavar="N")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    parser.add_argument("--batches", required=True, type=arguments.count, metavar="N")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--start",
@@ -231,7 +224,7 @@ def _add_telemetry(group: Any) -> None:
     )
     parser.add_argument(
         "--stars",
-        type=count,
+        type=arguments.count,
         default=5,
         metavar="N",
         help="maximum number of stars per tracker; default 5",
@@ -274,7 +267,7 @@ def _add_telemetry(group: Any) -> None:
     ):
         name = f"--{flag}-share"
         serious.add_argument(name, type=float, metavar="SHARE", help=f"{text}; default {share}")
-        kind: Any = count if unit == "N" else float
+        kind: Any = arguments.count if unit == "N" else float
         name = f"--{flag}-{'stars' if unit == 'N' else unit.lower()}"
         serious.add_argument(name, type=kind, metavar=unit, help=f"default {size}")
 
@@ -285,7 +278,7 @@ def _add_gyro(parser: Any) -> None:
     )
     gyro.add_argument(
         "--gyro",
-        type=positive,
+        type=arguments.positive,
         metavar="S",
         help="seconds between samples; the noise is that of the mission's table [gyro]",
     )
@@ -315,8 +308,10 @@ def _run_telemetry(parsed: Namespace) -> int:
     if gyro is not None:
         duration_s = (wanted.batches - 1) * wanted.cadence_of(mission)
         drawn = with_gyro(drawn, mission, gyro, duration_s, wanted.seed)
-    count = write_pass(drawn, parsed.output)
-    print(f"{parsed.output}: {count} batches of {mission.name}; truth: {truth_path(parsed.output)}")
+    written = write_pass(drawn, parsed.output)
+    print(
+        f"{parsed.output}: {written} batches of {mission.name}; truth: {truth_path(parsed.output)}"
+    )
     return 0
 
 

@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from service.cli.arguments import SERVICE, add_command, add_database, add_group, add_json, count
-from service.cli.configuration import service_url, settings_of, settings_of_existing
+from service.cli.configuration import service_url, settings_of_existing
 
 
 def add(commands: Any) -> None:
@@ -93,28 +93,23 @@ def add_service(parser: ArgumentParser) -> None:
 
 def create(parsed: Namespace) -> int:
     """Make a token and print it."""
-    from service.cli import tokens
+    from service.cli.tokens import create_token
 
-    return tokens.create(
-        settings_of(parsed),
-        service_url(parsed),
-        parsed.name,
-        parsed.scope,
-        parsed.spacecraft,
-        parsed.days,
-        parsed.rate,
-    )
+    return create_token(parsed)
 
 
 def show(parsed: Namespace) -> int:
     """Print every token."""
-    from service.cli import tokens
+    from service.cli.tokens import print_tokens
 
-    return tokens.show(settings_of_existing(parsed), as_json=parsed.json)
+    return print_tokens(settings_of_existing(parsed), parsed.json)
 
 
 def revoke(parsed: Namespace) -> int:
     """End a token."""
-    from service.cli import tokens
+    from service.cli.tokens import opened_tokens
 
-    return tokens.revoke(settings_of_existing(parsed), service_url(parsed), parsed.name)
+    with opened_tokens(settings_of_existing(parsed), service_url(parsed)) as tokens:
+        tokens.revoke(parsed.name)
+    print(f"{parsed.name} is revoked; a running service heeds that within a second")
+    return 0

@@ -1,6 +1,7 @@
 """`acquire tracks`: moving points, planets and hot pixels among the unmatched stars of a record."""
 
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -45,8 +46,7 @@ def run(parsed: Namespace) -> int:
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed), reads_only=True)
-    try:
+    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
             written_to(parsed.output, app.tracks.tdm(found))
@@ -54,6 +54,4 @@ def run(parsed: Namespace) -> int:
             print_json(found)
         else:
             print(tracks_text(found))
-    finally:
-        app.close()
     return 0
