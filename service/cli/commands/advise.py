@@ -10,20 +10,7 @@ from service.cli.configuration import period_of, progress_bar, settings_of_exist
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "advise",
-        "Recommend settings of a mission from recorded batches: the size of its zone, tolerances "
-        "that are too tight or too wide, the trackers' noise, magnitudes and alignment, the "
-        "outcomes with other settings, and the lines to change in the mission file.  Changes "
-        "nothing.",
-        """
-        acquire advise --spacecraft XTE
-        acquire advise --spacecraft XTE --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
-        acquire advise --spacecraft SOHO --run pass-7 --sample 2000 --try separation_deg=0.01
-        """,
-        run,
-    )
+    parser = arguments.add_command(commands, "advise", run)
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run to examine; default live")
     parser.add_argument(
@@ -47,7 +34,14 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Print what recorded batches say of a mission's settings."""
+    """Recommend settings of a mission from recorded batches: the size of its zone, tolerances that
+    are too tight or too wide, the trackers' noise, magnitudes and alignment, the outcomes with
+    other settings, and the lines to change in the mission file.  Changes nothing.
+
+    acquire advise --spacecraft XTE
+    acquire advise --spacecraft XTE --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
+    acquire advise --spacecraft SOHO --run pass-7 --sample 2000 --try separation_deg=0.01
+    """
     import msgspec
 
     from service.app.factory import open_app

@@ -19,51 +19,17 @@ FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "archive",
-        "Move the batches before a time to an archive: a folder of Parquet files.  Each file is "
-        "compared with the record before its batches are deleted.  Trends, and the recognition of "
-        "repeats, stay in the database; gyro blocks stay too.  After an interruption, run the "
-        "same command again to continue.  With SQLite, stop the service first.",
-        """
-        acquire archive --before 1996-01-01T00:00:00Z --to /archive
-        acquire archive verify --archive /archive
-        acquire archive restore --archive /archive --spacecraft XTE --start 1996-010T00:00:00Z
-        """,
-        archive,
-    )
+    parser = arguments.add_command(commands, "archive", archive)
     parser.add_argument("--before", metavar="UTC", help="archive batches before this batch time")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help=FOLDER)
     arguments.add_json(parser, "the counts")
     arguments.add_database(parser)
     group = arguments.add_subcommands(parser)
-    verified = arguments.add_command(
-        group,
-        "verify",
-        "Read every file of an archive and report faults; exit code 1 if there is one.  With "
-        "--database, also report files that the database needs and the archive lacks.",
-        """
-        acquire archive verify --archive /archive
-        acquire archive verify --archive /archive --database sqlite:///acquire.db
-        """,
-        verify,
-    )
+    verified = arguments.add_command(group, "verify", verify)
     verified.add_argument("--archive", dest="folder", type=Path, metavar="FOLDER", help=FOLDER)
     arguments.add_json(verified, "the faults")
     arguments.add_database(verified)
-    restored = arguments.add_command(
-        group,
-        "restore",
-        "Record archived batches again, also in another database, byte for byte.  Files that have "
-        "a batch of the period are restored whole; they stay in the archive.  With SQLite, stop "
-        "the service first.",
-        """
-        acquire archive restore --archive /archive --spacecraft XTE
-        acquire archive restore --archive /archive --database sqlite:///again.db
-        """,
-        restore,
-    )
+    restored = arguments.add_command(group, "restore", restore)
     restored.add_argument("--archive", dest="folder", type=Path, metavar="FOLDER", help=FOLDER)
     restored.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
     arguments.add_period(restored, "only this run; default: all runs")
@@ -72,7 +38,15 @@ def add(commands: Any) -> None:
 
 
 def archive(parsed: Namespace) -> int:
-    """Move old batches to the archive."""
+    """Move the batches before a time to an archive: a folder of Parquet files.  Each file is
+    compared with the record before its batches are deleted.  Trends, and the recognition of
+    repeats, stay in the database; gyro blocks stay too.  After an interruption, run the same
+    command again to continue.  With SQLite, stop the service first.
+
+    acquire archive --before 1996-01-01T00:00:00Z --to /archive
+    acquire archive verify --archive /archive
+    acquire archive restore --archive /archive --spacecraft XTE --start 1996-010T00:00:00Z
+    """
     from service.extras import require_extra
     from service.storage.store import Store
     from service.times import parse_utc, utc_now
@@ -102,7 +76,12 @@ def archive(parsed: Namespace) -> int:
 
 
 def verify(parsed: Namespace) -> int:
-    """Tell what is wrong with an archive."""
+    """Read every file of an archive and report faults; exit code 1 if there is one.  With
+    --database, also report files that the database needs and the archive lacks.
+
+    acquire archive verify --archive /archive
+    acquire archive verify --archive /archive --database sqlite:///acquire.db
+    """
     from service.extras import require_extra
 
     folder = _folder(parsed.folder, "--archive")
@@ -123,7 +102,13 @@ def verify(parsed: Namespace) -> int:
 
 
 def restore(parsed: Namespace) -> int:
-    """Record archived batches again."""
+    """Record archived batches again, also in another database, byte for byte.  Files that have a
+    batch of the period are restored whole; they stay in the archive.  With SQLite, stop the
+    service first.
+
+    acquire archive restore --archive /archive --spacecraft XTE
+    acquire archive restore --archive /archive --database sqlite:///again.db
+    """
     from service.extras import require_extra
     from service.storage.store import Store
 

@@ -23,22 +23,7 @@ RECORDED_BY = "acquire calibrate"
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "calibrate",
-        "Estimate, from the identified stars of recorded batches, the alignment between trackers, "
-        "and each tracker's scale, distortion, magnitudes and time tags, with sigmas.  Name the "
-        "unknowns that these stars cannot determine.  Write a mission file with the result, or "
-        "record it for the console, where an operator can adopt it.  Change nothing that is in "
-        "use.",
-        """
-        acquire calibrate TWOHEADS
-        acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
-        acquire calibrate TWOHEADS --record
-        acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
-        """,
-        run,
-    )
+    parser = arguments.add_command(commands, "calibrate", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
     arguments.add_period(parser, "the run to use; default live")
     parser.add_argument(
@@ -85,7 +70,16 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Estimate, print, and write the mission file if asked to."""
+    """Estimate, from the identified stars of recorded batches, the alignment between trackers, and
+    each tracker's scale, distortion, magnitudes and time tags, with sigmas.  Name the unknowns
+    that these stars cannot determine.  Write a mission file with the result, or record it for
+    the console, where an operator can adopt it.  Change nothing that is in use.
+
+    acquire calibrate TWOHEADS
+    acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
+    acquire calibrate TWOHEADS --record
+    acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
+    """
     from service.app.calibration_estimates import CalibrationRequest
     from service.app.factory import open_app
     from service.cli.texts import calibration_json, calibration_text
@@ -123,7 +117,6 @@ def run(parsed: Namespace) -> int:
 
 
 def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
-    """Write the spacecraft's mission file, changed by the calibration, to another file."""
     from service.calibration.mission_file import calibrated_mission_text
 
     source = _mission_file(parsed)

@@ -35,147 +35,62 @@ def add(commands: Any) -> None:
         acquire database verify
         """,
     )
-    parser = arguments.add_command(
-        group,
-        "upgrade",
-        "Create missing tables and migrate the schema to this version; all data are kept.",
-        "acquire database upgrade",
-        upgrade,
-    )
+    parser = arguments.add_command(group, "upgrade", upgrade)
     arguments.add_database(parser)
-    parser = arguments.add_command(
-        group,
-        "check",
-        "Compare the schema with the code; exit code 1 if they differ.",
-        """
-        acquire database check
-        acquire database check --fresh
-        """,
-        check,
-    )
+    parser = arguments.add_command(group, "check", check)
     parser.add_argument(
         "--fresh", action="store_true", help="check the migrations on an empty database"
     )
     arguments.add_json(parser, "the differences")
     arguments.add_database(parser)
-    parser = arguments.add_command(
-        group,
-        "backup",
-        "Copy the whole database as it is now, also while the service is running: SQLite to a "
-        "database file, PostgreSQL to a file for pg_restore.",
-        """
-        acquire database backup night.db
-        acquire database backup night.dump --database postgresql://user@host/attitudes
-        """,
-        backup,
-    )
+    parser = arguments.add_command(group, "backup", backup)
     parser.add_argument("output", type=Path, metavar="FILE", help="must not exist yet")
     arguments.add_database(parser)
-    parser = arguments.add_command(
-        group,
-        "restore",
-        "Make a database from a backup: an SQLite file that does not exist yet, or an empty "
-        "PostgreSQL database.  It appears whole or not at all, with the schema of the backup.",
-        """
-        acquire database restore night.db --database sqlite:///acquire.db
-        acquire database restore night.dump --database postgresql://user@host/attitudes
-        """,
-        restore,
-    )
+    parser = arguments.add_command(group, "restore", restore)
     parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
     arguments.add_database(parser)
-    _add_verify(group)
-    _add_copy(group)
-    _add_rebuild(group)
-    _add_split_trackers(group)
-    _add_prune(group)
-    add_forget(group)
-
-
-def _add_verify(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "verify",
-        "Read everything and report faults: the file, the schema, every batch with its results, "
-        "the trends, the gyro blocks, the filtered and smoothed attitudes.  Exit code 1 if there "
-        "is a fault.  Changes nothing.",
-        """
-        acquire database verify
-        acquire database verify --database sqlite:///night.db
-        """,
-        verify,
-    )
+    parser = arguments.add_command(group, "verify", verify)
     arguments.add_json(parser, "the faults")
     arguments.add_database(parser)
-
-
-def _add_copy(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "copy",
-        "Copy the whole record to another database, SQLite to PostgreSQL or back, compare every "
-        "row of the two, and verify the copy.  Stop the services on both first.  FROM stays as it "
-        "is; TO must be empty, and an SQLite file is made if it is missing.  You can stop the "
-        "command at any time: it continues when you start it again.",
-        """
-        acquire database copy sqlite:///acquire.db postgresql://user@host/attitudes
-        acquire database copy postgresql://user@host/attitudes sqlite:///acquire.db
-        """,
-        copy,
-    )
+    parser = arguments.add_command(group, "copy", copy)
     parser.add_argument("source", metavar="FROM", help="URL of the database to copy")
     parser.add_argument("target", metavar="TO", help="URL of the empty database")
-
-
-def _add_rebuild(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "rebuild",
-        "Count the trends anew from the recorded batches.  They are kept up by themselves: this is "
-        "for a database whose `verify` reports wrong trends.  Alarms and events stay: they hold "
-        "what people did, and the limits of their time.  On SQLite no service may be running.",
-        "acquire database rebuild",
-        rebuild,
-    )
+    parser = arguments.add_command(group, "rebuild", rebuild)
     arguments.add_database(parser)
-
-
-def _add_split_trackers(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "split-trackers",
-        "Split the batches of earlier versions by tracker, for trends of each tracker of a "
-        "spacecraft with several.  The service does the same by itself, more slowly.  You can "
-        "stop the command at any time; it continues when you start it again.",
-        "acquire database split-trackers",
-        split_trackers,
-    )
+    parser = arguments.add_command(group, "split-trackers", split_trackers)
     arguments.add_database(parser)
-
-
-def _add_prune(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "prune",
-        "Delete the batches before a time, with their results and their part in the trends, and "
-        "the gyro blocks and days of filtered attitudes that end before it.  On SQLite no service "
-        "may be running.  This cannot be undone: make a backup first.",
-        """
-        acquire database prune --before 1996-01-01T00:00:00Z --dry-run
-        acquire database prune --before 1996-001T00:00:00Z --run pass-7
-        """,
-        prune,
-    )
+    parser = arguments.add_command(group, "prune", prune)
     parser.add_argument(
         "--before", required=True, metavar="UTC", help="delete batches before this batch time"
     )
     parser.add_argument("--run", metavar="NAME", help="only this run; default: all runs")
     parser.add_argument("--dry-run", action="store_true", help="only print the number of batches")
     arguments.add_database(parser)
+    parser = arguments.add_command(group, "forget", forget)
+    parser.add_argument("--run", required=True, metavar="NAME", help="the run")
+    parser.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
+    parser.add_argument(
+        "--batch", nargs="+", default=[], metavar="BATCH", help="only these batches"
+    )
+    parser.add_argument(
+        "--gyro-block", nargs="+", default=[], metavar="BLOCK", help="only these gyro blocks"
+    )
+    parser.add_argument(
+        "--archive",
+        type=Path,
+        metavar="FOLDER",
+        help="the archive with batches of the run; default: ACQUIRE_ARCHIVE_FOLDER",
+    )
+    parser.add_argument("--yes", action="store_true", help="remove without asking")
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
 
 
 def upgrade(parsed: Namespace) -> int:
-    """Bring the schema up to date."""
+    """Create missing tables and migrate the schema to this version; all data are kept.
+
+    acquire database upgrade
+    """
     from service.storage.sql.migrations import upgrade as upgrade_schema
 
     upgrade_schema(settings_of(parsed).database)
@@ -184,7 +99,11 @@ def upgrade(parsed: Namespace) -> int:
 
 
 def check(parsed: Namespace) -> int:
-    """Tell how the schema differs from the code."""
+    """Compare the schema with the code; exit code 1 if they differ.
+
+    acquire database check
+    acquire database check --fresh
+    """
     from service.storage.sql.migrations import check as check_schema
     from service.storage.sql.migrations import check_fresh
 
@@ -200,7 +119,12 @@ def check(parsed: Namespace) -> int:
 
 
 def backup(parsed: Namespace) -> int:
-    """Copy the database."""
+    """Copy the whole database as it is now, also while the service is running: SQLite to a database
+    file, PostgreSQL to a file for pg_restore.
+
+    acquire database backup night.db
+    acquire database backup night.dump --database postgresql://user@host/attitudes
+    """
     from service.storage.upkeep.backup import back_up
 
     with progress_bar("pages", "copying") as bar:
@@ -211,7 +135,12 @@ def backup(parsed: Namespace) -> int:
 
 
 def restore(parsed: Namespace) -> int:
-    """Make a database from a backup."""
+    """Make a database from a backup: an SQLite file that does not exist yet, or an empty PostgreSQL
+    database.  It appears whole or not at all, with the schema of the backup.
+
+    acquire database restore night.db --database sqlite:///acquire.db
+    acquire database restore night.dump --database postgresql://user@host/attitudes
+    """
     from service.storage.sql.migrations import HEAD
     from service.storage.upkeep.backup import restore as restore_backup
 
@@ -227,7 +156,13 @@ def restore(parsed: Namespace) -> int:
 
 
 def verify(parsed: Namespace) -> int:
-    """Tell what is wrong with the database."""
+    """Read everything and report faults: the file, the schema, every batch with its results, the
+    trends, the gyro blocks, the filtered and smoothed attitudes.  Exit code 1 if there is a
+    fault.  Changes nothing.
+
+    acquire database verify
+    acquire database verify --database sqlite:///night.db
+    """
     from service.storage.upkeep.verify import earlier_results
     from service.storage.upkeep.verify import verify as verify_records
 
@@ -257,7 +192,14 @@ def _print_problems(problems: Sequence[str]) -> None:
 
 
 def copy(parsed: Namespace) -> int:
-    """Copy the record to another database."""
+    """Copy the whole record to another database, SQLite to PostgreSQL or back, compare every row of
+    the two, and verify the copy.  Stop the services on both first.  FROM stays as it is; TO must
+    be empty, and an SQLite file is made if it is missing.  You can stop the command at any time:
+    it continues when you start it again.
+
+    acquire database copy sqlite:///acquire.db postgresql://user@host/attitudes
+    acquire database copy postgresql://user@host/attitudes sqlite:///acquire.db
+    """
     from tqdm import tqdm
 
     from service.storage.upkeep.copy import copy_record
@@ -279,7 +221,12 @@ def copy(parsed: Namespace) -> int:
 
 
 def rebuild(parsed: Namespace) -> int:
-    """Count the trends anew."""
+    """Count the trends anew from the recorded batches.  They are kept up by themselves: this is for
+    a database whose `verify` reports wrong trends.  Alarms and events stay: they hold what
+    people did, and the limits of their time.  On SQLite no service may be running.
+
+    acquire database rebuild
+    """
     from service.storage.projections.projector import projected, rebuild_trends
     from service.storage.store import Store
 
@@ -294,7 +241,12 @@ def rebuild(parsed: Namespace) -> int:
 
 
 def split_trackers(parsed: Namespace) -> int:
-    """Split older batches by tracker."""
+    """Split the batches of earlier versions by tracker, for trends of each tracker of a spacecraft
+    with several.  The service does the same by itself, more slowly.  You can stop the command at
+    any time; it continues when you start it again.
+
+    acquire database split-trackers
+    """
     from service.app.factory import open_app
 
     with (
@@ -307,7 +259,13 @@ def split_trackers(parsed: Namespace) -> int:
 
 
 def prune(parsed: Namespace) -> int:
-    """Delete old batches."""
+    """Delete the batches before a time, with their results and their part in the trends, and the
+    gyro blocks and days of filtered attitudes that end before it.  On SQLite no service may be
+    running.  This cannot be undone: make a backup first.
+
+    acquire database prune --before 1996-01-01T00:00:00Z --dry-run
+    acquire database prune --before 1996-001T00:00:00Z --run pass-7
+    """
     from service.storage.projections.projector import projected
     from service.storage.store import Store
     from service.storage.upkeep.prune import prune as prune_records
@@ -345,44 +303,17 @@ def _beside(gyro_blocks: int, graded_days: int) -> str:
     return "".join(f" and {each}" for each in counts)
 
 
-def add_forget(group: Any) -> None:
-    """Declare the command."""
-    parser = arguments.add_command(
-        group,
-        "forget",
-        "Remove what was recorded wrongly: a run, or some of its batches and gyro blocks, with "
-        "their results, their part in the trends, the filtered attitudes that were computed with "
-        "them, and what is archived of them.  Afterwards the right file can be replayed.  The "
-        "command shows what it will remove and asks; the audit list says who did it.  This cannot "
-        "be undone: make a backup first.  With SQLite, stop the service first, or use its API.",
-        """
-        acquire database forget --run pass-7
-        acquire database forget --run live --spacecraft XTE --batch 1996-010-0001 1996-010-0002
-        acquire database forget --run pass-7 --gyro-block g1 --yes
-        """,
-        forget,
-    )
-    parser.add_argument("--run", required=True, metavar="NAME", help="the run")
-    parser.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
-    parser.add_argument(
-        "--batch", nargs="+", default=[], metavar="BATCH", help="only these batches"
-    )
-    parser.add_argument(
-        "--gyro-block", nargs="+", default=[], metavar="BLOCK", help="only these gyro blocks"
-    )
-    parser.add_argument(
-        "--archive",
-        type=Path,
-        metavar="FOLDER",
-        help="the archive with batches of the run; default: ACQUIRE_ARCHIVE_FOLDER",
-    )
-    parser.add_argument("--yes", action="store_true", help="remove without asking")
-    arguments.add_json(parser, "the counts")
-    arguments.add_database(parser)
-
-
 def forget(parsed: Namespace) -> int:
-    """Show what is removed, ask, and remove it."""
+    """Remove what was recorded wrongly: a run, or some of its batches and gyro blocks, with their
+    results, their part in the trends, the filtered attitudes that were computed with them, and
+    what is archived of them.  Afterwards the right file can be replayed.  The command shows what
+    it will remove and asks; the audit list says who did it.  This cannot be undone: make a
+    backup first.  With SQLite, stop the service first, or use its API.
+
+    acquire database forget --run pass-7
+    acquire database forget --run live --spacecraft XTE --batch 1996-010-0001 1996-010-0002
+    acquire database forget --run pass-7 --gyro-block g1 --yes
+    """
     from service.storage.store import Store
     from service.storage.upkeep import forget as forgetting
 
@@ -433,7 +364,6 @@ def _is_confirmed(run: str) -> bool:
 
 
 def _note(parsed: Namespace) -> Any:
-    """A function that adds the entry of the audit list."""
     asked = {
         "spacecraft": parsed.spacecraft,
         "batches": parsed.batch,

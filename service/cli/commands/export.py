@@ -33,17 +33,7 @@ def add(commands: Any) -> None:
 
 
 def _add_attitude(commands: Any) -> None:
-    parser = arguments.add_command(
-        commands,
-        "attitude",
-        "Write the attitudes of a spacecraft in any of the formats.",
-        """
-        acquire export attitude --spacecraft XTE --format aem --output xte.aem
-        acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
-        acquire export attitude --spacecraft XTE --grade smoothed --format acm --output xte.acm
-        """,
-        _write_attitude,
-    )
+    parser = arguments.add_command(commands, "attitude", _write_attitude)
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")
@@ -85,7 +75,12 @@ def _add_largest_gap(parser: ArgumentParser) -> None:
 
 
 def _write_attitude(parsed: Namespace) -> int:
-    """Write the attitudes, as they are read."""
+    """Write the attitudes of a spacecraft in any of the formats.
+
+    acquire export attitude --spacecraft XTE --format aem --output xte.aem
+    acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+    acquire export attitude --spacecraft XTE --grade smoothed --format acm --output xte.acm
+    """
     from service.app.products import open_products
 
     start, end = period_of(parsed)
@@ -115,17 +110,7 @@ def _write_attitude(parsed: Namespace) -> int:
 
 
 def _add_attitude_at(commands: Any) -> None:
-    parser = arguments.add_command(
-        commands,
-        "attitude-at",
-        "Print the attitude of a spacecraft at a given time as JSON, with its covariance.",
-        """
-        acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
-        acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
-        acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --grade smoothed
-        """,
-        _print_attitude_at,
-    )
+    parser = arguments.add_command(commands, "attitude-at", _print_attitude_at)
     parser.add_argument("time", metavar="UTC", help="the time")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     parser.add_argument("--run", metavar="NAME", help="the run that is read; default live")
@@ -142,7 +127,12 @@ def _add_attitude_at(commands: Any) -> None:
 
 
 def _print_attitude_at(parsed: Namespace) -> int:
-    """Print the attitude."""
+    """Print the attitude of a spacecraft at a given time as JSON, with its covariance.
+
+    acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
+    acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
+    acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --grade smoothed
+    """
     from service.app.products import open_products
     from service.times import parse_utc
 
@@ -166,12 +156,13 @@ def _add_table(commands: Any, kind: str, summary: str) -> None:
     parser = arguments.add_command(
         commands,
         kind,
-        f"{summary} Oldest first; units and descriptions are in the metadata of Parquet files.",
-        f"""
+        _write_table,
+        summary=f"{summary} Oldest first; units and descriptions are in the metadata of Parquet "
+        "files.",
+        examples=f"""
         acquire export {kind} --spacecraft XTE --format parquet --output {kind}.parquet
         acquire export {kind} --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
         """,
-        _write_table,
     )
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")

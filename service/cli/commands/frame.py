@@ -29,23 +29,7 @@ FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "frame",
-        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy), "
-        "identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that "
-        "is sent again returns the first answer.  Without a spacecraft a picture may be from any "
-        "camera: its lens is fitted with the attitude, and nothing is recorded.",
-        """
-        acquire frame holiday.jpg                    any camera, any lens
-        acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
-        acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
-        acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
-        acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
-        """,
-        run,
-        SIDECAR,
-    )
+    parser = add_command(commands, "frame", run, notes=SIDECAR)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument("--spacecraft", metavar="NAME", help=f"{CAMERA_MISSION}; none: any camera")
     _add_lens(parser)
@@ -105,7 +89,17 @@ def _add_lens(parser: ArgumentParser) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Send every file and print its result; 1 where one was refused."""
+    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy),
+    identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
+    sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
+    its lens is fitted with the attitude, and nothing is recorded.
+
+    acquire frame holiday.jpg                    any camera, any lens
+    acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
+    acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
+    acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
+    acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
+    """
     if parsed.spacecraft is None:
         from service.cli.pictures import solve_pictures
 

@@ -14,16 +14,7 @@ from service.products.tables import Table
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "history",
-        "Write the quantities of every recorded batch of a spacecraft, one row per batch.",
-        """
-        acquire history --spacecraft XTE --format csv
-        acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
-        """,
-        run,
-    )
+    parser = arguments.add_command(commands, "history", run)
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
@@ -34,7 +25,11 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Write the table, page by page."""
+    """Write the quantities of every recorded batch of a spacecraft, one row per batch.
+
+    acquire history --spacecraft XTE --format csv
+    acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+    """
     from service.app.factory import open_app
     from service.app.spacecraft import batch_table
 
@@ -49,7 +44,6 @@ def run(parsed: Namespace) -> int:
 
 
 def _lines(table: Table) -> Iterator[bytes]:
-    """Every row as a JSON object."""
     for page in table.pages:
         for row in zip(*page, strict=True):
             yield f"{json.dumps(dict(zip(table.names, row, strict=True)))}\n".encode()

@@ -35,24 +35,7 @@ times of a scan) or a measured attitude."""
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "replay",
-        "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) "
-        "to the service.  You can send a file twice: nothing is recorded twice.",
-        """
-        acquire replay pass.ndjson
-        acquire replay pass.csv --in-process --run trial --results answers.ndjson
-        acquire replay pass.ndjson --alarms            and raise alarms for the run
-        acquire replay pass.ndjson --speed 60          one minute of telemetry per second
-        acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
-        acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
-        acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
-        acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
-        """,
-        run,
-        CSV_HELP,
-    )
+    parser = arguments.add_command(commands, "replay", run, notes=CSV_HELP)
     parser.add_argument(
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
@@ -92,7 +75,6 @@ def add(commands: Any) -> None:
 
 
 def _add_knowledge(parser: ArgumentParser) -> None:
-    """Declare the arguments that add something to each batch."""
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--a-priori",
@@ -117,7 +99,6 @@ def _add_knowledge(parser: ArgumentParser) -> None:
 
 
 def _add_packets(parser: ArgumentParser) -> None:
-    """Declare the arguments of space packets."""
     parser.add_argument(
         "--packets",
         nargs="+",
@@ -138,7 +119,18 @@ def _add_packets(parser: ArgumentParser) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Send files through the service and print what became of them."""
+    """Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) to
+    the service.  You can send a file twice: nothing is recorded twice.
+
+    acquire replay pass.ndjson
+    acquire replay pass.csv --in-process --run trial --results answers.ndjson
+    acquire replay pass.ndjson --alarms            and raise alarms for the run
+    acquire replay pass.ndjson --speed 60          one minute of telemetry per second
+    acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
+    acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
+    acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
+    acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
+    """
     from msgspec import to_builtins
 
     from service.replay.from_file import AttitudeCarrier
@@ -213,7 +205,6 @@ def run(parsed: Namespace) -> int:
 
 
 def _sources(parsed: Namespace) -> list["FromFile"]:
-    """The files that add something to each batch."""
     from service.products.reading.files import read_attitudes, read_ephemeris
     from service.replay.from_file import FileEphemeris, FilePrior
 

@@ -17,26 +17,7 @@ settings name, and tcp:// only in a network that you trust.  The extra `dask` ha
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "reprocess",
-        "Process recorded batches again, on all cores, with the present settings or with a "
-        "mission file, and record the results in a separate run; then compare both runs.  With "
-        "--archive, process archived batches too, and write the results to the archive: one file "
-        "for each file of the archive and for each day of batches in the database.  After an "
-        "interruption, run the same command again to continue.  With SQLite, stop the service "
-        "first.",
-        """
-        acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
-        acquire reprocess --mission wider.toml --run wider
-        acquire reprocess --spacecraft XTE --run xte-tracked --track
-        acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
-        acquire reprocess --mission wider.toml --run wider --archive /archive
-        acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
-        """,
-        run,
-        notes=SCHEDULER,
-    )
+    parser = arguments.add_command(commands, "reprocess", run, notes=SCHEDULER)
     arguments.add_period(
         parser, "the run for the results; default: a name derived from the settings"
     )
@@ -80,7 +61,19 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Run recorded batches again into another run, and print how both compare."""
+    """Process recorded batches again, on all cores, with the present settings or with a mission
+    file, and record the results in a separate run; then compare both runs.  With --archive,
+    process archived batches too, and write the results to the archive: one file for each file of
+    the archive and for each day of batches in the database.  After an interruption, run the same
+    command again to continue.  With SQLite, stop the service first.
+
+    acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
+    acquire reprocess --mission wider.toml --run wider
+    acquire reprocess --spacecraft XTE --run xte-tracked --track
+    acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
+    acquire reprocess --mission wider.toml --run wider --archive /archive
+    acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
+    """
     import dataclasses
 
     import msgspec

@@ -17,14 +17,8 @@ def add(commands: Any) -> None:
     parser = arguments.add_command(
         commands,
         "score",
-        "Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints "
-        "the errors about each body axis, and whether the covariances fit them.",
-        """
-        acquire score truth.aem --spacecraft XTE --run pass-7
-        acquire score truth.bc --spacecraft XTE --plot errors.svg --json
-        """,
         run,
-        "Between two records of the truth the body is taken to turn at a constant rate. "
+        notes="Between two records of the truth the body is taken to turn at a constant rate. "
         "Attitudes\noutside its segments are counted and left out.",
     )
     parser.add_argument("truth", type=Path, metavar="FILE", help="the true attitudes")
@@ -39,7 +33,12 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Score the attitudes and print the statistics."""
+    """Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints the
+    errors about each body axis, and whether the covariances fit them.
+
+    acquire score truth.aem --spacecraft XTE --run pass-7
+    acquire score truth.bc --spacecraft XTE --plot errors.svg --json
+    """
     from service.app.factory import open_app
     from service.cli.arguments import written_to
     from service.cli.charts import errors_picture
@@ -68,7 +67,6 @@ def run(parsed: Namespace) -> int:
 
 
 def _table(found: dict[str, Any]) -> str:
-    """The statistics for people."""
     names = ("mean", "std", "rms", "predicted_rms", "median", "p95", "p99", "max")
     rows = {**{f"about {axis}": each for axis, each in found["axes"].items()}}
     rows["total"] = found["total"]

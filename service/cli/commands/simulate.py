@@ -32,18 +32,7 @@ def add(commands: Any) -> None:
 
 
 def _add_frames(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "frames",
-        "Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds "
-        "the known data of FILE.fits; truth.ndjson holds the truth of all frames.",
-        """
-        acquire simulate frames --spacecraft IMAGER --frames 10 --seed 3 frames/
-        acquire simulate frames --spacecraft IMAGER --frames 5 --psf cross --lost frames/
-        acquire simulate frames --spacecraft IMAGER --frames 5 --rates 0.5 --cosmic-rays 50 frames/
-        """,
-        _run_frames,
-    )
+    parser = arguments.add_command(group, "frames", _run_frames)
     parser.add_argument("output", type=Path, metavar="OUTDIR")
     parser.add_argument(
         "--spacecraft", required=True, metavar="NAME", help=arguments.CAMERA_MISSION
@@ -103,7 +92,13 @@ def _add_frames(group: Any) -> None:
 
 
 def _run_frames(parsed: Namespace) -> int:
-    """Draw frames into a folder, with a progress bar."""
+    """Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds the known
+    data of FILE.fits; truth.ndjson holds the truth of all frames.
+
+    acquire simulate frames --spacecraft IMAGER --frames 10 --seed 3 frames/
+    acquire simulate frames --spacecraft IMAGER --frames 5 --psf cross --lost frames/
+    acquire simulate frames --spacecraft IMAGER --frames 5 --rates 0.5 --cosmic-rays 50 frames/
+    """
     from tqdm import tqdm
 
     from service.simulate.frames import (
@@ -138,18 +133,7 @@ def _run_frames(parsed: Namespace) -> int:
 
 
 def _add_imaging(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "imaging",
-        "Compare every claim of the star image detection report with a measurement: crosses of "
-        "wire meshes, correlation, estimation, scans and their noise, pattern constants.",
-        """
-        acquire simulate imaging --row IM-4
-        acquire simulate imaging --seed 7 --json claims.json
-        acquire simulate imaging --plots docs/plots --report docs/imaging.md
-        """,
-        _run_imaging,
-    )
+    parser = arguments.add_command(group, "imaging", _run_imaging)
     parser.add_argument(
         "--row", nargs="+", default=[], metavar="IM-N", help="IM-1 to IM-11; default all"
     )
@@ -168,7 +152,13 @@ def _add_imaging(group: Any) -> None:
 
 
 def _run_imaging(parsed: Namespace) -> int:
-    """Hold the star image detection report beside what is measured; 1 where a claim is off."""
+    """Compare every claim of the star image detection report with a measurement: crosses of wire
+    meshes, correlation, estimation, scans and their noise, pattern constants.
+
+    acquire simulate imaging --row IM-4
+    acquire simulate imaging --seed 7 --json claims.json
+    acquire simulate imaging --plots docs/plots --report docs/imaging.md
+    """
     from studies.star_image_report.command import as_json, run_imaging
 
     prints_json = parsed.json == arguments.STANDARD_OUTPUT
@@ -196,20 +186,7 @@ _SERIOUS_SHARE = 0.1
 
 
 def _add_telemetry(group: Any) -> None:
-    parser = arguments.add_command(
-        group,
-        "telemetry",
-        "Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the "
-        "truth in OUT.truth.ndjson.  The same arguments always give the same pass.",
-        """
-        acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
-        acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
-        acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
-        acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
-        acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
-        """,
-        _run_telemetry,
-    )
+    parser = arguments.add_command(group, "telemetry", _run_telemetry)
     parser.add_argument("output", type=Path, metavar="OUT.ndjson")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     parser.add_argument("--batches", required=True, type=arguments.count, metavar="N")
@@ -295,7 +272,15 @@ def _add_gyro(parser: Any) -> None:
 
 
 def _run_telemetry(parsed: Namespace) -> int:
-    """Draw a pass and write it with its truth."""
+    """Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the truth
+    in OUT.truth.ndjson.  The same arguments always give the same pass.
+
+    acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
+    acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
+    acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
+    acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
+    acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
+    """
     from service.simulate.gyro import with_gyro
     from service.simulate.telemetry import draw_pass, truth_path, write_pass
     from service.sky.cache import LruCache
@@ -316,7 +301,6 @@ def _run_telemetry(parsed: Namespace) -> int:
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
-    """The gyro that the arguments describe, if any."""
     from service.observations.readers.telemetry import telemetry_format
     from service.simulate.gyro import GyroWanted
 

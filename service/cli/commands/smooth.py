@@ -10,20 +10,7 @@ from service.cli.configuration import period_of, progress_bar, settings_of_exist
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(
-        commands,
-        "smooth",
-        "Filter and smooth the recorded attitudes of a spacecraft with its gyro, or with a "
-        "constant-rate model where no gyro runs, and record both grades, UTC day by UTC day.  A "
-        "day whose record has not changed is left as it is; one with later batches gets a new "
-        "revision.  With SQLite, stop the service first.",
-        """
-        acquire smooth XTE
-        acquire smooth XTE --start 1999-060T00:00:00Z --end 1999-067T00:00:00Z
-        acquire smooth XTE --run pass-7 --json
-        """,
-        run,
-    )
+    parser = arguments.add_command(commands, "smooth", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     arguments.add_json(parser, "the days")
@@ -32,7 +19,15 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Smooth a period and print what became of each day."""
+    """Filter and smooth the recorded attitudes of a spacecraft with its gyro, or with a
+    constant-rate model where no gyro runs, and record both grades, UTC day by UTC day.  A day
+    whose record has not changed is left as it is; one with later batches gets a new
+    revision.  With SQLite, stop the service first.
+
+    acquire smooth XTE
+    acquire smooth XTE --start 1999-060T00:00:00Z --end 1999-067T00:00:00Z
+    acquire smooth XTE --run pass-7 --json
+    """
     import msgspec
 
     from service.app.factory import open_app

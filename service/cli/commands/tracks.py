@@ -12,17 +12,7 @@ from service.errors import BadInput, Fault
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "tracks",
-        "Link the unmatched stars of recorded batches to tracks: objects that move on the sky, "
-        "planets, and hot pixels, which keep their place on the detector.  Changes nothing.",
-        """
-        acquire tracks XTE --start 1999-060T00:00:00Z --end 1999-060T01:00:00Z
-        acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
-        """,
-        run,
-    )
+    parser = add_command(commands, "tracks", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
     add_period(parser, "the run to use; default live")
     parser.add_argument(
@@ -38,7 +28,12 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Link, and print or write."""
+    """Link the unmatched stars of recorded batches to tracks: objects that move on the sky,
+    planets, and hot pixels, which keep their place on the detector.  Changes nothing.
+
+    acquire tracks XTE --start 1999-060T00:00:00Z --end 1999-060T01:00:00Z
+    acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
+    """
     from service.app.factory import open_app
     from service.cli.arguments import written_to
     from service.cli.texts import tracks_text
