@@ -1,6 +1,7 @@
 """`acquire replay`: send files of batches through the service."""
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,6 +13,7 @@ from service.errors import BadFile, BadInput, Fault, shown_value
 if TYPE_CHECKING:
     from service.packets.reader import PacketReader
     from service.replay.from_file import FromFile
+    from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
 CSV_HELP = """\
@@ -193,15 +195,21 @@ def run(parsed: Namespace) -> int:
                 )
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
-    if parsed.json:
+    _print_counts(run, summary, sources, parsed.json)
+    return 1 if summary.refused else 0
+
+
+def _print_counts(
+    run: str, summary: "ReplaySummary", sources: Sequence["FromFile"], as_json: bool
+) -> None:
+    if as_json:
         supplied = {source.key: source.supplied for source in sources}
         arguments.print_json({"run": run, **summary.counts(), **supplied})
-    else:
-        print(f"{'run':<20}{run}")
-        print(summary.table())
-        for source in sources:
-            print(f"{source.title:<20}{source.supplied:,} batches")
-    return 1 if summary.refused else 0
+        return
+    print(f"{'run':<20}{run}")
+    print(summary.table())
+    for source in sources:
+        print(f"{source.title:<20}{source.supplied:,} batches")
 
 
 def _sources(parsed: Namespace) -> list["FromFile"]:

@@ -4,11 +4,14 @@ import sys
 from argparse import Namespace
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
 from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
+
+if TYPE_CHECKING:
+    from service.missions.mission import Mission
 
 SCHEDULER = """\
 A Dask scheduler runs whatever code it is sent: use tls://, with the certificates that Dask's own
@@ -83,18 +86,9 @@ def run(parsed: Namespace) -> int:
     from service.app.factory import open_app
     from service.cli.texts import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
-    from service.missions.mission import load_missions, mission_named, read_mission
 
     start, end = period_of(parsed)
-    mission = None if parsed.mission is None else read_mission(parsed.mission)
-    spacecraft = parsed.spacecraft
-    if mission is not None:
-        spacecraft = spacecraft or mission.name
-        if spacecraft != mission.name:
-            message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
-            raise BadInput(Fault("--mission", message, str(parsed.mission)))
-    elif spacecraft is not None:
-        mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+    mission, spacecraft = _chosen(parsed)
     if parsed.run is not None:
         require_other_run(checked_run_name(parsed.run), parsed.source)
     _check_track(parsed)
@@ -145,6 +139,22 @@ def run(parsed: Namespace) -> int:
         if compared is not None:
             print(comparison_text(compared))
     return 1 if progress.refused else 0
+
+
+def _chosen(parsed: Namespace) -> "tuple[Mission | None, str | None]":
+    """The mission of `--mission`, and the spacecraft whose batches are asked for."""
+    from service.missions.mission import load_missions, mission_named, read_mission
+
+    spacecraft: str | None = parsed.spacecraft
+    if parsed.mission is None:
+        if spacecraft is not None:
+            mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+        return None, spacecraft
+    mission = read_mission(parsed.mission)
+    if spacecraft not in (None, mission.name):
+        message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
+        raise BadInput(Fault("--mission", message, str(parsed.mission)))
+    return mission, mission.name
 
 
 def _check_track(parsed: Namespace) -> None:
