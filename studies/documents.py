@@ -1,0 +1,32 @@
+"""What studies write: tables as Markdown, rows as JSON, links to pictures."""
+
+import json
+import os.path
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table with aligned columns, the first to the left and the others to the right."""
+    table = [list(header), *(list(row) for row in rows)]
+    widths = [max(len(row[k]) for row in table) for k in range(len(header))]
+    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
+
+    def line(cells: Sequence[str]) -> str:
+        first = cells[0].ljust(widths[0])
+        others = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
+        return "| " + " | ".join([first, *others]) + " |"
+
+    return "\n".join([line(table[0]), line(rule), *map(line, table[1:])])
+
+
+def json_rows(rows: Iterable[Any]) -> str:
+    """Rows as a JSON array, one a line."""
+    lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
+    return f"[\n{lines}\n]\n" if lines else "[]\n"
+
+
+def links(title: str, picture: Path, file: Path) -> list[str]:
+    """The link to a picture, as seen from the page `file`; none without the picture."""
+    return [f"![{title}]({os.path.relpath(picture, file.parent)})"] if picture.exists() else []
