@@ -15,15 +15,7 @@ from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.day import LOOK_AHEAD_S, grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
-from service.storage.grades.days import (
-    DayKey,
-    DefinitiveJob,
-    GradedDayRow,
-    Innovation,
-    current_day,
-    record_day,
-    rows_of,
-)
+from service.storage.grades.days import DayKey, GradedDayRow, current_day, record_day, rows_of
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
 from service.storage.grades.period import (
     GradesOfPeriod,
@@ -32,6 +24,7 @@ from service.storage.grades.period import (
     list_innovations,
 )
 from service.storage.models.base import Page
+from service.storage.models.products import DefinitiveJob, Innovation
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
@@ -24,19 +24,7 @@ from service.grades.day import (
 )
 from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
-from service.storage.models.base import (
-    Components,
-    Count,
-    DescribedAs,
-    Digest,
-    Id,
-    Moment,
-    Record,
-    Stamp,
-    doc,
-    list_record,
-    page_record,
-)
+from service.storage.models.base import Count, Digest, Id, Moment, Stamp, doc
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.storage.sql.tables import runs
@@ -95,57 +83,6 @@ class GradedDayRow(Struct, frozen=True, kw_only=True):
     inputs: Annotated[Digest, doc("Of all that the day was computed from.")]
     digest: Annotated[Digest, doc("Of what was computed.")]
     summary: DaySummary
-
-
-class Innovation(Record, frozen=True, kw_only=True):
-    """How a measured attitude met the filter, and how it differs from the smoothed attitude."""
-
-    time: Moment
-    outcome: Annotated[
-        str, DescribedAs(Literal["accepted", "rejected", "started", "undecided", "unused"])
-    ]
-    """`accepted` and `started` measurements are used; `started`: with it the filter began.
-    `undecided`: it agrees with two attitudes that contradict each other."""
-    innovation_arcsec: Components | None
-    """From prediction to measurement, about the body axes; null: nothing was predicted."""
-    innovation_sigma_arcsec: Components | None
-    """One sigma of prediction and measurement together."""
-    chi_square: float | None
-    """Of the innovation, with three degrees of freedom: 3 on average."""
-    difference_arcsec: Components
-    """From the smoothed attitude to the measured one, about the body axes."""
-    difference_sigma_arcsec: Components
-    """One sigma; the smoothed attitude is partly made of the measured one."""
-    model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
-    revision: Annotated[int, Field(ge=1), doc("Of the day.")]
-
-
-InnovationPage = page_record("InnovationPage", Innovation, "A page of innovations.")
-
-
-class DefinitiveJob(Record, frozen=True, kw_only=True):
-    """The making of a definitive attitude: filtered and smoothed attitudes of recorded days."""
-
-    id: Id
-    spacecraft: str
-    run: str
-    start: Annotated[Moment | None, doc("null: from the first day with batches.")]
-    end: Annotated[Moment | None, doc("null: to the last.")]
-    who: Annotated[str, doc("`schedule`: the mission asks for it each day.")]
-    created: Stamp
-    ended: Stamp | None
-    state: Annotated[
-        str, DescribedAs(Literal["queued", "running", "done", "failed", "interrupted"])
-    ]
-    done: Annotated[int, doc("Days that are finished.")]
-    total: Annotated[int, doc("Days with batches; 0 until they are counted.")]
-    recorded: Annotated[int, doc("Days that got a new revision; the others had not changed.")]
-    fault: str | None
-
-
-DefinitiveJobList = list_record(
-    "DefinitiveJobList", DefinitiveJob, "Jobs since the start of the service, the newest first."
-)
 
 
 def current_day(connection: Connection, key: DayKey) -> GradedDayRow | None:

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
@@ -13,16 +13,7 @@ from service.grades.day import Grade, day_bounds, unpacked
 from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
 from service.storage.grades.inputs import inside
-from service.storage.models.base import (
-    Components,
-    Covariance,
-    DescribedAs,
-    Moment,
-    Quaternion,
-    Record,
-    doc,
-)
-from service.storage.models.base import Status as StatusWord
+from service.storage.models.products import LiveAttitude
 from service.storage.queries.pages import ResultFilter, covariance_of
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import graded_blocks, graded_days
@@ -133,23 +124,6 @@ def _repeated(value: str | None, n: int) -> Any:
     column = np.empty(n, dtype=object)
     column[:] = value
     return column
-
-
-class LiveAttitude(Record, frozen=True, kw_only=True):
-    """The filtered attitude of a spacecraft at the last epoch of its live data."""
-
-    spacecraft: str
-    time: Annotated[Moment, doc("Of the last gyro sample or, without a gyro, measurement.")]
-    quaternion: Quaternion
-    covariance_arcsec2: Covariance
-    rate_deg_per_s: Annotated[Components, doc("Of the body relative to inertial, in body axes.")]
-    bias_deg_per_h: Components | None
-    """Bias of the gyro, in body axes; null at a constant rate."""
-    bias_sigma_deg_per_h: Components
-    """One sigma of the bias or, at a constant rate, of the rate."""
-    status: StatusWord
-    """`suspect`: measurements contradict it, or have not confirmed it yet."""
-    model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
 
 
 def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:

@@ -17,9 +17,14 @@ from service.products.formats import (
     write_attitudes,
     write_table,
 )
-from service.storage.grades.days import DefinitiveJob, DefinitiveJobList, InnovationPage
-from service.storage.grades.rows import LiveAttitude
-from service.storage.models.products import AttitudeAtMoment, AttitudeProduct
+from service.storage.models.products import (
+    AttitudeAtMoment,
+    AttitudeProduct,
+    DefinitiveJob,
+    DefinitiveJobList,
+    InnovationPage,
+    LiveAttitude,
+)
 from service.storage.tracks import TrackList
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
