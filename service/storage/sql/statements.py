@@ -18,8 +18,6 @@ from service.storage.sql.tables import COUNTS, MAXIMA, MINIMA, SUMS, runs
 
 T = TypeVar("T")
 
-# Statements that are put into SQL once and run many times.
-#
 # SQLAlchemy compiles a statement at every execution and wraps every row.  With a
 # dozen statements for each group of results that takes longer than running them.
 # On SQLite the compiled text goes to the driver directly, with values by position;

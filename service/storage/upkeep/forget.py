@@ -110,9 +110,14 @@ def forget(
         raise BadConfiguration(
             f"{total.archived_batches} of the batches are archived: name the folder of the archive"
         )
+
+    def forget_days(connection: Connection) -> None:
+        while delete_days(connection, _of_days(selected)):
+            pass
+        note(connection, total)
+
     # What is computed from the batches goes first: it is computed again from what is left.
-    days = partial(_forget_days, selected=selected, note=note, total=total)
-    store.writer.change(days).result()
+    store.writer.change(forget_days).result()
     done = 0
     if total.archived_batches and archive is not None:
         done += _forget_archived(store, archive, selected)
@@ -181,18 +186,6 @@ def _of_days(selected: ForgetFilter) -> list[Any]:
             )
         )
     return [*chosen, or_(*overlapping)]
-
-
-def _forget_days(
-    connection: Connection,
-    selected: ForgetFilter,
-    note: Callable[[Connection, Forgotten], object],
-    total: Forgotten,
-) -> None:
-    chosen = _of_days(selected)
-    while delete_days(connection, chosen):
-        pass
-    note(connection, total)
 
 
 def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
