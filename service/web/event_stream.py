@@ -147,7 +147,11 @@ class Live:
             if found:
                 last = found[-1].id
                 named = None if spacecraft is None else (spacecraft,)
-                lines = b"".join(_event_line(e) for e in found if e.concerns(run, named))
+                lines = b"".join(
+                    _line(each.id, each.kind, each.data)
+                    for each in found
+                    if each.concerns(run, named)
+                )
                 if lines:
                     heard_s = clock()
                     yield lines
@@ -229,10 +233,6 @@ class Live:
 
     async def _read(self, ask: Callable[..., T], *arguments: object) -> T:
         return await run_sync(ask, *arguments, limiter=self._threads)
-
-
-def _event_line(event: Event) -> bytes:
-    return _line(event.id, event.kind, event.data)
 
 
 def _line(id: int, kind: str, data: str) -> bytes:

@@ -34,33 +34,18 @@ SCHEMAS = "#/components/schemas/"
 TABLES, ATTITUDES = "x-tables", "x-attitudes"
 """Mark a response in the formats of tables, or of attitudes, until the document is made."""
 
-REPLAYED = {
-    "Replayed": {
-        "description": "`true`: the answer was recorded before this request.",
-        "schema": {"type": "string", "enum": ["true"]},
-    }
-}
-LOCATION = {
-    "Location": {"description": "The address of the new resource.", "schema": {"type": "string"}}
-}
-CONTENT_LOCATION = {
-    "Content-Location": {
-        "description": "The address of this result.",
-        "schema": {"type": "string"},
-    }
-}
-ETAG = {
-    "ETag": {
-        "description": "Changes with the answer; send it as `If-None-Match`.",
-        "schema": {"type": "string"},
-    }
-}
-LINK = {
-    "Link": {
-        "description": 'The next page, as `<...>; rel="next"`; absent on the last page.',
-        "schema": {"type": "string"},
-    }
-}
+
+def _header(name: str, description: str, **schema: Any) -> dict[str, Any]:
+    return {name: {"description": description, "schema": {"type": "string", **schema}}}
+
+
+REPLAYED = _header(
+    "Replayed", "`true`: the answer was recorded before this request.", enum=["true"]
+)
+LOCATION = _header("Location", "The address of the new resource.")
+CONTENT_LOCATION = _header("Content-Location", "The address of this result.")
+ETAG = _header("ETag", "Changes with the answer; send it as `If-None-Match`.")
+LINK = _header("Link", 'The next page, as `<...>; rel="next"`; absent on the last page.')
 IDEMPOTENCY_KEY = {
     "name": "Idempotency-Key",
     "in": "header",
@@ -97,8 +82,8 @@ _PROBLEMS = {
 READING_JSON = (400, 408, 413, 415, 503)
 READING_NDJSON = READING_FRAME = (408, 413, 415)
 _BINARY = {"type": "string", "format": "binary"}
-_RETRY_AFTER = {"Retry-After": {"description": "Seconds.", "schema": {"type": "string"}}}
-_CHALLENGE = {"WWW-Authenticate": {"description": "Bearer.", "schema": {"type": "string"}}}
+_RETRY_AFTER = _header("Retry-After", "Seconds.")
+_CHALLENGE = _header("WWW-Authenticate", "Bearer.")
 _HEADERS: Mapping[int, Any] = {
     401: {"headers": _CHALLENGE},
     429: {"headers": _RETRY_AFTER},
@@ -148,9 +133,11 @@ class ApiRouter(APIRouter):
         problems: Sequence[int] = (),
         parameters: Sequence[Mapping[str, Any]] = (),
         dependencies: Sequence[Any] = (),
+        may_create: bool = False,
     ) -> Callable[[Handler], Handler]:
         """Register the decorated handler; one that declares no query parameter refuses any.
 
+        What a path names may not be there, so 404 is described, unless the route creates it.
         Without `body_required` the body may be left out: its fields all have defaults.
         `archive` says what an archive holds that can be sent in place of lines.
         `array_of` is the model of an array's elements, and how many there may be.
@@ -181,7 +168,8 @@ class ApiRouter(APIRouter):
         responses: dict[int | str, Any] = {
             status: _answer(by_status[status]) for status in sorted(by_status)
         }
-        for status in sorted({*problems, *reading, 422}):
+        unknown = (404,) if "{" in method_and_path and not may_create else ()
+        for status in sorted({*problems, *reading, *unknown, 422}):
             responses[status] = _problem(_PROBLEMS[status]) | _HEADERS.get(status, {})
         responses["default"] = _problem("Any other problem: a wrong method, an internal error.")
         method, _, path = method_and_path.partition(" ")

@@ -15,7 +15,7 @@ from service.observations.schema import Key, Wire
 from service.storage.models import alarms as models
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AuditDep, CallerDep, author, require_all_spacecraft
+from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
@@ -70,9 +70,7 @@ class LimitIn(_Statement):
     settings: LimitSettings
 
 
-@router.serves(
-    "GET /spacecraft/{name}/limits", Returns("Every limit.", models.LimitList), problems=(404,)
-)
+@router.serves("GET /spacecraft/{name}/limits", Returns("Every limit.", models.LimitList))
 def list_limits(name: SpacecraftPath, query: FromQuery[params.LimitQuery], app: AppDep) -> Response:
     """The limits of every quantity of a spacecraft or a tracker, set or shipped."""
     return json_response({"items": app.limits.all(name, query.tracker)})
@@ -81,7 +79,6 @@ def list_limits(name: SpacecraftPath, query: FromQuery[params.LimitQuery], app: 
 @router.serves(
     "GET /spacecraft/{name}/limits/{quantity}",
     Returns("The limit and its history.", models.LimitHistory),
-    problems=(404,),
 )
 def get_limit(
     name: SpacecraftPath, quantity: QuantityPath, query: FromQuery[params.LimitQuery], app: AppDep
@@ -94,7 +91,6 @@ def get_limit(
     "PUT /spacecraft/{name}/limits/{quantity}",
     Returns("The limit, which applies from the next batch on.", models.Limit),
     body=LimitIn,
-    problems=(404,),
 )
 def set_limit(
     name: SpacecraftPath,
@@ -102,30 +98,17 @@ def set_limit(
     query: FromQuery[params.LimitQuery],
     body: JsonBody,
     app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    change: ChangeDep,
 ) -> Response:
     """Set a limit; the previous one stays in the history."""
     asked = read_model(LimitIn, body)
-    limited, who = _quantity_with_limits(quantity), author(caller, asked.who)
-    return json_response(
-        app.limits.set(
-            name,
-            limited,
-            asked.settings,
-            who=who,
-            comment=asked.comment,
-            entry=audited.entry(),
-            tracker=query.tracker,
-        )
-    )
+    return json_response(_set(app, name, quantity, query.tracker, asked.settings, asked, change))
 
 
 @router.serves(
     "POST /spacecraft/{name}/limits/{quantity}/preview",
     Returns("How this limit and the one in force evaluate them.", models.LimitPreview),
     body=LimitTrialIn,
-    problems=(404,),
 )
 def preview_limit(
     name: SpacecraftPath,
@@ -143,28 +126,38 @@ def preview_limit(
 @router.serves(
     "DELETE /spacecraft/{name}/limits/{quantity}",
     Returns("The shipped limit, which applies again.", models.Limit),
-    problems=(404, 503),
+    problems=(503,),
 )
 def reset_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
     query: FromQuery[params.LimitStatementQuery],
     app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    change: ChangeDep,
 ) -> Response:
     """Restore the shipped limit; earlier limits stay in the history."""
-    limited, who = _quantity_with_limits(quantity), author(caller, query.who)
-    return json_response(
-        app.limits.set(
-            name,
-            limited,
-            None,
-            who=who,
-            comment=query.comment,
-            entry=audited.entry(),
-            tracker=query.tracker,
-        )
+    return json_response(_set(app, name, quantity, query.tracker, None, query, change))
+
+
+def _set(
+    app: AppDep,
+    name: str,
+    quantity: str,
+    tracker: str | None,
+    settings: LimitSettings | None,
+    statement: LimitIn | params.LimitStatementQuery,
+    change: ChangeDep,
+) -> models.Limit:
+    """Set a limit, or without settings restore the shipped one."""
+    limited, who = _quantity_with_limits(quantity), change.author(statement.who)
+    return app.limits.set(
+        name,
+        limited,
+        settings,
+        who=who,
+        comment=statement.comment,
+        entry=change.entry(),
+        tracker=tracker,
     )
 
 
@@ -174,7 +167,7 @@ def list_alarms(request: Request, query: FromQuery[params.AlarmQuery], app: AppD
     return page_response(request, app.alarms.page(**query.asked()))
 
 
-@router.serves("GET /alarms/{id}", Returns("The alarm.", models.AlarmWithActions), problems=(404,))
+@router.serves("GET /alarms/{id}", Returns("The alarm.", models.AlarmWithActions))
 def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     """One alarm with its history."""
     return json_response(_visible_alarm(app, id, caller))
@@ -184,64 +177,53 @@ def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     "POST /alarms/{id}/acknowledge",
     Returns("The alarm, now acknowledged.", models.AlarmWithActions),
     body=StatementIn,
-    problems=(404, 409),
+    problems=(409,),
 )
-def acknowledge_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Acknowledge an alarm; it is cleared if the quantity is back in limits."""
     asked = read_model(StatementIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.acknowledge(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.acknowledge(id, who, asked.comment, change.entry()))
 
 
 @router.serves(
     "POST /alarms/{id}/shelve",
     Returns("The alarm, now shelved.", models.AlarmWithActions),
     body=ShelveIn,
-    problems=(404, 409),
+    problems=(409,),
 )
-def shelve_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Shelve an alarm for some minutes; it returns by itself."""
     asked = read_model(ShelveIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, change.entry()))
 
 
 @router.serves(
     "POST /alarms/{id}/unshelve",
     Returns("The alarm.", models.AlarmWithActions),
     body=StatementIn,
-    problems=(404, 409),
+    problems=(409,),
 )
-def unshelve_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def unshelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Unshelve an alarm."""
     asked = read_model(StatementIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.unshelve(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.unshelve(id, who, asked.comment, change.entry()))
 
 
 @router.serves(
-    "POST /alarms/{id}/comment",
-    Returns("The alarm.", models.AlarmWithActions),
-    body=CommentIn,
-    problems=(404,),
+    "POST /alarms/{id}/comment", Returns("The alarm.", models.AlarmWithActions), body=CommentIn
 )
-def comment_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def comment_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Add a comment to an alarm."""
     asked = read_model(CommentIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.comment(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.comment(id, who, asked.comment, change.entry()))
 
 
 def _quantity_with_limits(quantity: str) -> QuantityName:
@@ -305,17 +287,17 @@ def list_annotations(
     Returns("The annotation.", models.Annotation, status=201),
     body=AnnotationIn,
 )
-def add_annotation(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
+def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Write a note on a time or a period; the name of its author is stored with it."""
     asked = read_model(AnnotationIn, body)
-    _require(caller, asked.spacecraft)
+    _require(change.caller, asked.spacecraft)
     written = app.annotations.add(
         asked.text,
         start=asked.start,
         end=asked.end,
         spacecraft=asked.spacecraft,
-        who=author(caller, asked.who),
-        entry=audited.entry(201),
+        who=change.author(asked.who),
+        entry=change.entry(201),
     )
     return json_response(written, 201)
 
@@ -323,22 +305,18 @@ def add_annotation(body: JsonBody, app: AppDep, caller: CallerDep, audited: Audi
 @annotations_router.serves(
     "DELETE /annotations/{id}",
     Returns("The annotation that was deleted.", models.Annotation),
-    problems=(404, 503),
+    problems=(503,),
 )
 def delete_annotation(
-    id: AnnotationId,
-    query: FromQuery[params.AuthorQuery],
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    id: AnnotationId, query: FromQuery[params.AuthorQuery], app: AppDep, change: ChangeDep
 ) -> Response:
     """Delete a note; the audit list keeps its text, and who deleted it."""
-    author(caller, query.who)
+    change.author(query.who)
     found = app.annotations.get(id)
-    if found.spacecraft is not None and not caller.may_see(found.spacecraft):
+    if found.spacecraft is not None and not change.caller.may_see(found.spacecraft):
         raise NotFound(f"there is no annotation with the id {shown_value(id)}")
-    _require(caller, found.spacecraft)
-    return json_response(app.annotations.delete(id, audited.entry()))
+    _require(change.caller, found.spacecraft)
+    return json_response(app.annotations.delete(id, change.entry()))
 
 
 def _require(caller: Caller, spacecraft: str | None) -> None:

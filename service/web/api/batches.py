@@ -1,4 +1,4 @@
-"""Batches: submit, list, look at one, try it with other options, compare sets of options."""
+"""Batches and gyro blocks: submit, list, look at one, try a batch with other options, compare."""
 
 from typing import Annotated
 
@@ -10,13 +10,15 @@ from starlette.responses import Response
 
 from service.app.submissions import MAX_ARRAY, Outcome
 from service.errors import BadBatch, BadInput, Fault
+from service.gyro import GyroBlockIn
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.models.compare import Comparison
+from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.requests.access import CallerDep, ChangeDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
     MetricsDep,
@@ -25,10 +27,11 @@ from service.web.requests.dependencies import (
     page_response,
 )
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import FromQuery, Time, Who
+from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who
 from service.web.requests.request_body import (
     BINARY,
     NO_IDEMPOTENCY_KEY,
+    NO_KEY_OF_A_BLOCK,
     NO_KEY_OF_MANY,
     JsonBody,
     idempotency_key,
@@ -125,15 +128,13 @@ def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: App
     return page_response(request, app.results.page(**query.asked()))
 
 
-@router.serves("GET /batches/{id}", Returns("The result and its batch.", Result), problems=(404,))
+@router.serves("GET /batches/{id}", Returns("The result and its batch.", Result))
 def get_batch(id: ResultId, app: AppDep) -> Response:
     """One recorded result with its batch."""
     return json_response(app.results.get(id))
 
 
-@router.serves(
-    "GET /batches/{id}/overlay", Returns("The image.", media_type=PNG, also=BINARY), problems=(404,)
-)
+@router.serves("GET /batches/{id}/overlay", Returns("The image.", media_type=PNG, also=BINARY))
 def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     """An image of a frame's result: the stars, their names, and residual arrows.
 
@@ -149,24 +150,18 @@ def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     Returns("The answer, which was not recorded.", Answer),
     Returns("The answer, now recorded in addition to the first one.", Answer, LOCATION, status=201),
     body=WhatIfIn,
-    problems=(404,),
     dependencies=[NO_IDEMPOTENCY_KEY],
 )
 def what_if(
-    request: Request,
-    id: ResultId,
-    body: JsonBody,
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    request: Request, id: ResultId, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Process a recorded batch again with other options; recording the result needs `operate`."""
     asked = read_model(WhatIfIn, body)
     record, entry = asked.record or asked.adopt, None
     if record:
-        require_scope(caller, "operate")
+        require_scope(change.caller, "operate")
         request.state.changes = "what_if"
-        entry = audited.entry(201)
+        entry = change.entry(201)
     answered = app.results.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
     return answer_response(answered, recorded=record)
 
@@ -184,8 +179,8 @@ class CompareIn(Wire):
 
     spacecraft: Key
     run: RunName = "live"
-    start: Annotated[Time | None, Field(description="Start of the period, included.")] = None
-    end: Annotated[Time | None, Field(description="End of the period, excluded.")] = None
+    start: params.Start = None
+    end: params.End = None
     sample: Annotated[
         int,
         Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
@@ -217,3 +212,54 @@ def compare(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
         limit_s=COMPARISON_S,
     )
     return json_response(found)
+
+
+gyro_router = ApiRouter("gyro")
+
+BlockId = Annotated[str, Path(description="The `id` of a recorded gyro block.")]
+
+
+@gyro_router.serves(
+    "POST /spacecraft/{name}/gyro",
+    Returns("The block, now recorded.", GyroBlockRow, LOCATION, status=201),
+    Returns("The block that was recorded before.", GyroBlockRow, REPLAYED),
+    body=GyroBlockIn,
+    problems=(409,),
+    dependencies=[NO_KEY_OF_A_BLOCK],
+)
+def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: MetricsDep) -> Response:
+    """Record a block of gyro samples.
+
+    The same block again is answered with 200 and `Replayed`. 409 if another body has its name, or
+    if another block of the run holds one of its times.
+    """
+    try:
+        recorded = app.gyro.submit(name, body)
+    except BadInput as error:
+        raise refused(body, error) from None
+    if recorded.replayed:
+        metrics.count_repeat()
+        return json_response(recorded.row, 200, {"Replayed": "true"})
+    location = f"/api/v1/spacecraft/{name}/gyro/{recorded.row.id}"
+    return json_response(recorded.row, 201, {"Location": location})
+
+
+@gyro_router.serves(
+    "GET /spacecraft/{name}/gyro", Returns("A page of blocks.", GyroBlockPage, LINK)
+)
+def list_gyro(
+    request: Request, name: SpacecraftPath, query: FromQuery[PeriodPageQuery], app: AppDep
+) -> Response:
+    """The gyro blocks that touch a period, without their samples, the earliest first.
+
+    The samples of a period are the table `gyro`.
+    """
+    return page_response(request, app.gyro.page(name, **query.asked()))
+
+
+@gyro_router.serves(
+    "GET /spacecraft/{name}/gyro/{id}", Returns("The block and its samples.", GyroSamples)
+)
+def get_gyro(name: SpacecraftPath, id: BlockId, app: AppDep) -> Response:
+    """One gyro block with its samples."""
+    return json_response(app.gyro.get(name, id))

@@ -18,28 +18,25 @@ from service.storage.models.compare import Comparison
 from service.web.api.batches import COMPARISON_S
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AuditDep, CallerDep, author
+from service.web.requests.access import CallerDep, ChangeDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Time, Who
+from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("calibrations")
 
 CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
-Start = Annotated[Time | None, Field(description="Start of the period, included.")]
-End = Annotated[Time | None, Field(description="End of the period, excluded.")]
 
 
 class _Period(Wire):
     """The batches that are used."""
 
-    start: Start = None
-    end: End = None
+    start: params.Start = None
+    end: params.End = None
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if self.start and self.end and self.start.tai_ns > self.end.tai_ns:
-            raise ValueError(f"start {self.start} must not be after end {self.end}")
+        params.require_order(self.start, self.end)
         return self
 
 
@@ -140,20 +137,15 @@ def list_calibrations(
     body=CalibrationIn,
     problems=(404,),
 )
-def start_calibration(
-    body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Estimate alignment, scale and distortion of trackers; no setting is changed."""
     asked = read_model(CalibrationIn, body)
-    caller.require(asked.spacecraft)
-    who = author(caller, asked.who)
-    begun = app.calibrations.start(asked.request(), who, audited.entry(202))
+    change.caller.require(asked.spacecraft)
+    begun = app.calibrations.start(asked.request(), change.author(asked.who), change.entry(202))
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
-@router.serves(
-    "GET /calibrations/{id}", Returns("The calibration.", models.Calibration), problems=(404,)
-)
+@router.serves("GET /calibrations/{id}", Returns("The calibration.", models.Calibration))
 def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Response:
     """One calibration with covariance and residual maps."""
     return json_response(_visible(app, id, caller))
@@ -163,7 +155,7 @@ def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Respon
     "POST /calibrations/{id}/trial",
     Returns("In force (a), and with the calibration (b).", Comparison),
     body=CalibrationTrialIn,
-    problems=(404, 409),
+    problems=(409,),
 )
 def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Process recorded batches again with and without a calibration; nothing is recorded."""
@@ -176,22 +168,21 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     "POST /calibrations/{id}/adopt",
     Returns("The adoption.", models.CalibrationAdoption),
     body=CalibrationAdoptIn,
-    problems=(404, 409),
+    problems=(409,),
 )
 def adopt_calibration(
-    id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+    id: CalibrationId, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Let new batches of the spacecraft be processed with a calibration."""
     asked = read_model(CalibrationAdoptIn, body)
-    _visible(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.adoptions.adopt(id, who, asked.note, audited.entry()))
+    _visible(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.adoptions.adopt(id, who, asked.note, change.entry()))
 
 
 @router.serves(
     "GET /spacecraft/{name}/calibration",
     Returns("The calibration in force.", models.CalibrationInForce),
-    problems=(404,),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
     """The calibration that new batches use, and what held when."""
@@ -202,15 +193,15 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
     "POST /spacecraft/{name}/calibration/revert",
     Returns("The change.", models.CalibrationAdoption),
     body=CalibrationRevertIn,
-    problems=(404, 409),
+    problems=(409,),
 )
 def revert_calibration(
-    name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+    name: SpacecraftPath, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Go back to an earlier adoption, or to the mission file."""
     asked = read_model(CalibrationRevertIn, body)
-    who = author(caller, asked.who)
-    return json_response(app.adoptions.revert(name, asked.to, who, asked.note, audited.entry()))
+    who = change.author(asked.who)
+    return json_response(app.adoptions.revert(name, asked.to, who, asked.note, change.entry()))
 
 
 def _visible(app: AppDep, id: str, caller: Caller) -> models.Calibration:

@@ -120,7 +120,7 @@ async def _frame(request: Request, query: FromQuery[FrameQuery], app: AppDep) ->
     Returns("The answer, now recorded.", Answer, LOCATION, status=201),
     Returns("The answer that was recorded before.", Answer, REPLAYED),
     frame=True,
-    problems=(404, 409, 503),
+    problems=(409, 503),
     parameters=(IDEMPOTENCY_KEY,),
 )
 def submit_frame(

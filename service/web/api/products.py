@@ -40,7 +40,7 @@ router = ApiRouter("products")
 @router.serves(
     "GET /spacecraft/{name}/attitude",
     Returns("The attitudes, in the requested format.", AttitudeProduct, attitudes=True),
-    problems=(404, 503),
+    problems=(503,),
 )
 def get_attitude(
     name: SpacecraftPath,
@@ -63,11 +63,7 @@ def get_attitude(
     )
 
 
-@router.serves(
-    "GET /spacecraft/{name}/attitude/at",
-    Returns("The attitude.", AttitudeAtMoment),
-    problems=(404,),
-)
+@router.serves("GET /spacecraft/{name}/attitude/at", Returns("The attitude.", AttitudeAtMoment))
 def get_attitude_at(
     name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
 ) -> Response:
@@ -88,7 +84,7 @@ def get_attitude_at(
         media_type=OUTPUT_FORMATS["csv"].media_type,
         tables=True,
     ),
-    problems=(404, 503),
+    problems=(503,),
 )
 def get_table(
     name: SpacecraftPath,
@@ -112,11 +108,7 @@ def get_table(
     )
 
 
-@router.serves(
-    "GET /spacecraft/{name}/attitude/latest",
-    Returns("The attitude.", LiveAttitude),
-    problems=(404,),
-)
+@router.serves("GET /spacecraft/{name}/attitude/latest", Returns("The attitude.", LiveAttitude))
 def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     """The filtered attitude at the last epoch of live data, where the mission keeps it up.
 
@@ -126,9 +118,7 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
 
 
 @router.serves(
-    "GET /spacecraft/{name}/innovations",
-    Returns("A page of innovations.", InnovationPage, LINK),
-    problems=(404,),
+    "GET /spacecraft/{name}/innovations", Returns("A page of innovations.", InnovationPage, LINK)
 )
 def list_innovations(
     request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
@@ -158,7 +148,6 @@ class DefinitiveIn(Wire):
     "POST /spacecraft/{name}/definitive-attitude",
     Returns("The job, which is queued.", DefinitiveJob, LOCATION, status=202),
     body=DefinitiveIn,
-    problems=(404,),
 )
 def make_definitive_attitude(
     name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep
@@ -176,9 +165,7 @@ def make_definitive_attitude(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude",
-    Returns("The jobs.", DefinitiveJobList),
-    problems=(404,),
+    "GET /spacecraft/{name}/definitive-attitude", Returns("The jobs.", DefinitiveJobList)
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     """The jobs of a spacecraft since the start of the service, the newest first."""
@@ -186,9 +173,7 @@ def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude/{id}",
-    Returns("The job.", DefinitiveJob),
-    problems=(404,),
+    "GET /spacecraft/{name}/definitive-attitude/{id}", Returns("The job.", DefinitiveJob)
 )
 def get_definitive_attitude(
     name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep
@@ -203,7 +188,7 @@ tracks_router = ApiRouter("products")
 @tracks_router.serves(
     "GET /spacecraft/{name}/tracks",
     Returns("The tracks.", TrackList, also=params.TDM_MEDIA_TYPE),
-    problems=(404, 503),
+    problems=(503,),
 )
 def list_tracks(
     name: SpacecraftPath, query: FromQuery[params.TracksQuery], app: AppDep

@@ -15,7 +15,7 @@ from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
-from service.web.requests.access import AuditDep, CallerDep, require_all_spacecraft
+from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response
 from service.web.requests.query_parameters import FromQuery, Query
 from service.web.requests.request_body import (
@@ -103,22 +103,17 @@ def list_runs(app: AppDep, caller: CallerDep) -> Response:
     return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
-@router.serves("PUT /runs/{run}", Returns("The run.", RunState), body=RunIn)
-def watch_run(run: RunPath, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+@router.serves("PUT /runs/{run}", Returns("The run.", RunState), body=RunIn, may_create=True)
+def watch_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Switch the alarms of a run on or off; creates the run if it does not exist."""
     asked = read_model(RunIn, body)
-    return json_response(app.runs.watch(run, asked.alarms, audited.entry()))
+    return json_response(app.runs.watch(run, asked.alarms, change.entry()))
 
 
 @router.serves(
-    "POST /runs/{run}/forget",
-    Returns("What is removed, or would be.", Forgotten),
-    body=ForgetIn,
-    problems=(404,),
+    "POST /runs/{run}/forget", Returns("What is removed, or would be.", Forgotten), body=ForgetIn
 )
-def forget_run(
-    run: RunPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def forget_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Remove what was recorded wrongly, with its trends and archived batches; it cannot be undone.
 
     The same batches can be recorded again afterwards. Alarms, events, notes and the audit list
@@ -126,13 +121,13 @@ def forget_run(
     """
     asked = read_model(ForgetIn, body)
     if asked.spacecraft is None:
-        require_all_spacecraft(caller)
+        require_all_spacecraft(change.caller)
     else:
-        caller.require(asked.spacecraft)
+        change.caller.require(asked.spacecraft)
     selected = ForgetFilter(run, asked.spacecraft, asked.batches, asked.gyro_blocks)
     if not asked.confirm:
         return json_response(app.runs.would_forget(selected))
-    return json_response(app.runs.forget(selected, audited.entry()))
+    return json_response(app.runs.forget(selected, change.entry()))
 
 
 @router.serves("GET /replays", Returns("The latest hundred replays.", ReplayList))
@@ -152,10 +147,7 @@ def list_replays(app: AppDep, caller: CallerDep) -> Response:
     problems=(503,),
 )
 def start_replay(
-    upload: Annotated[ReplayUpload, Depends(_telemetry)],
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    upload: Annotated[ReplayUpload, Depends(_telemetry)], app: AppDep, change: ChangeDep
 ) -> Response:
     """Accept a telemetry file and process it in the background.
 
@@ -174,15 +166,15 @@ def start_replay(
         query.run,
         name=query.run,
         total=body.lines,
-        caller=caller,
+        caller=change.caller,
         alarms=query.alarms,
-        entry=audited.entry(202) if query.alarms else None,
+        entry=change.entry(202) if query.alarms else None,
     )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(app.replays.get(id), 202, location)
 
 
-@router.serves("GET /replays/{id}", Returns("The replay.", Replay), problems=(404,))
+@router.serves("GET /replays/{id}", Returns("The replay.", Replay))
 def get_replay(id: ReplayId, app: AppDep) -> Response:
     """A replay and its progress."""
     return json_response(app.replays.get(id))
@@ -192,7 +184,7 @@ def get_replay(id: ReplayId, app: AppDep) -> Response:
     "DELETE /replays/{id}",
     Returns("The replay, now cancelled.", Replay),
     Returns("The replay, which will end soon.", Replay, status=202),
-    problems=(404, 409, 503),
+    problems=(409, 503),
 )
 def cancel_replay(id: ReplayId, app: AppDep, caller: CallerDep) -> Response:
     """Cancel a replay; the batches that it recorded stay."""

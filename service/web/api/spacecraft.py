@@ -39,9 +39,7 @@ def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: Call
     return json_response({"items": theirs})
 
 
-@router.serves(
-    "GET /spacecraft/{name}", Returns("The spacecraft.", models.SpacecraftState), problems=(404,)
-)
+@router.serves("GET /spacecraft/{name}", Returns("The spacecraft.", models.SpacecraftState))
 def get_spacecraft(
     name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep
 ) -> Response:
@@ -50,9 +48,7 @@ def get_spacecraft(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/latest",
-    Returns("The result and its batch.", Result, CONTENT_LOCATION),
-    problems=(404,),
+    "GET /spacecraft/{name}/latest", Returns("The result and its batch.", Result, CONTENT_LOCATION)
 )
 def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep) -> Response:
     """The newest current result of a run, by batch time; it may have no attitude.
@@ -66,9 +62,7 @@ def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: App
 
 
 @router.serves(
-    "GET /spacecraft/{name}/attitudes",
-    Returns("A page of attitudes.", models.AttitudePage, LINK),
-    problems=(404,),
+    "GET /spacecraft/{name}/attitudes", Returns("A page of attitudes.", models.AttitudePage, LINK)
 )
 def list_attitudes(
     request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
@@ -78,9 +72,7 @@ def list_attitudes(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/rates",
-    Returns("The buckets with batches.", models.RateList),
-    problems=(404,),
+    "GET /spacecraft/{name}/rates", Returns("The buckets with batches.", models.RateList)
 )
 def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: AppDep) -> Response:
     """Stars by outcome, in at most 20,000 buckets of batch time."""
@@ -90,7 +82,7 @@ def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: A
 @router.serves(
     "GET /spacecraft/{name}/history",
     Returns("The history, in the requested format.", models.History, THINNED, tables=True),
-    problems=(404, 503),
+    problems=(503,),
 )
 def get_history(
     name: SpacecraftPath,
@@ -128,9 +120,7 @@ def get_history(
     return json_response(history, headers=thinned_header(history.thinned))
 
 
-@router.serves(
-    "GET /spacecraft/{name}/worst", Returns("The worst batches.", models.Ranking), problems=(404,)
-)
+@router.serves("GET /spacecraft/{name}/worst", Returns("The worst batches.", models.Ranking))
 def list_worst(name: SpacecraftPath, query: FromQuery[params.WorstQuery], app: AppDep) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
     return json_response(app.spacecraft.ranking(name, **query.asked()))
@@ -180,7 +170,7 @@ class AdviceQuery(params.PeriodQuery):
 
 
 @advice_router.serves(
-    "GET /spacecraft/{name}/advice", Returns("The advice.", Advice), problems=(404, 503)
+    "GET /spacecraft/{name}/advice", Returns("The advice.", Advice), problems=(503,)
 )
 def get_advice(name: SpacecraftPath, query: FromQuery[AdviceQuery], app: AppDep) -> Response:
     """Recommended mission settings from recorded batches: tolerances, noise, alignment."""

@@ -12,7 +12,7 @@ from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.web.openapi import LINK, ApiRouter, Returns
-from service.web.requests.access import COOKIE, AuditDep, CallerDep
+from service.web.requests.access import COOKIE, CallerDep, ChangeDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.query_parameters import AuditQuery, FromQuery
 from service.web.requests.request_body import JsonBody, SessionBody, read_model
@@ -101,20 +101,20 @@ def list_tokens(app: AppDep) -> Response:
     body=TokenIn,
     problems=(409,),
 )
-def add_token(body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Make a token; the first one ends open access."""
     asked = read_model(TokenIn, body)
-    made = app.tokens.add(**asked.model_dump(), entry=audited.entry(201))
+    made = app.tokens.add(**asked.model_dump(), entry=change.entry(201))
     app.access.forget()
     return json_response(made, 201)
 
 
 @router.serves(
-    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(404, 503)
+    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(503,)
 )
-def revoke_token(token: TokenName, app: AppDep, audited: AuditDep) -> Response:
+def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     """Revoke a token at once, with the browser sessions that were begun with it."""
-    revoked = app.tokens.revoke(token, audited.entry())
+    revoked = app.tokens.revoke(token, change.entry())
     app.access.forget()
     return json_response(revoked)
 

@@ -13,7 +13,7 @@ from service.storage import webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
-from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.requests.access import ChangeDep, require_scope
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.query_parameters import Cursor, FromQuery, PageLimit, Query, Time
 from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_model
@@ -116,7 +116,7 @@ def list_webhooks(app: AppDep) -> Response:
     return json_response({"items": app.webhooks.all()})
 
 
-@router.serves("GET /webhooks/{id}", Returns("The webhook.", webhooks.Webhook), problems=(404,))
+@router.serves("GET /webhooks/{id}", Returns("The webhook.", webhooks.Webhook))
 def get_webhook(id: WebhookId, app: AppDep) -> Response:
     """One webhook."""
     return json_response(app.webhooks.get(id))
@@ -130,37 +130,30 @@ def get_webhook(id: WebhookId, app: AppDep) -> Response:
     body=WebhookIn,
     problems=(409,),
 )
-def add_webhook(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
+def add_webhook(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Register a receiver, which is sent the events from now on, signed (Standard Webhooks)."""
-    _require_reader(caller)
+    _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    added = app.webhooks.add(asked.settings(), caller, audited.entry(201))
+    added = app.webhooks.add(asked.settings(), change.caller, change.entry(201))
     return json_response(added, 201, {"Location": f"/api/v1/webhooks/{added.id}"})
 
 
-@router.serves(
-    "PUT /webhooks/{id}",
-    Returns("The webhook.", webhooks.Webhook),
-    body=WebhookIn,
-    problems=(404,),
-)
-def change_webhook(
-    id: WebhookId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+@router.serves("PUT /webhooks/{id}", Returns("The webhook.", webhooks.Webhook), body=WebhookIn)
+def change_webhook(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Replace all settings; a webhook that was paused or disabled goes on where it stopped."""
-    _require_reader(caller)
+    _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    return json_response(app.webhooks.change(id, asked.settings(), caller, audited.entry()))
+    return json_response(app.webhooks.change(id, asked.settings(), change.caller, change.entry()))
 
 
 @router.serves(
     "DELETE /webhooks/{id}",
     Returns("The webhook that was deleted.", webhooks.Webhook),
-    problems=(404, 503),
+    problems=(503,),
 )
-def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
+def delete_webhook(id: WebhookId, app: AppDep, change: ChangeDep) -> Response:
     """Delete a webhook with its queue and its dead letters."""
-    return json_response(app.webhooks.delete(id, audited.entry()))
+    return json_response(app.webhooks.delete(id, change.entry()))
 
 
 @router.serves(
@@ -168,23 +161,23 @@ def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
     Returns("The webhook, and its new secret this once.", webhooks.WebhookWithSecret),
     body=SecretIn,
     body_required=False,
-    problems=(404, 409),
+    problems=(409,),
 )
 def rotate_webhook_secret(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Make a new secret; deliveries are signed by the previous one too for some hours.
 
     A second time within these hours only with `previous_hours` 0, which ends both.
     """
     asked = read_model(SecretIn, body)
-    return json_response(app.webhooks.rotate(id, asked.previous_hours, audited.entry()))
+    return json_response(app.webhooks.rotate(id, asked.previous_hours, change.entry()))
 
 
 @router.serves(
     "POST /webhooks/{id}/test",
     Returns("What came of the attempt.", webhooks.WebhookTest),
-    problems=(404, 409, 503),
+    problems=(409, 503),
 )
 def test_webhook(id: WebhookId, app: AppDep) -> Response:
     """Send an event of the type `test` at once, and wait for the receiver's answer."""
@@ -194,7 +187,6 @@ def test_webhook(id: WebhookId, app: AppDep) -> Response:
 @router.serves(
     "GET /webhooks/{id}/deliveries",
     Returns("A page of deliveries.", webhooks.WebhookDeliveryPage, LINK),
-    problems=(404,),
 )
 def list_webhook_deliveries(
     id: WebhookId, request: Request, query: FromQuery[DeliveryQuery], app: AppDep
@@ -212,26 +204,24 @@ def list_webhook_deliveries(
     Returns("How many were queued.", webhooks.WebhookQueued),
     body=RetryIn,
     body_required=False,
-    problems=(404,),
 )
 def retry_dead_letters(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Send dead letters again; new events of the spacecraft do not wait for them."""
     asked = read_model(RetryIn, body)
-    return json_response(app.webhooks.retry(id, asked.events, audited.entry()))
+    return json_response(app.webhooks.retry(id, asked.events, change.entry()))
 
 
 @router.serves(
     "POST /webhooks/{id}/replay",
     Returns("How many were queued.", webhooks.WebhookQueued),
     body=ReplayEventsIn,
-    problems=(404,),
 )
-def replay_events(id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def replay_events(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Send the kept events of a period again, with the ids that they had."""
     asked = read_model(ReplayEventsIn, body)
-    return json_response(app.webhooks.replay(id, asked.since, asked.until, audited.entry()))
+    return json_response(app.webhooks.replay(id, asked.since, asked.until, change.entry()))
 
 
 def _require_reader(caller: Caller) -> None:

@@ -17,7 +17,6 @@ from fastapi.routing import APIRoute
 from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 from markupsafe import Markup
-from pydantic import Field
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
@@ -27,7 +26,6 @@ from service.access.tokens import Caller
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
-from service.observations.schema import RunName
 from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
@@ -38,7 +36,7 @@ from service.web.requests.dependencies import AppDep
 from service.web.requests.problem_types import ProblemType
 from service.web.requests.problems import faults_in_query, on_http_error, root_path
 from service.web.requests.query_parameters import FromQuery as FromQuery  # for pages
-from service.web.requests.query_parameters import Query
+from service.web.requests.query_parameters import Query, Run
 
 Handler = Callable[..., Any]
 
@@ -86,9 +84,7 @@ def navigation() -> list[ConsolePage]:
 class PageQuery(Query):
     """The run that a page shows; every page takes it."""
 
-    run: Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")] = (
-        LIVE
-    )
+    run: Run = LIVE
 
     def address(self, **changed: Any) -> dict[str, Any]:
         """The parameters of this page with some changed; those at their default are left out."""

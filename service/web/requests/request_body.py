@@ -117,11 +117,8 @@ def _limits(request: Request) -> BodyLimits:
     return limits
 
 
-def _media_type(request: Request) -> str:
-    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
-
-
-def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
+def _require_type(request: Request, allowed: tuple[str, ...]) -> str:
+    """The media type of a body, which must be one of these."""
     # Also a protection: pages of other sites can send only form types without a preflight.
     sent = request.headers.get("content-type", "")
     kind, _, parameters = sent.partition(";")
@@ -131,6 +128,7 @@ def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
         raise HTTPException(415, f"Content-Type must be {allowed[0]}, not {sent[:80] or 'absent'}")
     if parameters.startswith("charset=") and parameters not in ("charset=utf-8", "charset=utf8"):
         raise HTTPException(415, f"the body must be in UTF-8, not {parameters[:40]}")
+    return kind
 
 
 def _coding(request: Request, allowed: tuple[Coding, ...]) -> Coding:
@@ -216,8 +214,7 @@ async def telemetry_body(
 
     Lines (NDJSON) may be compressed.
     """
-    _require_type(request, (*NDJSON, PACKETS))
-    is_packets = _media_type(request) == PACKETS
+    is_packets = _require_type(request, (*NDJSON, PACKETS)) == PACKETS
     coding = _coding(request, ("identity",) if is_packets else ("identity", "gzip", "zstd"))
     limits = _limits(request)
     file = new_file()

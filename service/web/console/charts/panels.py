@@ -11,7 +11,7 @@ import numpy.typing as npt
 from service.filtering.result import Integers
 from service.filtering.state import Status
 from service.storage.grades.period import GradesOfPeriod
-from service.times import Utc
+from service.times import DAY_S, Utc
 from service.vectors import Vector
 
 Mask = npt.NDArray[np.bool_]
@@ -20,7 +20,6 @@ WIDTH, HEIGHT = 1280, 176
 PAD = 10
 FINE_HEIGHT = 10 * HEIGHT
 """The height of panels whose values are read to a thousandth of their range."""
-DAY_S = 86_400
 TIME_STEPS_S = (
     *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
     *(days * DAY_S for days in (1, 2, 7, 14, 28, 56, 91, 182)),

@@ -1,4 +1,4 @@
-"""The pages of batches: the list of a run, and one batch with star field, votes and what-if."""
+"""The pages of batches: the list, one with star field, votes and what-if; and of a picture."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -32,7 +32,14 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
+from service.web.console.page import (
+    HEADERS,
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    console_page,
+)
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
@@ -288,3 +295,28 @@ def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]
 def _listed(context: PageContext, run: str, spacecraft: str | None, text: str) -> list[Summary]:
     page = context.app.results.page(spacecraft=spacecraft, run=run, batch=text, limit=ROWS)
     return [each for each in page.items if context.caller.may_see(each.spacecraft)]
+
+
+# The script shows the drawn picture, which no address of the service has.
+_POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
+
+
+@console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
+def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
+    """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
+    missions = context.app.missions
+    cameras = [
+        (name, tracker.camera)
+        for name in context.spacecraft
+        if name in missions
+        for tracker in [each for each in missions[name].trackers if each.camera][:1]
+    ]
+    page = context.rendered(
+        "pictures.html.jinja",
+        query.run,
+        cameras=cameras,
+        most_mb=context.app.settings.frame_mb,
+        most_megapixels=context.app.settings.frame_megapixels,
+    )
+    page.headers["Content-Security-Policy"] = _POLICY
+    return page

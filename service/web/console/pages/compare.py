@@ -10,13 +10,18 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.runs import MOST_COMPARED
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison, RatesOfRuns
 from service.times import DAY_S, parse_utc, utc_now
 from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.options import asked_options, fields_of, settings_of_mission
+from service.web.console.options import (
+    asked_options,
+    faults_of_form,
+    fields_of,
+    settings_of_mission,
+)
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
@@ -60,10 +65,7 @@ async def _query(request: Request) -> CompareQuery:
     try:
         return CompareQuery.model_validate(plain)
     except ValidationError as error:
-        raise BadBatch(
-            Fault(".".join(map(str, each["loc"]))[:80], each["msg"], shown_value(each["input"]))
-            for each in error.errors()
-        ) from None
+        raise BadBatch(faults_of_form(error)) from None
 
 
 @console_page("/compare", "Compare", Policy("read", "nothing"), position=40)

@@ -69,8 +69,7 @@ class GradeOfFile:
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Attitudes of a period as files of every grade and format, and its tables."""
     context.app.context.mission(name)
-    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
-    shown = shown_period(context, name, query, latest)
+    shown = shown_period(context, name, query)
 
     def address(product: str, format: str, **more: str) -> str:
         assert shown is not None

@@ -175,9 +175,14 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
 
 
 def shown_period(
-    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary]
+    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary] | None = None
 ) -> ShownPeriod | None:
-    """The period that the address names; None without any batch."""
+    """The period that the address names; None without any batch.
+
+    It ends with the first of the `latest` batches, which are read where they are not known yet.
+    """
+    if latest is None:
+        latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     if not latest:
         return None
     # The latest batch belongs to the stretch, whose end does not.
