@@ -16,7 +16,7 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
-from service.simulate.drawing import Folder
+from studies.documents import Folder
 from studies.paper_1994.command import PAPER_IDENTIFIER, document
 from studies.paper_1994.command import measured as measured_times
 from studies.paper_1994.experiments import run_experiments

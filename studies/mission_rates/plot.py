@@ -9,7 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from service.errors import BadInput, Fault, shown_value
-from service.simulate.drawing import pictures_in
+from studies.documents import pictures_in
 from studies.mission_rates.report import TITLES, heading, meeting, met
 from studies.mission_rates.simulation import Plan, Rates
 

@@ -8,8 +8,7 @@ from typing import TextIO
 from tqdm import tqdm
 
 from service.errors import BadInput, Fault
-from service.simulate.drawing import pictures_in
-from studies.documents import json_rows, links
+from studies.documents import json_rows, links, pictures_in
 from studies.star_image_report import estimating, locating, mesh, optics, recognising, scanning
 from studies.star_image_report.claims import Claim, Row, Study
 
