@@ -244,7 +244,8 @@ the aperture wide, stand before the lens, and every star is a cross whose arms r
 The mission's camera has `psf = "cross"` ([missions.md](missions.md#the-image-of-a-star)); its stars
 are taken off the frame one behind the other before the next ones are looked for, and each is placed
 by the shape of the cross, with the arms of all others as its background. All light is of one
-colour, which the camera assumes too; in broad light the errors of places are not known.
+colour, which the camera assumes too; for light of many colours a camera has a `band_nm`
+([missions.md](missions.md#light-of-many-colours) has the figures).
 
 A star counts as found, and an attitude as right, as above: within {FOUND_PX:g} pixels, and
 within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it.

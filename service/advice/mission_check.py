@@ -200,13 +200,13 @@ def _trackers(mission: Mission) -> Iterator[Finding]:
 def _camera(key: str, tracker: Tracker) -> Iterator[Finding]:
     if tracker.camera is None:
         return
-    if tracker.camera.psf != "gaussian":
+    if tracker.camera.psf != "gaussian" and tracker.camera.band_nm is None:
         yield Finding(
             "unusual",
             f"{key}.camera.psf",
-            f"{tracker.camera.psf} is an image in light of one colour: without a narrow filter "
-            "stars leave light that it does not explain, and errors of places exceed their sigmas "
-            "by amounts that are not known",
+            f"{tracker.camera.psf} is an image in light of one colour: without a narrow filter, or "
+            "band_nm of the detector, stars leave light that it does not explain, and errors of "
+            "places exceed their sigmas by amounts that are not known",
         )
     corner_deg, file_deg = tracker.camera.corner_radius_deg, tracker.field_of_view_radius_deg
     if not math.isclose(corner_deg, file_deg, rel_tol=CORNER_SHARE):

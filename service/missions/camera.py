@@ -7,11 +7,12 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from service.missions.strict import Strict
+from service.missions.strict import Strict, is_missing
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 CentroidMethod = Literal["window", "scan", "matched", "recursive"]
 PsfKind = Literal["gaussian", "airy", "cross"]
+Wavelength = Annotated[float, Field(ge=100, le=5000)]
 Power = Annotated[int, Field(ge=0, le=12)]
 Terms = tuple[tuple[Power, Power, float], ...]
 Wire = tuple[
@@ -28,6 +29,9 @@ TWO_EACH_WAY: tuple[Wire, ...] = (
 MOST_COVERED = 0.6
 """Of the aperture: the wires may cover no more, counted one by one."""
 MOST_SAMPLED_SIGMA_PX = 5.0
+
+WIDEST_BAND = 2.0
+"""The longest wavelength of a band over its shortest."""
 
 MAX_SIDE_PX = 20_000
 MOST_STARS = 250
@@ -78,6 +82,10 @@ class Camera(Strict):
         default=TWO_EACH_WAY, max_length=32, exclude_if=TWO_EACH_WAY.__eq__
     )
     """Of the cross."""
+    band_nm: tuple[Wavelength, Wavelength] | None = Field(default=None, exclude_if=is_missing)
+    """The wavelengths between which the detector sees light; None: light of one colour.
+
+    `psf_sigma_px` is then that of the light in the middle of the band."""
     zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
     """Instrument magnitude of a star that gives one count a second; without it stars have none."""
     sigma_floor_px: float = Field(default=0.0, ge=0, le=10)
@@ -110,6 +118,19 @@ class Camera(Strict):
         if covered > MOST_COVERED:
             raise ValueError(
                 f"wires cover {covered:.0%} of the aperture; at most {MOST_COVERED:.0%} may be"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _band_is_of_an_aperture(self) -> Self:
+        if self.band_nm is None:
+            return self
+        if self.psf == "gaussian":
+            raise ValueError('band_nm belongs to the psf "airy" or "cross", not to "gaussian"')
+        shortest, longest = self.band_nm
+        if not shortest < longest <= WIDEST_BAND * shortest:
+            raise ValueError(
+                f"band_nm must rise, the longest at most {WIDEST_BAND:g} times the shortest"
             )
         return self
 

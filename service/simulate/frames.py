@@ -18,7 +18,14 @@ from typing import Any, BinaryIO, Literal, get_args
 import numpy as np
 
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.imaging.detection.star_image import TrailPsf, reach_px, still_psf, trails_px
+from service.imaging.centroids.psf import ColouredPsf, Psf
+from service.imaging.detection.star_image import (
+    TrailPsf,
+    psfs_of_colours,
+    reach_px,
+    still_psf,
+    trails_px,
+)
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera, PsfKind
@@ -41,6 +48,10 @@ MARGIN_PX = 10
 FAINT_REACHES = ((2e3, 16), (3e4, 48))
 """Below so many electrons, the image of an aperture is drawn no farther than so many pixels: a
 pixel beyond holds a tenth of an electron."""
+DRAWN_BV_MAG = (-0.4, -0.2, 0.0, 0.3, 0.6, 1.0, 1.4, 1.8, 2.4, 3.2)
+"""The colour indices of images that are computed; that of another star lies between two of them."""
+TYPICAL_BV_MAG = 0.65
+"""The colour of a star for which the catalog has none: the median to V 9."""
 FULL_SCALE = 65535
 
 
@@ -113,6 +124,7 @@ class _FrameStars:
     u_px: Vector
     v_px: Vector
     magnitude_mag: Vector
+    bv_mag: Vector
     trail_u_px: Vector
     trail_v_px: Vector = field(default_factory=lambda: np.zeros(0))
 
@@ -211,7 +223,9 @@ def _stars(
     inside = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
     row, u, v = row[inside], u[inside], v[inside]
     trails = trails_px(camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s)
-    return _FrameStars(row, u, v, everything.magnitude_mag[row], *trails)
+    bv_mag = everything.catalog.color_bv_mag[run.catalog_row[row]]
+    bv_mag = np.where(np.isfinite(bv_mag), bv_mag, TYPICAL_BV_MAG)
+    return _FrameStars(row, u, v, everything.magnitude_mag[row], bv_mag, *trails)
 
 
 def _exposed(
@@ -224,9 +238,11 @@ def _exposed(
     """The counts of one exposure, and how many cosmic rays hit."""
     light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
     flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
-    psf, half = still_psf(camera), reach_px(camera)
-    for u, v, along_u, along_v, flux in zip(
-        stars.u_px, stars.v_px, stars.trail_u_px, stars.trail_v_px, flux_e, strict=True
+    half = reach_px(camera)
+    for u, v, along_u, along_v, flux, psf in zip(
+        *(stars.u_px, stars.v_px, stars.trail_u_px, stars.trail_v_px),
+        *(flux_e, _psfs(camera, stars.bv_mag)),
+        strict=True,
     ):
         near = [reach for most_e, reach in FAINT_REACHES if flux < most_e]
         add_star(light_e, TrailPsf(psf, along_u, along_v), u, v, flux, min([half, *near]))
@@ -240,6 +256,20 @@ def _exposed(
     electrons += rng.normal(0.0, camera.read_noise_e, electrons.shape)
     counts = np.round(electrons / camera.gain_e_per_count + camera.bias_counts)
     return np.clip(counts, 0, min(camera.saturation_counts, FULL_SCALE)).astype(np.uint16), hits
+
+
+def _psfs(camera: Camera, bv_mag: Vector) -> list[Psf]:
+    """The still image of each star; in a band, of its own colour."""
+    if camera.psf == "gaussian" or camera.band_nm is None:
+        return [still_psf(camera)] * len(bv_mag)
+    images, known = psfs_of_colours(camera, DRAWN_BV_MAG), np.array(DRAWN_BV_MAG)
+    bv_mag = np.clip(bv_mag, known[0], known[-1])
+    redder = np.clip(np.searchsorted(known, bv_mag), 1, len(known) - 1)
+    share = (bv_mag - known[redder - 1]) / (known[redder] - known[redder - 1])
+    return [
+        ColouredPsf(images[k - 1], images[k], part)
+        for k, part in zip(redder.tolist(), share.tolist(), strict=True)
+    ]
 
 
 def add_star(

@@ -48,9 +48,9 @@ _LEFT_OUT = """\
   `acquire simulate mission` give the error of a camera's places and the rates of identification at
   a given error one after the other.
 - 2.5 to 2.7, plates and wedges: claims of IM-1; a camera has wires, and no other mask or plate.
-- 2.5, 7.1, colours: every star and its background have one spectrum, and the cameras' images
-  `airy` and `cross` are of one colour, so that in broad light the errors of their places are not
-  known.
+- 2.5, 7.1, colours: in these claims every star and its background have one spectrum. The cameras'
+  images `airy` and `cross` are of one colour, or of the camera's `band_nm` with a colour for each
+  star ([missions.md](missions.md#light-of-many-colours)).
 - 3.3, the synthesis of a filter from a wanted correlation: the report names three steps and gives
   none; nothing is made of it. Aperture times image width: it follows from 2.9 and is no claim of
   its own.

@@ -171,6 +171,53 @@ def _is_raster(u: Array, v: Array) -> bool:
     return bool(np.all(np.diff(u[0]) > 0.0) and np.all(np.diff(v[:, 0]) > 0.0))
 
 
+def psfs_in_colours(shortest: SampledPsf, longer: Array, weights: Array) -> list[SampledPsf]:
+    """The images in light of many colours, by that of the shortest wavelength of them.
+
+    An aperture's image grows with the wavelength: those of the colours, `longer` (n,) times as long
+    as the shortest, are summed with the `weights` (m, n), which are shares of photons, to m images.
+    """
+    rows, columns = shortest.image.shape
+    v = np.arange(-(rows // 2), rows // 2 + 1, dtype=np.float64)
+    u = np.arange(-(columns // 2), columns // 2 + 1, dtype=np.float64)
+    spline = RectBivariateSpline(v, u, shortest.image, kx=5, ky=5)
+    images = np.zeros((len(weights), rows, columns))
+    for ratio, shares in zip(longer.tolist(), weights.T, strict=True):
+        images += shares[:, None, None] * spline(v / ratio, u / ratio, grid=True) / ratio**2
+    return [
+        SampledPsf(image, shortest.samples_per_px, shortest.total, shortest.jitter_px)
+        for image in images
+    ]
+
+
+@dataclass(frozen=True)
+class ColouredPsf:
+    """The image of a star whose light is mixed of that of a blue star and that of a red one."""
+
+    blue: Psf
+    red: Psf
+    red_share: float = 0.5
+    """Below 0 and above 1 for stars bluer or redder than both."""
+
+    @property
+    def fwhm_px(self) -> float:
+        """The mean of both widths."""
+        return (1.0 - self.red_share) * self.blue.fwhm_px + self.red_share * self.red.fwhm_px
+
+    def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
+        """See `Psf`."""
+        blue, red = self.blue.pixel(du_px, dv_px), self.red.pixel(du_px, dv_px)
+        return (1.0 - self.red_share) * blue + self.red_share * red
+
+    def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
+        """See `Psf`."""
+        (blue_u, blue_v), (red_u, red_v) = (
+            each.slopes(du_px, dv_px) for each in (self.blue, self.red)
+        )
+        share = self.red_share
+        return (1.0 - share) * blue_u + share * red_u, (1.0 - share) * blue_v + share * red_v
+
+
 def airy_psf(
     lambda_over_d_px: float,
     obscuration: float = 0.0,

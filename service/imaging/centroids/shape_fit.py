@@ -8,12 +8,12 @@ pixels moving with the star.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.window import Array, Region, Window, square_about
+from service.imaging.centroids.psf import ColouredPsf, Psf
+from service.imaging.centroids.window import Array, Mask, Region, Window, square_about
 
 MOST_STEPS = 30
 ENOUGH_SIGMAS = 0.01
@@ -49,11 +49,12 @@ class Fit:
 class Linearised:
     """Pixels of a square against the shape at a presumed place and light.
 
-    `rows` (n, 3) are the changes with u, v and light; `left` is what the shape does not
-    explain; `variance` per pixel is that of the model, never of the noisy counts, which
-    would favour pixels that happened to be low.
+    `good` are the pixels used; `rows` (n, 3) are the changes with u, v and light; `left` is what
+    the shape does not explain; `variance` per pixel is that of the model, never of the noisy
+    counts, which would favour pixels that happened to be low.
     """
 
+    good: Mask
     rows: Array
     left: Array
     variance: Array
@@ -74,7 +75,7 @@ def linearised(region: Region, psf: Psf, u_px: float, v_px: float, flux: float) 
     )
     good = region.usable & (variance > 0.0)
     rows = np.stack([-flux * u_slope[good], -flux * v_slope[good], image[good]], axis=1)
-    return Linearised(rows, (region.light - model)[good], variance[good])
+    return Linearised(good, rows, (region.light - model)[good], variance[good])
 
 
 def first_flux(region: Region, psf: Psf, u_px: float, v_px: float) -> float:
@@ -116,6 +117,40 @@ def fit(
     if covariance is None:
         return None
     return Fit(u, v, flux, covariance, region, taken, converged)
+
+
+TYPICAL_RED_SHARE, RED_SHARE_SIGMA = 0.5, 0.4
+"""The colours of stars to V 9, as shares of the red one."""
+LEAST_RED_SHARE, MOST_RED_SHARE = -0.2, 1.3
+"""The colours of single stars: light that looks bluer or redder is blended."""
+
+
+def fit_in_its_colour(
+    window: Window, psf: Psf, start: tuple[float, float], half_width_px: int
+) -> tuple[Fit | None, Psf]:
+    """The best place with the image of the colour that the star itself shows, and that image.
+
+    What is known of stars' colours counts as a measurement.  Images of all colours are even and
+    their slopes odd, so that the colour's own error hardly moves a star.
+    """
+    found = fit(window, psf, start, half_width_px)
+    if found is None or not isinstance(psf, ColouredPsf):
+        return found, psf
+    region, flux = found.region, found.flux_counts
+    seen = linearised(region, psf, found.u_px, found.v_px, flux)
+    du, dv = region.du - (found.u_px - region.column), region.dv - (found.v_px - region.row)
+    redder = psf.red.pixel(du, dv) - psf.blue.pixel(du, dv)
+    rows = np.column_stack([seen.rows, flux * redder[seen.good]])
+    weighted = rows / seen.variance[:, None]
+    normal, right = weighted.T @ rows, weighted.T @ seen.left
+    normal[3, 3] += RED_SHARE_SIGMA**-2
+    right[3] += (TYPICAL_RED_SHARE - psf.red_share) * RED_SHARE_SIGMA**-2
+    try:
+        share = psf.red_share + float(np.linalg.solve(normal, right)[3])
+    except np.linalg.LinAlgError:
+        return found, psf
+    own = replace(psf, red_share=min(max(share, LEAST_RED_SHARE), MOST_RED_SHARE))
+    return fit(window, own, (found.u_px, found.v_px), half_width_px), own
 
 
 def region_after_step(

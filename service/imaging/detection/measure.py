@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.imaging.centroids.centroid import centroid
-from service.imaging.centroids.psf import Psf
+from service.imaging.centroids.psf import ColouredPsf, Psf
 from service.imaging.centroids.record import CentroidRecord
+from service.imaging.centroids.shape_fit import fit_in_its_colour
 from service.imaging.centroids.window import Window, cutout
 from service.imaging.detection.background import MESH_PX
 from service.imaging.detection.cosmic_rays import hits_under
@@ -81,14 +82,21 @@ def measure(
             for window, own in zip(windows, found.image_of[:count], strict=True)
         ]
     starts = list(zip(found.u_px.tolist(), found.v_px.tolist(), strict=True))
-    records = [centroid(windows[k], method, psfs[k], starts[k], half) for k in range(count)]
+
+    def placed(window: Window, k: int) -> CentroidRecord:
+        if isinstance(psfs[k], ColouredPsf):
+            at = starts[k][0] - window.corner_u_px, starts[k][1] - window.corner_v_px
+            _, psfs[k] = fit_in_its_colour(window, psfs[k], at, half)
+        return centroid(window, method, psfs[k], starts[k], half)
+
+    records = [placed(windows[k], k) for k in range(count)]
     for k, near in enumerate(_neighbours(found, count, half + MARGIN_PX + 2)):
         window = _without(windows[k], near, records, found, psfs) if near else windows[k]
         if near:
-            records[k] = centroid(window, method, psfs[k], starts[k], half)
+            records[k] = placed(window, k)
         if records[k].usable and (hits := hits_under(window, psfs[k], records[k])).any():
             clean = dataclasses.replace(window, good=window.usable & ~hits)
-            records[k] = centroid(clean, method, psfs[k], starts[k], half)
+            records[k] = placed(clean, k)
     flux = np.array([record.flux_counts for record in records], dtype=np.float64)
     magnitudes = camera.magnitude(flux, exposure_s)
     return _chosen(records, magnitudes.tolist(), faintest_mag, camera.most_stars)

@@ -1,14 +1,23 @@
 """The image of a star that a camera makes: still, and drawn out by the body's rates."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.centroids.psf import GaussianPsf, Psf, airy_psf, wired_psf
+from service.imaging.centroids.psf import (
+    ColouredPsf,
+    GaussianPsf,
+    Psf,
+    SampledPsf,
+    airy_psf,
+    psfs_in_colours,
+    wired_psf,
+)
+from service.imaging.optics import thermal
 from service.missions.camera import Camera, PsfKind, Wire
 from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector, rotate_about
@@ -23,6 +32,10 @@ REACH_OVER_AIRY = 45.0
 LEAST_REACH_PX, MOST_REACH_PX = 48, 160
 GAUSSIAN_REACH_PX = 8
 CORE_SIGMAS = 3.0
+COLOURS = 61
+"""Wavelengths that a band is summed over."""
+BLUE_BV_MAG, RED_BV_MAG = -0.2, 1.6
+"""Colour indices of the two stars that the images of all others are mixed of."""
 SHORT_TRAIL_PX = 0.1
 
 
@@ -36,7 +49,43 @@ def reach_px(camera: Camera) -> int:
 
 def still_psf(camera: Camera) -> Psf:
     """The image of a star that does not move; that of an aperture is kept once it is computed."""
+    if camera.psf != "gaussian" and camera.band_nm is not None:
+        blue, red = psfs_of_colours(camera, (BLUE_BV_MAG, RED_BV_MAG))
+        return ColouredPsf(blue, red)
     return _psf(camera.psf, camera.psf_sigma_px, camera.wires, reach_px(camera))
+
+
+def psfs_of_colours(camera: Camera, bv_mag: tuple[float, ...]) -> Sequence[Psf]:
+    """The still images of stars of some colour indices B-V, in the band of a camera.
+
+    Stars shine as black bodies (Ballesteros 2012), the detector counts photons.
+    """
+    assert camera.band_nm is not None
+    return _psfs(
+        camera.psf, camera.psf_sigma_px, camera.wires, reach_px(camera), camera.band_nm, bv_mag
+    )
+
+
+@lru_cache(maxsize=8)
+def _psfs(
+    kind: PsfKind,
+    sigma_px: float,
+    wires: tuple[Wire, ...],
+    reach: int,
+    band_nm: tuple[float, float],
+    bv_mag: tuple[float, ...],
+) -> Sequence[Psf]:
+    shortest, longest = band_nm
+    weights = []
+    for bv in bv_mag:
+        heat_k = 4600.0 * (1.0 / (0.92 * bv + 1.7) + 1.0 / (0.92 * bv + 0.62))
+        light = thermal(heat_k, shortest * 1e-9, longest * 1e-9, COLOURS)
+        photons = light.power * light.wavelength_m
+        weights.append(photons / photons.sum())
+    sharpest_px = sigma_px * shortest / (0.5 * (shortest + longest))
+    sharpest = _psf(kind, sharpest_px, wires, reach)
+    assert isinstance(sharpest, SampledPsf)
+    return psfs_in_colours(sharpest, light.wavelength_m * 1e9 / shortest, np.array(weights))
 
 
 @lru_cache(maxsize=8)
@@ -73,7 +122,7 @@ def psf_of(
             camera, tracker.body_from_tracker, rates_deg_per_s, u_px, v_px, exposure_s
         )
         return [
-            TrailPsf(still, u, v) if math.hypot(u, v) > SHORT_TRAIL_PX else still
+            _drawn_out(still, u, v) if math.hypot(u, v) > SHORT_TRAIL_PX else still
             for u, v in zip(*(each.tolist() for each in along), strict=True)
         ]
 
@@ -122,6 +171,14 @@ class TrailPsf:
             (self.trail_u_px * share, self.trail_v_px * share)
             for share in ((k + 0.5) / count - 0.5 for k in range(count))
         ]
+
+
+def _drawn_out(psf: Psf, u_px: float, v_px: float) -> Psf:
+    """The image with a trail; that of a band stays one of two colours."""
+    if isinstance(psf, ColouredPsf):
+        blue, red = TrailPsf(psf.blue, u_px, v_px), TrailPsf(psf.red, u_px, v_px)
+        return replace(psf, blue=blue, red=red)
+    return TrailPsf(psf, u_px, v_px)
 
 
 def trails_px(

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.shape_fit import fit
+from service.imaging.centroids.shape_fit import fit_in_its_colour
 from service.imaging.centroids.window import Array, Detector, Mask, Window, cutout
 from service.imaging.detection.cosmic_rays import is_sharp
 from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
@@ -170,7 +170,7 @@ class ImageSearch:
     def _placed(self, window: Window, at: tuple[float, float], psf: Psf) -> StarImage | None:
         """The star of a window where it fits best; None where there is no light to fit."""
         start = at[0] - window.corner_u_px, at[1] - window.corner_v_px
-        found = fit(window, psf, start, self._half)
+        found, psf = fit_in_its_colour(window, psf, start, self._half)
         if found is None or not found.signal_ratio >= BREAKDOWN_RATIO:
             return None
         u, v = found.u_px + window.corner_u_px, found.v_px + window.corner_v_px
