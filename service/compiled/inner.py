@@ -133,7 +133,7 @@ class _ForPython(CompilerBase):
         self.state.library.enable_object_caching()
         backend.create_library = partial(_BitcodeLibrary, backend)
         try:
-            return super().compile_extra(func)
+            return super().compile_extra(func)  # type: ignore[no-untyped-call]
         finally:
             del backend.create_library
 
