@@ -31,12 +31,12 @@ prewarm_kernels(sky, missions)
 batch = submission_from_json(sys.stdin.read()).batch
 print(json.dumps(acquire(batch, missions[batch.spacecraft], sky).solution.quaternion.tolist()))
 """
-SECONDS = 3_600.0
+SECONDS = 1_800.0
 
 
-@pytest.mark.torture
+@pytest.mark.slow
 def test_two_servers_four_workers_and_a_command_on_an_empty_folder_share_one_build(
-    tmp_path, monkeypatch, sky, missions, figures
+    tmp_path, monkeypatch, sky, missions
 ):
     folder = tmp_path / "kernels"
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
@@ -45,8 +45,8 @@ def test_two_servers_four_workers_and_a_command_on_an_empty_folder_share_one_bui
     command = [sys.executable, "-m", "service.cli", "replay", "--in-process"]
     command += [str(tmp_path / "first.ndjson"), "--results", str(tmp_path / "results.ndjson")]
     command += ["--database", sqlite_at(tmp_path / "replay.db")]
-    logs = [(tmp_path / f"{place}.log").open("w+b") for place in range(2)]
     with ExitStack() as stack:
+        logs = [stack.enter_context((tmp_path / f"{place}.log").open("wb")) for place in range(2)]
         servers = [
             stack.enter_context(serving(sqlite_at(tmp_path / f"{place}.db"), log))
             for place, log in enumerate(logs)
@@ -62,17 +62,15 @@ def test_two_servers_four_workers_and_a_command_on_an_empty_folder_share_one_bui
             found.append(json.loads(printed))
         for process, url in servers:
             wait_until(lambda p=process, u=url: is_ready(p, u), SECONDS, every_s=0.5)
-            answer = httpx.post(f"{url}/api/v1/batches", content=batch, timeout=60)
+            answer = httpx.post(f"{url}/api/v1/batches", json=json.loads(batch), timeout=60)
             assert answer.status_code == 201, answer.text
             found.append(answer.json()["attitude"]["quaternion"])
-    for log in logs:
-        log.seek(0)
-        assert b"Traceback" not in log.read()
+    for place in range(2):
+        assert "Traceback" not in (tmp_path / f"{place}.log").read_text()
     assert found == [pytest.approx(samples.QUATERNION, abs=1e-4)] * 7
     assert found == [pytest.approx(found[0], abs=1e-9)] * 7
     signatures = {}
     for path in folder.rglob("*.nbi"):
         _, _, overloads = pickle.loads(content_of(Path(path)))
         signatures[path.stem] = len(overloads)
-    figures["kernels"] = len(signatures)
     assert set(signatures.values()) == {1}
