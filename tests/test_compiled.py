@@ -172,7 +172,9 @@ def test_a_kernel_that_does_not_compile_holds_nobody_up(monkeypatch, tmp_path):
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
-def test_what_numba_adds_to_a_kernel_has_no_machine_code_either():
+def test_what_numba_adds_to_a_kernel_has_no_machine_code_either(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # nothing is compiled yet
+
     @njit
     def least(values):
         return np.sort(values)[0]
