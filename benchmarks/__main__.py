@@ -17,6 +17,7 @@ from benchmarks.report import Report
 from benchmarks.speed import (
     columns,
     exports,
+    first_posts,
     kernels,
     live_filter,
     packets,
@@ -76,6 +77,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "kernels": kernels.run,
     "columns": columns.run,
     "posts": posts.run,
+    "first_posts": first_posts.run,
     "live_filter": live_filter.run,
     "stored": stored.run,
     "scale": scale.run,

@@ -1,5 +1,6 @@
 """Kernels that borrow what they are given: nothing is counted, nothing is made, nothing leaks."""
 
+import fcntl
 import multiprocessing
 import sys
 import time
@@ -7,11 +8,13 @@ import time
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 from numba.core.caching import IndexDataCacheFile
 from numba.core.errors import NumbaError
 
 from service.attitude.covariance import information
 from service.attitude.quest import quest
+from service.compiled.inner import _BitcodeLibrary
 from service.compiled.jit import njit, njit_no_refcount
 from service.compiled.views import borrowed_view
 from service.identify.voting.fov_rotation import rotation_rad
@@ -128,3 +131,57 @@ def test_processes_that_save_one_kernel_at_once_lose_no_entry(monkeypatch, tmp_p
     assert (kept(np.int64(3)), kept(np.float64(3.0))) == (6, 6.0)
     assert sum(kept.stats.cache_hits.values()) == 2
     assert not kept.stats.cache_misses
+
+
+def _compile_counted(start, compiled):
+    """Compile a kernel when the others are ready, too, and count it where it was compiled."""
+    kernel = njit(_twice_the_sum.py_func)
+    start.wait(60)
+    with event.install_recorder("numba:compile") as recorder:
+        assert kernel(3) == 6
+    with compiled.get_lock():
+        compiled.value += any(each.is_start for _, each in recorder.buffer)
+
+
+def test_of_several_processes_that_need_a_kernel_one_compiles_it(monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    context = multiprocessing.get_context("spawn")
+    start, compiled = context.Barrier(4), context.Value("i", 0)
+    processes = [context.Process(target=_compile_counted, args=(start, compiled)) for _ in range(4)]
+    for each in processes:
+        each.start()
+    for each in processes:
+        each.join()
+        assert each.exitcode == 0
+    assert compiled.value == 1
+
+
+def test_a_kernel_that_does_not_compile_holds_nobody_up(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+
+    @njit
+    def halved(x):
+        return x / 2
+
+    for _ in range(2):
+        with pytest.raises(NumbaError):
+            halved("text")
+    assert halved(3.0) == 1.5
+    for lock in tmp_path.rglob("*.lock"):
+        with lock.open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def test_what_numba_adds_to_a_kernel_has_no_machine_code_either(monkeypatch, tmp_path):
+    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))  # nothing is compiled yet
+
+    @njit
+    def least(values):
+        return np.sort(values)[0]
+
+    with event.install_recorder("numba:compile") as recorder:
+        assert least(np.array([3.0, 1.0, 2.0])) == 1.0
+    added = {each.data["dispatcher"] for _, each in recorder.buffer} - {least}
+    libraries = [kind.library for each in added for kind in each.overloads.values()]
+    assert len(libraries) > 2
+    assert {type(library) for library in libraries} == {_BitcodeLibrary}

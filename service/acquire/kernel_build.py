@@ -212,7 +212,7 @@ def _compile(
 #
 # The size of machine code grows evenly with the time that its compiling takes.
 
-KERNEL_BYTES = 6_090_000
+KERNEL_BYTES = 3_010_000
 """The size of the machine code of all kernels, about; other processors differ by a tenth."""
 MOST_SHARE = 0.99
 """The largest share shown until it is over, since the size is not known to the last byte."""

@@ -4,6 +4,7 @@ numba optimises every kernel and makes machine code of it, with all that it call
 links it into its callers, where the same is done again: once for each level of calls.  That was
 half of the time of compiling.  Here a kernel that another one calls is only typed and translated;
 the one that Python calls is optimised as a whole, and it alone is kept in the cache on disk.
+The same is done with the functions of numba's own that a kernel calls, such as sorts.
 """
 
 import errno
@@ -12,9 +13,12 @@ import importlib
 import os
 import sys
 from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
+from llvmlite.binding import parse_assembly  # type: ignore[import-untyped]
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
@@ -51,7 +55,7 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         options["nopython"] = True
-        super().__init__(function, targetoptions=options)
+        super().__init__(function, targetoptions=options, pipeline_class=_ForPython)
         try:
             self._cache = _LockedCache(function)
         except RuntimeError:
@@ -63,9 +67,15 @@ class Kernel(CPUDispatcher):
                 os.environ.get("NUMBA_CACHE_DIR"),
             ) from None
         without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        self._inner = CPUDispatcher(
-            function, targetoptions=options | without, pipeline_class=_WithoutMachineCode
-        )
+        self._inner = CPUDispatcher(function, targetoptions=options | without)
+
+    def compile(self, sig: Any) -> Any:
+        """Load or compile the kernel for a signature."""
+        try:
+            return super().compile(sig)
+        except BaseException:
+            self._cache.unlock()
+            raise
 
     @property
     def _numba_type_(self) -> Any:
@@ -74,10 +84,9 @@ class Kernel(CPUDispatcher):
 
 
 class _LockedCache(FunctionCache):
-    """numba's cache on disk, which one process at a time writes to.
+    """numba's cache on disk; of several processes that need a kernel one compiles it.
 
-    numba reads the index, adds an entry and writes it again.  Two processes that save a kernel
-    with different signatures at once choose the same file for both, and one entry is lost.
+    The others wait, and load what it saved.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -85,37 +94,77 @@ class _LockedCache(FunctionCache):
         self._cache_file = CheckedFile(  # type: ignore[no-untyped-call]
             self._cache_path, self._impl.filename_base, self._impl.locator.get_source_stamp()
         )
+        self._lock: IO[str] | None = None
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load a kernel; if there is none, lock it until it is saved or `unlock` is called."""
+        load: Callable[..., Any] = super().load_overload
+        kernel = load(sig, target_context)
+        if kernel is None and self._lock is None:
+            with suppress(OSError):  # a folder that cannot be written: saving says so
+                self._impl.locator.ensure_cache_path()
+                place = Path(self.cache_path) / f"{self._impl.filename_base}.lock"
+                self._lock = place.open("w")
+                fcntl.flock(self._lock, fcntl.LOCK_EX)
+                kernel = load(sig, target_context)
+        if kernel is not None:
+            self.unlock()
+        return kernel
 
     def save_overload(self, sig: Any, data: Any) -> None:
-        """Save a kernel while no other process saves one of the same folder."""
-        self._impl.locator.ensure_cache_path()
-        with (Path(self.cache_path) / "saving.lock").open("w") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)  # closing the file unlocks it
-            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        """Save a kernel that was locked."""
+        super().save_overload(sig, data)  # type: ignore[no-untyped-call]
+        self.unlock()
+
+    def unlock(self) -> None:
+        """Let other processes load the kernel, or compile it."""
+        if self._lock is not None:
+            self._lock.close()
+            self._lock = None
 
 
-class _WithoutMachineCode(CompilerBase):
-    """numba's compiler, into a library without machine code."""
+class _ForPython(CompilerBase):
+    """numba's compiler, into a library with machine code; what it calls has none."""
+
+    def compile_extra(self, func: Any) -> Any:
+        """Compile a function."""
+        backend = self.state.targetctx.codegen()
+        self.state.library = _MachineCodeLibrary(backend, func.__qualname__)  # type: ignore[no-untyped-call]
+        self.state.library.enable_object_caching()
+        backend.create_library = partial(_BitcodeLibrary, backend)
+        try:
+            return super().compile_extra(func)  # type: ignore[no-untyped-call]
+        finally:
+            del backend.create_library
 
     def define_pipelines(self) -> list[Any]:
-        backend = self.state.targetctx.codegen()
-        name = self.state.func_id.func_qualname
-        self.state.library = _BitcodeLibrary(backend, name)  # type: ignore[no-untyped-call]
         build: Any = DefaultPassBuilder.define_nopython_pipeline
-        passes = build(self.state)
-        passes.finalize()
-        return [passes]
+        return [build(self.state)]
+
+
+class _MachineCodeLibrary(JITCodeLibrary):
+    """A kernel that Python calls; no kernel is linked with it.
+
+    The cache would keep its bitcode as well, for linking, which every process would load.
+    """
+
+    def _get_module_for_linking(self) -> Any:
+        """Functions of the same names, without code: numba finds the machine code by these."""
+        names = [each.name for each in self._final_module.functions if not each.is_declaration]
+        return parse_assembly(
+            "".join(f'define void @"{name}"() {{ ret void }}\n' for name in names)
+        )
 
 
 class _BitcodeLibrary(JITCodeLibrary):
-    """A kernel and what it calls, ready for linking and nothing else."""
+    """A function and what it calls, ready for linking and nothing else."""
 
     @property
     def codegen(self) -> Any:
         return _WithoutEnvironment(self._codegen)
 
     def _optimize_final_module(self) -> None:
-        """Left to the kernel that this one is linked into."""
+        """Left to the kernel that this function is linked into."""
 
     def _finalize_final_module(self) -> None:
         self._finalize_dynamic_globals()  # type: ignore[no-untyped-call]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.jit import njit, njit_no_refcount
+from service.compiled.jit import njit_inlined, njit_no_refcount
 from service.identify.hypotheses.evidence import LOG_PRIOR_AT_BEST, log_prior
 from service.identify.hypotheses.fitting import log_weight_bound
 from service.identify.hypotheses.ledger import (
@@ -63,7 +63,7 @@ def weight_bound(count, observed, stars, bounds):  # type: ignore[no-untyped-def
     return bounds[count]
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit_inlined
 def scan_pair(  # type: ignore[no-untyped-def]
     observed, stars, pairs, pair, accept_threshold, scratch, ledger, progress
 ):
@@ -110,7 +110,7 @@ def scan_pair(  # type: ignore[no-untyped-def]
     return progress
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit_inlined
 def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
     """Go once through the candidates of a scan; the progress.
 
@@ -171,7 +171,7 @@ def _score_candidates(observed, stars, pairs, scan, fewest, scratch, ledger, pro
     return progress
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit_inlined
 def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  # type: ignore[no-untyped-def]
     """Put zone stars a and b in the place of the observed pair, and consider what they match.
 
@@ -220,7 +220,7 @@ def _evaluate(observed, stars, scan, a, b, fewest, scratch, ledger, progress):  
     return matched, progress
 
 
-@njit(nogil=True, error_model="numpy", inline="always")
+@njit_inlined
 def _nearest_to_predicted(stars, scratch, a, b, k, taken):  # type: ignore[no-untyped-def]
     """The zone star where the pair (a, b) puts observed star k, -1 for none."""
     u, v, part = stars.direction[a], stars.direction[b], scratch.parts[k]
@@ -273,7 +273,7 @@ def _test(scratch, others, at):  # type: ignore[no-untyped-def]
     return alpha, beta, gamma, level_for(scratch.gate[k])
 
 
-@njit(nogil=True, inline="always")
+@njit_inlined
 def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[no-untyped-def]
     """Whether, 0 or 1, no star can stand where a pair u, v with the product w predicts one."""
     alpha, beta, gamma, level = test

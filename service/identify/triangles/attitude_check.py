@@ -16,6 +16,7 @@ from service.compiled.jit import njit
 from service.identify.hypotheses.fitting import fit_match
 from service.identify.hypotheses.local_search import LARGEST_GATE_RAD
 from service.identify.hypotheses.scene import scratch_for
+from service.sky.geometry.axes import axes_across
 from service.sky.geometry.pairs import separation_rad
 from service.sky.geometry.star_buckets import nearest
 
@@ -277,12 +278,8 @@ def _is_right_handed(observed, match, t, references):  # type: ignore[no-untyped
         count += 1
     norm = math.sqrt(centre[0] ** 2 + centre[1] ** 2 + centre[2] ** 2)
     centre /= norm
-    # Two axes across the centre.
-    axis = np.zeros(3)
-    axis[np.argmin(np.abs(centre))] = 1.0
-    u = np.cross(centre, axis)
-    u /= math.sqrt(u[0] ** 2 + u[1] ** 2 + u[2] ** 2)
-    v = np.cross(centre, u)
+    u, v = np.empty(3), np.empty(3)
+    axes_across(centre, u, v)
     sx = sy = sxx = sxy = syy = 0.0
     for k in range(len(match)):
         if match[k] >= 0:

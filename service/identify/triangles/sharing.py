@@ -7,15 +7,20 @@ image: one triangle seen from two of its corners says nothing twice.
 """
 
 import numpy as np
+import numpy.typing as npt
 
 from service.compiled.jit import njit
+
+Rows = npt.NDArray[np.int32]
+Held = npt.NDArray[np.bool_]
 
 LEAST_TRIANGLES = 2
 """In so many triangles a sharing star carries the same identity."""
 
 
-@njit(nogil=True)
-def count_pairs(image, star, stars, pair_image, pair_star, votes, held):  # type: ignore[no-untyped-def]
+def count_pairs(
+    image: Rows, star: Rows, stars: int, pair_image: Rows, pair_star: Rows, votes: Rows, held: Held
+) -> int:
     """Tally (observed star, catalog star) pairs over matches, the most votes first.
 
     `image` and `star` (m, 3) hold the three observed rows and the three catalog
@@ -24,61 +29,20 @@ def count_pairs(image, star, stars, pair_image, pair_star, votes, held):  # type
     `held`, each of length 3 m.  A vote is a distinct set of three observed
     stars; held is a pair of which some match has a sharing star.
     """
-    matches = len(image)
-    number, distinct = _numbered(image)
-    key = np.empty(3 * matches, np.int64)
-    for m in range(matches):
-        for corner in range(3):
-            key[3 * m + corner] = _pair(image, star, stars, m, corner) * distinct + number[m]
-    key.sort()
-    pair = np.empty(3 * matches, np.int64)
-    tally = np.zeros(3 * matches, np.int64)
-    count = 0
-    for at in range(len(key)):
-        if at > 0 and key[at] == key[at - 1]:
-            continue
-        if count == 0 or pair[count - 1] != key[at] // distinct:
-            pair[count] = key[at] // distinct
-            count += 1
-        tally[count - 1] += 1
-    pair, tally = pair[:count], tally[:count]
-    in_shared = np.zeros(count, np.bool_)
-    for m in range(matches):
-        place = np.empty(3, np.int64)
-        shares = False
-        for corner in range(3):
-            place[corner] = np.searchsorted(pair, _pair(image, star, stars, m, corner))
-            shares = shares or tally[place[corner]] >= LEAST_TRIANGLES
-        if shares:
-            in_shared[place] = True
-    ranked = np.argsort(-tally, kind="mergesort")
-    for at in range(count):
-        one = ranked[at]
-        pair_image[at], pair_star[at] = pair[one] // stars, pair[one] % stars
-        votes[at], held[at] = tally[one], in_shared[one]
+    low, middle, high = np.sort(image, axis=1).astype(np.int64).T
+    triples, number = np.unique((low << 40) | (middle << 20) | high, return_inverse=True)
+    distinct = max(len(triples), 1)
+    of_corner = image.astype(np.int64) * stars + star
+    counted = np.unique(of_corner * distinct + number[:, None]) // distinct
+    pair, tally = np.unique(counted, return_counts=True)
+    place = np.searchsorted(pair, of_corner)
+    is_held = np.zeros(len(pair), np.bool_)
+    is_held[place[(tally[place] >= LEAST_TRIANGLES).any(axis=1)]] = True
+    ranked = np.argsort(-tally, kind="stable")
+    count = len(pair)
+    pair_image[:count], pair_star[:count] = np.divmod(pair[ranked], stars)
+    votes[:count], held[:count] = tally[ranked], is_held[ranked]
     return count
-
-
-@njit(nogil=True)
-def _numbered(image):  # type: ignore[no-untyped-def]
-    """A number for each row of `image`, equal where it holds the same stars; how many there are."""
-    triple = np.empty(len(image), np.int64)
-    for m in range(len(image)):
-        a, b, c = np.sort(image[m])
-        triple[m] = (np.int64(a) << 40) | (np.int64(b) << 20) | np.int64(c)
-    order = np.argsort(triple)
-    number = np.empty(len(image), np.int64)
-    distinct = 0
-    for at in range(len(image)):
-        if at > 0 and triple[order[at]] != triple[order[at - 1]]:
-            distinct += 1
-        number[order[at]] = distinct
-    return number, distinct + 1
-
-
-@njit(nogil=True)
-def _pair(image, star, stars, m, corner):  # type: ignore[no-untyped-def]
-    return np.int64(image[m, corner]) * stars + np.int64(star[m, corner])
 
 
 @njit(nogil=True)

@@ -111,7 +111,8 @@ def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ign
         return 1, work
     held = np.empty(4 * len(near), np.int64)
     at, end = np.zeros(reach, np.int64), np.zeros(reach, np.int64)
-    held[: len(near)] = near
+    for i in range(len(near)):
+        held[i] = near[i]
     end[0] = len(near)
     depth = 0
     while depth >= 0:

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from service.compiled.jit import njit, njit_no_refcount
 from service.errors import BadInput, Fault
-from service.vectors import Vector, read_only
+from service.vectors import Vector, locked, read_only
 
 Indices = npt.NDArray[np.int32]
 
@@ -69,7 +69,7 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     Raises `BadInput` where there would be too many to keep.
     """
     limit = math.radians(separation_max_deg)
-    n = len(direction)
+    n, direction = len(direction), locked(direction)
     # A guess from how many there would be were the stars spread evenly over a tenth of the sky.
     share = min(1.0, 10.0 * math.sin(0.5 * min(limit, math.pi)) ** 2)
     capacity = min(MAX_PAIRS, int(0.5 * n * n * share) + 1024) + n
@@ -137,7 +137,8 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
     for row in range(n):
         at = place[cube[row]]
         rows[at] = row
-        ordered[at] = direction[row]
+        for i in range(3):
+            ordered[at, i] = direction[row, i]
         place[cube[row]] += 1
     # A little more than the chord: the separation decides.
     most = chord * chord * (1.0 + 1e-12)

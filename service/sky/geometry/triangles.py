@@ -22,7 +22,7 @@ import numpy.typing as npt
 
 from service.compiled.jit import njit
 from service.sky.geometry.kvector import KVector, build_kvector
-from service.vectors import Matrix, Vector, read_only
+from service.vectors import Matrix, Vector, locked, read_only
 
 SIDE_SCALE = 1e4
 """Sides are chords of the unit sphere times this, as in the paper: 5 deg is 872.4."""
@@ -133,15 +133,19 @@ def project(side: Matrix, axis: Vector, mean: Vector) -> Vector:
     return np.asarray((side - mean) @ axis)
 
 
-@njit(nogil=True)
-def nearest_slaves(direction, least, most, near):  # type: ignore[no-untyped-def]
+def nearest_slaves(direction: Vector, least: float, most: float, near: Slaves) -> None:
     """Into `near` (n, slaves) the rows nearest to each star, the nearest first, -1 for none.
 
     `least` and `most` bound the chord.  Of equally near ones the lower row
     comes first.
     """
+    order = np.argsort(direction[:, 2], kind="stable")
+    _choose_slaves(locked(direction), order, least, most, near)
+
+
+@njit(nogil=True)
+def _choose_slaves(direction, order, least, most, near):  # type: ignore[no-untyped-def]
     n, slaves = near.shape
-    order = np.argsort(direction[:, 2], kind="mergesort")
     distance2 = np.empty(slaves)
     for at in range(n):
         master = order[at]
@@ -176,12 +180,16 @@ def nearest_slaves(direction, least, most, near):  # type: ignore[no-untyped-def
                 near[master, place] = other
 
 
-@njit(nogil=True)
-def make_triangles(direction, near, star, side):  # type: ignore[no-untyped-def]
+def make_triangles(direction: Vector, near: Slaves, star: Slaves, side: Matrix) -> int:
     """Every master's triangles into `star` and `side`, both (N, 3); how many there are.
 
     One with the nearest or the second nearest slave each: five of four slaves.
     """
+    return int(_fill_triangles(locked(direction), near, star, side))
+
+
+@njit(nogil=True)
+def _fill_triangles(direction, near, star, side):  # type: ignore[no-untyped-def]
     count = 0
     for master in range(len(near)):
         for a in range(min(2, near.shape[1])):

@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.compiled.jit import njit
+from service.sky.geometry.axes import axes_across
 from service.vectors import Vector
 
 CELLS = 1248
@@ -109,18 +110,10 @@ def _disc(radius_rad: float) -> Vector:
 
 @njit(nogil=True, error_model="numpy")
 def _fill(direction, disc, bits):  # type: ignore[no-untyped-def]
+    p, q = np.empty(3), np.empty(3)
     for row in range(len(direction)):
         star = direction[row]
-        # Two directions across the star's.
-        least = 0
-        for i in range(3):
-            if abs(star[i]) < abs(star[least]):
-                least = i
-        axis = np.zeros(3)
-        axis[least] = 1.0
-        p = np.cross(star, axis)
-        p /= math.sqrt(p[0] * p[0] + p[1] * p[1] + p[2] * p[2])
-        q = np.cross(star, p)
+        axes_across(star, p, q)
         for at in range(len(disc)):
             a, b = disc[at, 0], disc[at, 1]
             cell = cell_of(

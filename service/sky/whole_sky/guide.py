@@ -56,15 +56,15 @@ def build_guide(run_catalog: RunCatalog, reach_deg: float, slaves: int = SLAVES)
 def densities(direction: Vector) -> Vector:
     """Stars per steradian about each star (n, 3), itself left out; the sky's mean at least."""
     crowd = np.zeros(len(direction), np.int64)
-    _count_near(direction, 2.0 * math.sin(CROWD_RAD / 2.0), crowd)
+    order = np.argsort(direction[:, 2])
+    _count_near(direction, order, 2.0 * math.sin(CROWD_RAD / 2.0), crowd)
     mean = len(direction) / (4.0 * math.pi)
     return np.maximum(mean, crowd / (2.0 * math.pi * (1.0 - math.cos(CROWD_RAD))))
 
 
 @njit(nogil=True)
-def _count_near(direction, most, count):  # type: ignore[no-untyped-def]
-    """Add to `count` (n,) how many others lie within a chord of each star."""
-    order = np.argsort(direction[:, 2])
+def _count_near(direction, order, most, count):  # type: ignore[no-untyped-def]
+    """Add to `count` (n,) how many others lie within a chord of each star; `order` is that of z."""
     for at in range(len(order)):
         one = order[at]
         for other_at in range(at + 1, len(order)):

@@ -1,0 +1,112 @@
+"""The first posts to a fresh server: how long the slowest of them takes, and what it needed.
+
+    python -m benchmarks first_posts
+
+Simulated telemetry of XTE, SWAS and SOHO with its usual errors, mixed, sent one post after
+another to a server that has just started, on a machine that has served them once: the kernels
+are compiled and the files of the sky are built, but no zone is in the new server's cache.  Some
+batches have a wrong a priori attitude: for those the service searches the whole sky.
+"""
+
+import http.client
+import json
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.bounds import at_least, at_most, equal
+from benchmarks.report import Report
+from benchmarks.speed.posts import API
+from benchmarks.speed.serving import Served, service
+from service.missions.mission import load_missions
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.sky.cache import LruCache
+from service.sky.catalog.star_catalog import load_embedded
+from service.sky.model import SkyModel
+
+MISSIONS = ("XTE", "SWAS", "SOHO")
+POSTS, QUICK_POSTS = 3_000, 300
+MOST_MS = 150.0
+LEAST_WHOLE_SKY = 0.01
+"""The share of posts for which the whole sky is searched."""
+
+
+class Post(NamedTuple):
+    """How long a post took, processor time of the server's threads, and which search it needed."""
+
+    wait_ms: float
+    processor_ms: float
+    status: int
+    spacecraft: str
+    batch: str
+    path: str
+
+
+def run(quick: bool, seed: int) -> Report:
+    """The benchmark."""
+    bodies = _bodies(QUICK_POSTS if quick else POSTS, seed)
+    with tempfile.TemporaryDirectory() as folder:
+        with service(Path(folder) / "once.db") as served:
+            once = _posted(served, bodies)
+        with service(Path(folder) / "fresh.db") as served:
+            posts = _posted(served, bodies)
+    waits = np.array([post.wait_ms for post in posts])
+    whole_sky = [post for post in posts if "lost_in_space" in post.path]
+    figures: dict[str, Any] = {
+        "posts": len(posts),
+        "posts that searched the whole sky": len(whole_sky),
+        "median, ms": float(np.median(waits)),
+        "99.9th percentile, ms": float(np.percentile(waits, 99.9)),
+        "slowest that searched the whole sky, ms": max(
+            (post.wait_ms for post in whole_sky), default=0.0
+        ),
+        "most processor time, ms": max(post.processor_ms for post in posts),
+        "slowest to the server before it, ms": max(post.wait_ms for post in once),
+    }
+    for place, post in enumerate(sorted(posts, reverse=True)[:5], 1):
+        what = f"{post.processor_ms:.1f} ms of processor time, {post.spacecraft} {post.batch}"
+        figures[f"slowest {place}"] = f"{post.wait_ms:.1f} ms: {what}, {post.path}"
+    bounds = [
+        at_most("slowest post", float(waits.max()), MOST_MS, "ms"),
+        equal("posts answered with 201", sum(post.status == 201 for post in posts), len(bodies)),
+        at_least("share of the whole sky", len(whole_sky) / len(posts), LEAST_WHOLE_SKY),
+    ]
+    return Report("first_posts", figures, bounds)
+
+
+def _bodies(count: int, seed: int) -> list[dict[str, Any]]:
+    """Batches of the missions in turn."""
+    sky, missions = SkyModel(load_embedded(), LruCache(64 << 20)), load_missions()
+    wanted = Pass(batches=count // len(MISSIONS), seed=seed)
+    passes = [draw_pass(missions[name], sky, wanted) for name in MISSIONS]
+    return [drawn.batch for together in zip(*passes, strict=True) for drawn in together]
+
+
+def _posted(served: Served, bodies: Sequence[dict[str, Any]]) -> list[Post]:
+    connection = http.client.HTTPConnection("127.0.0.1", served.port, timeout=120)
+    posts = []
+    for body in bodies:
+        content = json.dumps(body).encode()
+        before_ms = _processor_ms(served)
+        started = time.perf_counter()
+        connection.request("POST", f"{API}/batches", content, {"Content-Type": "application/json"})
+        answer = connection.getresponse()
+        received = answer.read()
+        wait_ms = 1e3 * (time.perf_counter() - started)
+        path = json.loads(received)["path"]
+        spent_ms = _processor_ms(served) - before_ms
+        posts.append(
+            Post(wait_ms, spent_ms, answer.status, body["spacecraft"], body["batch"], path)
+        )
+    connection.close()
+    return posts
+
+
+def _processor_ms(served: Served) -> float:
+    tasks = Path(f"/proc/{served.pid}/task").iterdir()
+    return sum(int((task / "schedstat").read_text().split()[0]) for task in tasks) / 1e6
