@@ -19,7 +19,6 @@ from service.access.audit import Entry
 from service.errors import BadInput, Conflict, Fault, Forbidden, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
 from service.storage.models.access import NewToken, Scope, Token, TokenState
-from service.storage.recording.identity import OwnKey
 from service.storage.recording.ids import Ulids
 from service.storage.sql.access_tables import access_sessions, access_tokens
 from service.times import DAY_S, shifted, utc_now
@@ -55,13 +54,6 @@ class Caller:
         if not self.may_see(spacecraft):
             theirs = ", ".join(sorted(self.spacecraft or ()))
             raise Forbidden(f"{self.name} is bound to {theirs}, not to {spacecraft[:128]}")
-
-
-def own_key(caller: Caller | None, key: str | None) -> OwnKey | None:
-    """An Idempotency-Key together with its caller's token; None without a key."""
-    if key is None:
-        return None
-    return (caller and caller.token_id) or "", key
 
 
 def new_secret() -> str:

@@ -23,9 +23,9 @@ from service.advice.tolerances import ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
 from service.advice.trials import VariantOutcome
 from service.app.context import Context
-from service.app.submissions import Submissions
 from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
+from service.ingest.submit import SubmissionService
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models.advice import (
@@ -56,7 +56,7 @@ NO_TOLERANCES = TolerancesIn()
 class AdviceService:
     """Computes advice, for one caller at a time."""
 
-    def __init__(self, context: Context, submissions: Submissions, zones: Zones) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService, zones: Zones) -> None:
         self._context = context
         self._zones = zones
         self._submissions = submissions
@@ -97,8 +97,8 @@ class AdviceService:
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.
-            run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
-            run_freely = partial(self._submissions.ingest.run_again, mission=mission)
+            run_again = partial(self._submissions.run_again, mission=mission.within_zones)
+            run_freely = partial(self._submissions.run_again, mission=mission)
             findings = advise(mission, drawn.batches, run_again, run_freely, own, pace)
             zone = zone_statements(mission, *self._zones.advised_size(name, run))
         finally:

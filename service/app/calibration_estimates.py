@@ -15,7 +15,6 @@ from msgspec import structs
 
 from service.acquire import Acquisition
 from service.app.context import Context
-from service.app.submissions import Submissions
 from service.calibration.elimination import NotObservable
 from service.calibration.estimate import (
     Calibration,
@@ -36,6 +35,7 @@ from service.calibration.mission_file import Lines, magnitude_lines, tracker_lin
 from service.calibration.stars import IdentifiedStars, joined
 from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.ingest.submit import SubmissionService
 from service.missions.corrections import AS_MEASURED, Magnitudes
 from service.missions.corrections import Calibration as FocalPlaneSettings
 from service.missions.mission import Mission, Tracker
@@ -145,7 +145,7 @@ class CalibrationRun:
 class Estimator:
     """Estimates calibrations; nothing is recorded and no setting is changed."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
 
@@ -198,7 +198,7 @@ class Estimator:
         until_s = time.monotonic() + LONGEST_WAIT_S
         while True:
             try:
-                return self._submissions.ingest.run_again(batch, mission.within_zones)
+                return self._submissions.run_again(batch, mission.within_zones)
             except Stopping:
                 raise
             except Busy:

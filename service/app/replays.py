@@ -14,15 +14,16 @@ from sqlalchemy import Connection
 from service.access.audit import Entry
 from service.access.tokens import Caller
 from service.app.context import Context, checked_run_name, known_id
-from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
+from service.gyro import GyroBlock
 from service.ingest.bulk import Bulk, Check
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
-from service.ingest.submit import GyroIntake
+from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.readers.decompress import Coding, unpacked_lines
 from service.packets.upload import PacketLines
+from service.storage.gyro import Recorded
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries.replays import (
     UNFINISHED,
@@ -78,7 +79,12 @@ class UploadForm:
 class Replays:
     """Starts, cancels and reports replays."""
 
-    def __init__(self, context: Context, submissions: Submissions, gyro: GyroIntake) -> None:
+    def __init__(
+        self,
+        context: Context,
+        submissions: SubmissionService,
+        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
+    ) -> None:
         self._context = context
         config = WorkerConfig(
             context.missions,
@@ -87,12 +93,11 @@ class Replays:
             context.settings.shelf_mb << 20,
         )
         self.bulk = Bulk(
-            submissions.ingest,
-            gyro,
+            submissions,
+            begin_block,
             context.store,
             config,
             context.settings.replay_processes,
-            submissions.require_kernels,
         )
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()

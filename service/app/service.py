@@ -14,9 +14,9 @@ from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
-from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy
 from service.ingest.solver_pool import mission_in_input
+from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
@@ -48,7 +48,7 @@ class Service:
     def __init__(
         self,
         context: Context,
-        submissions: Submissions,
+        submissions: SubmissionService,
         replays: Replays,
         kernels: KernelBuild | None,
         upgrade: BackgroundUpgrade,
@@ -159,7 +159,7 @@ class Service:
                 self._prewarm_sky([mission], sent.batch.time)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
-                    self._submissions.ingest.warm_up(structs.replace(sent, batch=batch))
+                    self._submissions.warm_up(structs.replace(sent, batch=batch))
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)

@@ -15,9 +15,8 @@ import msgspec
 from service.errors import AcquisitionError, Busy
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
-from service.ingest.outcomes import Answers
 from service.ingest.solver_pool import Solver
-from service.ingest.submit import GyroIntake, SubmissionService
+from service.ingest.submit import Answers, SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.batch import ObservationBatch
 from service.observations.schema import Submission, submission_from_json
@@ -169,16 +168,14 @@ class Bulk:
     def __init__(
         self,
         submissions: SubmissionService,
-        gyro: GyroIntake,
+        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
         store: Store,
         config: WorkerConfig,
         workers: int,
-        require_kernels: Require,
     ) -> None:
-        """`require_kernels` raises `Busy` while kernels are compiled."""
+        """`begin_block` queues a gyro block; see `Gyro.begin`."""
         self._submissions = submissions
-        self._require_kernels = require_kernels
-        self.gyro = gyro
+        self.begin_block = begin_block
         self._store = store
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
             config, solve_lines, workers
@@ -217,7 +214,7 @@ class Bulk:
         ends that where it raises.
         """
         # Without them each worker would compile what it does not find.
-        self._require_kernels()
+        self._submissions.require_kernels()
         self.workers.start()
         self._submissions.yield_to_interactive()
         named = [identity_in(text, run) for text in texts]
@@ -300,7 +297,7 @@ class BulkChunk:
 
     def _begin_block(self, block: GyroBlock) -> Callable[[], LineAnswer]:
         try:
-            return self._bulk.gyro.begin(block)
+            return self._bulk.begin_block(block)
         except Busy:
             raise
         except AcquisitionError as error:
@@ -375,7 +372,9 @@ class BulkChunk:
     def _repeat(
         self, text: bytes, seen: RecordedLine
     ) -> UnsavedResult | TrackedLine | Answered | AcquisitionError:
-        first = self._registry.first(seen.identity, None, seen.fingerprint)
+        first = self._registry.holder(seen.identity, None, seen.fingerprint)
+        if isinstance(first, AcquisitionError):
+            return first
         if first is None:
             # It is not called what it seemed to be called.
             submission = submission_from_json(text, run=self._lines.run)

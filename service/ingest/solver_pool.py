@@ -21,7 +21,6 @@ from service.errors import (
     Stopping,
     shown_value,
 )
-from service.ingest.tracking import asks_for_last
 from service.missions.mission import Mission, mission_named
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.schema import Submission
@@ -83,7 +82,12 @@ class Solver:
 
         False for an unknown spacecraft, whose batch is refused.
         """
-        return asks_for_last(batch, self.missions.get(batch.spacecraft))
+        if batch.tracking is not None:
+            return not batch.tracking.resolved
+        mission = self.missions.get(batch.spacecraft)
+        settings = None if mission is None else mission.tracking
+        is_default = settings is not None and settings.default
+        return is_default and batch.a_priori is None and batch.measurement is None
 
     def solve(
         self,

@@ -40,14 +40,6 @@ SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
 
 
-def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
-    """True if the attitude of a batch is to be predicted from the record."""
-    if batch.tracking is not None:
-        return not batch.tracking.resolved
-    is_default = mission is not None and mission.tracking is not None and mission.tracking.default
-    return is_default and batch.a_priori is None and batch.measurement is None
-
-
 def last_results(connection: Connection, batch: ObservationBatch, mission: Mission) -> list[str]:
     """The results whose attitudes the prediction of a batch begins with."""
     settings = mission.tracking or TrackingSettings()

@@ -95,23 +95,25 @@ class Registry:
     identities: dict[Identity, ExistingResult] = field(default_factory=dict)
     keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
 
-    def first(
+    def holder(
         self, identity: Identity, key: OwnKey | None, fingerprint: str
-    ) -> ExistingResult | None:
-        """The recorded result of this body; None: there is none.
+    ) -> ExistingResult | KeyReused | Conflict | None:
+        """The recorded result of this body, or None; the error where it is of another body.
 
-        Raises `KeyReused` where the key belongs to another body, which is
+        That is `KeyReused` where the key belongs to another body, which is
         looked at first, and `Conflict` where the identity does.
         """
         by_key = None if key is None else self.keys.get(key)
         if key is not None and by_key is not None:
             if by_key.fingerprint != fingerprint:
-                raise KeyReused(f"Idempotency-Key {shown_value(key[1])} was used with another body")
+                return KeyReused(
+                    f"Idempotency-Key {shown_value(key[1])} was used with another body"
+                )
             return by_key
         by_identity = self.identities.get(identity)
         if by_identity is not None and by_identity.fingerprint != fingerprint:
             spacecraft, run, batch = identity
-            raise Conflict(
+            return Conflict(
                 f"{spacecraft}, run {run}: batch {shown_value(batch)} is recorded with another body"
             )
         return by_identity
@@ -160,7 +162,10 @@ def remember_key(
     connection: Connection, identity: Identity, key: OwnKey, taken: ExistingResult
 ) -> None:
     """Give a key to a body that is recorded without it; raises `KeyReused` if another has it."""
-    if look_up(connection, (), [key]).first(identity, key, taken.fingerprint) is None:
+    holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
+    if isinstance(holder, KeyReused | Conflict):
+        raise holder
+    if holder is None:
         connection.execute(insert(idempotency_keys), key_row(key, taken))
 
 

@@ -176,11 +176,11 @@ def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | Acqu
     """The holder of an identity and key: an earlier result, or from now on the unsaved one."""
     if unsaved.batch is None:
         return ExistingResult(unsaved.id, "")
-    try:
-        first = registry.first(unsaved.identity, unsaved.key, unsaved.batch["fingerprint"])
-    except AcquisitionError as error:
-        return error
-    taken = first or ExistingResult(unsaved.id, unsaved.batch["fingerprint"])
+    fingerprint = unsaved.batch["fingerprint"]
+    holder = registry.holder(unsaved.identity, unsaved.key, fingerprint)
+    if isinstance(holder, AcquisitionError):
+        return holder
+    taken = holder or ExistingResult(unsaved.id, fingerprint)
     registry.enter(unsaved.identity, unsaved.key, taken)
     return taken
 

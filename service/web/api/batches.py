@@ -9,8 +9,8 @@ from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.submissions import MAX_ARRAY, Outcome
 from service.errors import BadBatch, BadInput, Fault
+from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.models.compare import Comparison
