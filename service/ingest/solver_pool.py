@@ -167,6 +167,8 @@ def may_take_long(batch: ObservationBatch) -> bool:
 
 def _most_stars(stars: TrackerStars) -> int:
     """The stars of a tracker; of a raster, as many as its lines can show."""
+    if not stars.readings:
+        return stars.count
     lines = [each for each in stars.readings if each is not None and each.kind == "lines"]
     # A star is a line that is brighter than its neighbours, in both directions.
     return stars.count + sum(min(len(each.h), len(each.v)) // 2 for each in lines)

@@ -3,9 +3,9 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from typing import Annotated, Any, TypeVar
 
@@ -41,8 +41,8 @@ from service.storage.recording.identity import (
     remember_key,
 )
 from service.storage.recording.results import record
-from service.storage.recording.transaction import WriteOutcomes
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
+from service.storage.recording.writer import WriteOutcomes
 from service.storage.store import Store
 from service.times import utc_now
 
@@ -106,7 +106,7 @@ class SubmissionService:
         self._single_s = -float("inf")
         self.observers: list[Observer] = []
         """Called with every batch that is new, after its commit."""
-        self.before_solving: Callable[[Connection], object] = lambda connection: None
+        self.before_solving: Callable[[Connection], object] | None = None
         """Called before each group of submissions is solved, with a connection for look-ups."""
 
     def require_kernels(self, *, of_zones: bool = False) -> None:
@@ -474,13 +474,19 @@ class SubmissionService:
         """
         # Identities before keys, each as of its moment: a batch recorded in between is found by
         # its key, or seems new, and then the transaction finds it.
-        with self._noted_failure(len(group)), self._store.lookup() as connection:
-            registry = look_up(
-                connection,
-                {each.identity for each in group},
-                {each.key for each in group if each.key is not None},
-            )
-            self.before_solving(connection)
+        try:
+            with self._store.lookup() as connection:
+                registry = look_up(
+                    connection,
+                    {each.identity for each in group},
+                    {each.key for each in group if each.key is not None},
+                )
+                if self.before_solving is not None:
+                    self.before_solving(connection)
+        except Busy:
+            # Batches that cannot be looked up cannot be written either.
+            self._store.writer.note_failure(len(group))
+            raise
         holders = [registry.holder(e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}
@@ -519,15 +525,6 @@ class SubmissionService:
             return repeated
 
         return keep_key
-
-    @contextmanager
-    def _noted_failure(self, count: int) -> Iterator[None]:
-        """Batches that cannot be looked up cannot be written either."""
-        try:
-            yield
-        except Busy:
-            self._store.writer.note_failure(count)
-            raise
 
     def _note_outcome(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
         """Tell the observers of a new batch; a what-if holds the stars of one that is known."""

@@ -26,7 +26,8 @@ from service.storage.models.charts import (
     StarField,
     TrackerField,
 )
-from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
+from service.storage.recording.result_metrics import catalog_rows, tracker_rows
+from service.storage.sql.columns import Row
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,

@@ -13,7 +13,6 @@ from service.acquire.result import RivalAttitude, TrackerResult
 from service.identify.identification import Outcome
 from service.observations.batch import PredictedPrior
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.zones import SearchRegion
 from service.storage.models.answers import (
     Answer,
     Attitude,
@@ -133,23 +132,19 @@ def rows_of_stars(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> TrackerStars:
-    return TrackerStars(
-        tracker=result.corrected.tracker.name,
-        zone=None if result.region is None else _zone(result, result.region),
-        stars=_stars(result, run_catalog),
-    )
-
-
-def _zone(result: TrackerResult, region: SearchRegion) -> SearchedZone:
-    ra_deg, dec_deg = ra_dec_of(region.axis)
-    return SearchedZone(
-        kind=region.kind,
-        ra_deg=ra_deg,
-        dec_deg=dec_deg,
-        stars=result.stars,
-        pairs=result.pairs,
-        cached=result.zone_cached,
-    )
+    region, zone = result.region, None
+    if region is not None:
+        ra_deg, dec_deg = ra_dec_of(region.axis)
+        zone = SearchedZone(
+            kind=region.kind,
+            ra_deg=ra_deg,
+            dec_deg=dec_deg,
+            stars=result.stars,
+            pairs=result.pairs,
+            cached=result.zone_cached,
+        )
+    stars = _stars(result, run_catalog)
+    return TrackerStars(tracker=result.corrected.tracker.name, zone=zone, stars=stars)
 
 
 def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[Star]:
@@ -228,9 +223,11 @@ def _attitude(acquisition: Acquisition) -> Attitude | None:
 
 
 def _tracking(acquisition: Acquisition) -> Tracking | UnsetType:
-    asked, state = acquisition.batch.tracking, acquisition.tracking_state
-    if asked is None or state is None:
+    asked = acquisition.batch.tracking
+    if asked is None:
         return UNSET
+    state = acquisition.tracking_state
+    assert state is not None
     predicted = acquisition.batch.a_priori
     prediction = None
     if isinstance(predicted, PredictedPrior):

@@ -7,17 +7,17 @@ from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
 from service.storage.recording import events
-from service.storage.recording.digests import digest_of_row
 from service.storage.recording.identity import (
     ExistingResult,
     PredictionOutdated,
     Registry,
+    digest_of_row,
     key_row,
     look_up,
     require_not_archived,
     stored_answers,
 )
-from service.storage.recording.tracker_values import split_anew
+from service.storage.recording.result_metrics import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
@@ -150,6 +150,8 @@ def _outdated(
     the same spacecraft and run.  All locks are taken first, and in order.
     """
     asked = [unsaved for unsaved in unsaved_results if unsaved.is_outdated is not None]
+    if not asked:
+        return {}
     for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved in asked}):
         execute(connection, _LOCK_SEQUENCE, {"pair": pair})
     return {
@@ -202,8 +204,9 @@ def _insert(
     if len(known) > _REMEMBERED:
         known.clear()
     missing = [name for name in sorted(names) if not assume_new or name not in known]
-    insert_runs(connection, {name: names[name] for name in missing})
-    known.update(missing)
+    if missing:
+        insert_runs(connection, {name: names[name] for name in missing})
+        known.update(missing)
     insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
     require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])
     insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])

@@ -19,9 +19,8 @@ from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
-from service.storage.recording.digests import digest_of
-from service.storage.recording.result_metrics import metrics_of
-from service.storage.recording.tracker_values import values_of_trackers
+from service.storage.recording.identity import digest_of
+from service.storage.recording.result_metrics import metrics_of, values_of_trackers
 from service.storage.sql.columns import Row
 from service.times import Utc
 
@@ -133,10 +132,9 @@ def unsaved_submission(
         frame=UNSET if submission.frame is None else _frame_of(submission.frame),
         warnings=[warning] if is_ahead else (),
     )
-    result = _result_row(
-        acquisition, answer, batch_id=id, parent=None, current=True, created=received
+    unsaved = _unsaved_result(
+        acquisition, answer, row, key, batch_id=id, parent=None, current=True, created=received
     )
-    unsaved = _unsaved_result(acquisition, answer, row, result, key)
     if submission.frame is not None:
         unsaved.frame = _frame_row(submission.frame, id)
     return unsaved
@@ -153,31 +151,54 @@ def unsaved_what_if(
 ) -> UnsavedResult:
     """A further result of a batch, current if it is to be adopted."""
     answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
-    result = _result_row(
-        acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
+    return _unsaved_result(
+        *(acquisition, answer, None, None),
+        batch_id=batch_id,
+        parent=parent,
+        current=adopt,
+        created=created,
     )
-    return _unsaved_result(acquisition, answer, None, result, None)
 
 
 def _unsaved_result(
     acquisition: Acquisition,
     answer: Answer,
     batch_row: Row | None,
-    result: Row,
     key: tuple[str, str] | None,
+    *,
+    batch_id: str,
+    parent: str | None,
+    current: bool,
+    created: Utc,
 ) -> UnsavedResult:
-    batch = acquisition.batch
-    stars = rows_of_stars(answer)
-    solution = _solution_row(acquisition, answer, result["id"])
+    batch, attitude = acquisition.batch, answer.attitude
+    result = {
+        "id": answer.id,
+        "batch_id": batch_id,
+        "parent_id": parent,
+        "current": current,
+        "created": created.text,
+        "spacecraft": batch.spacecraft,
+        "run": batch.run,
+        "time_ns": batch.time.tai_ns,
+        "identifier": answer.identifier,
+        "options": options_text(acquisition),
+        "mission_digest": answer.provenance.mission,
+        "catalog_digest": answer.provenance.catalog,
+        **structs.asdict(answer.counts),
+        "status": attitude and attitude.status,
+        "reason": answer.reason,
+        **metrics_of(acquisition),
+    }
     return UnsavedResult(
         (batch.spacecraft, batch.run, batch.batch),
         msgspec.json.encode(answer),
         batch_row,
         result,
-        stars,
-        solution,
+        rows_of_stars(answer),
+        _solution_row(acquisition, answer, result["id"]),
         key,
-        trackers=values_of_trackers(acquisition, answer, result["batch_id"]),
+        trackers=values_of_trackers(acquisition, answer, batch_id),
     )
 
 
@@ -195,37 +216,6 @@ def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
         "detections": json.dumps({"stars": list(frame.stars), "hot_or_cosmic_px": frame.sharp}),
         "preview": frame.preview,
         "preview_step": frame.preview_step,
-    }
-
-
-def _result_row(
-    acquisition: Acquisition,
-    answer: Answer,
-    *,
-    batch_id: str,
-    parent: str | None,
-    current: bool,
-    created: Utc,
-) -> Row:
-    batch = acquisition.batch
-    attitude = answer.attitude
-    return {
-        "id": answer.id,
-        "batch_id": batch_id,
-        "parent_id": parent,
-        "current": current,
-        "created": created.text,
-        "spacecraft": batch.spacecraft,
-        "run": batch.run,
-        "time_ns": batch.time.tai_ns,
-        "identifier": answer.identifier,
-        "options": options_text(acquisition),
-        "mission_digest": answer.provenance.mission,
-        "catalog_digest": answer.provenance.catalog,
-        **structs.asdict(answer.counts),
-        "status": attitude and attitude.status,
-        "reason": answer.reason,
-        **metrics_of(acquisition),
     }
 
 

@@ -27,7 +27,6 @@ from service.web.requests.access import AuditDep, CallerDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
     MetricsDep,
-    answer_response,
     json_response,
     page_response,
 )
@@ -38,17 +37,18 @@ from service.web.requests.query_parameters import (
     Comment,
     Time,
     Who,
-    require_no_query,
 )
 from service.web.requests.request_body import (
     BINARY,
+    JSON,
     NO_IDEMPOTENCY_KEY,
     NO_KEY_OF_MANY,
     JsonBody,
     idempotency_key,
-    json_body,
+    read_json,
     read_model,
     refused,
+    require_no_query,
 )
 
 router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
@@ -75,6 +75,15 @@ class WhatIfIn(Wire):
     comment: Comment = None
 
 
+def answer_response(answered: Answered, recorded: bool = True) -> Response:
+    """An answer to a batch: new and recorded, recorded before, or not recorded at all."""
+    if not recorded:
+        return Response(answered.body, media_type=JSON)
+    if answered.replayed:
+        return Response(answered.body, 200, {"Replayed": "true"}, JSON)
+    return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
+
+
 @router.post(
     "",
     **route_docs(
@@ -90,7 +99,7 @@ class WhatIfIn(Wire):
 async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
     await require_no_query(request)
-    body = await json_body(request)
+    body = await read_json(request, request.app.state.limits.json_bytes)
     key = await idempotency_key(request)
     held = request.app.state
     try:

@@ -17,11 +17,10 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import CoreSchema, core_schema
-from starlette.requests import Request
 
 from service.alarms.quantities import QuantityName, RankedName, trend_names
 from service.app.products import TableKind
-from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.errors import BadInput
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
 from service.products.attitudes import ProductGrade, StatusWanted
@@ -32,6 +31,7 @@ from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
+from service.web.requests.request_body import require_no_query
 
 MAX_LIMIT = 500
 
@@ -346,16 +346,6 @@ class LimitQuery(Query):
 
 class LimitStatementQuery(StatementQuery, LimitQuery):
     """Whose limits change, who changes them, and a comment on it."""
-
-
-async def require_no_query(request: Request) -> None:
-    """Raise `BadBatch` for every parameter that a request brings."""
-    faults = [
-        Fault(name[:80], "unknown parameter; this route has none", shown_value(value))
-        for name, value in request.query_params.items()
-    ]
-    if faults:
-        raise BadBatch(faults)
 
 
 NO_QUERY = Depends(require_no_query)
