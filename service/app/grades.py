@@ -15,23 +15,9 @@ from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.day import LOOK_AHEAD_S, grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
-from service.storage.grades.days import (
-    DayKey,
-    DefinitiveJob,
-    DefinitiveJobList,
-    GradedDayRow,
-    Innovation,
-    current_day,
-    record_day,
-    rows_of,
-)
+from service.storage.grades import days as recorded_days
+from service.storage.grades import period
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.grades.period import (
-    GradesOfPeriod,
-    evaluate_day,
-    grades_of_period,
-    list_innovations,
-)
 from service.storage.models.base import Page
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
@@ -72,7 +58,7 @@ class SmoothProgress:
     """
 
     total: int
-    days: list[GradedDayRow] = field(default_factory=list)
+    days: list[recorded_days.GradedDayRow] = field(default_factory=list)
     new: set[str] = field(default_factory=set)
     empty: int = 0
     archived: int = 0
@@ -116,7 +102,7 @@ class Grades:
         progress = SmoothProgress(len(days))
         step(progress)
         for day in days:
-            self._smooth_day(mission, DayKey(name, run, day), progress)
+            self._smooth_day(mission, recorded_days.DayKey(name, run, day), progress)
             step(progress)
         return progress
 
@@ -129,27 +115,29 @@ class Grades:
         end: Utc | None = None,
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[Innovation]:
+    ) -> Page[recorded_days.Innovation]:
         """How the measured attitudes of a period met the filter, the earliest first."""
         self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            return list_innovations(connection, selected, limit=limit, cursor=cursor)
+            return period.list_innovations(connection, selected, limit=limit, cursor=cursor)
 
-    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> GradesOfPeriod | None:
+    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> period.GradesOfPeriod | None:
         """A bounded number of samples and innovations of a period; None where none are recorded."""
         self._context.mission(name)
         with self._context.reading() as connection:
-            return grades_of_period(connection, name, run, start, end)
+            return period.grades_of_period(connection, name, run, start, end)
 
-    def _smooth_day(self, mission: Mission, key: DayKey, progress: SmoothProgress) -> None:
+    def _smooth_day(
+        self, mission: Mission, key: recorded_days.DayKey, progress: SmoothProgress
+    ) -> None:
         window = window_of(key.day)
         with self._context.reading() as connection:
             if holds_any(connection, key.spacecraft, key.run, *window):
                 progress.archived += 1
                 return
             recorded = recorded_in(connection, self._context.sky, key.spacecraft, key.run, *window)
-            before = current_day(connection, key)
+            before = recorded_days.current_day(connection, key)
         inputs = inputs_digest(recorded, mission)
         if before is not None and before.inputs == inputs:
             progress.days.append(before)
@@ -158,13 +146,13 @@ class Grades:
         if before is None and not graded.samples:
             progress.empty += 1
             return
-        rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
+        rows = recorded_days.rows_of(key, graded, inputs, self._ids.new(), utc_now())
 
-        def change(connection: Connection) -> GradedDayRow:
-            recorded_day = record_day(connection, key, rows)
+        def change(connection: Connection) -> recorded_days.GradedDayRow:
+            recorded_day = recorded_days.record_day(connection, key, rows)
             # Another process may have recorded the same meanwhile.
             if recorded_day.id == rows[0]["id"]:
-                evaluate_day(connection, mission, key, recorded_day)
+                period.evaluate_day(connection, mission, key, recorded_day)
             return recorded_day
 
         row = self._context.change(change)
@@ -185,7 +173,7 @@ class DefinitiveAttitudes:
         self._context, self._grades, self._kernels = context, grades, kernels
         self._ids = Ulids()
         self._lock = threading.Lock()
-        self._jobs: dict[str, DefinitiveJob] = {}
+        self._jobs: dict[str, recorded_days.DefinitiveJob] = {}
         self._worker = ThreadPoolExecutor(1, "definitive-attitude")
         self._stopped = threading.Event()
         self._schedule: threading.Thread | None = None
@@ -200,7 +188,7 @@ class DefinitiveAttitudes:
         start: Utc | None = None,
         end: Utc | None = None,
         who: str,
-    ) -> DefinitiveJob:
+    ) -> recorded_days.DefinitiveJob:
         """Queue a job for the UTC days of a period that have batches; without one, all days.
 
         Raises `Busy` where too many wait or kernels are still compiled, `Stopping` while the
@@ -211,7 +199,7 @@ class DefinitiveAttitudes:
         self._context.store.writer.require()
         if self._kernels is not None and self._kernels.is_needed:
             raise Busy("the kernels of the filter are still being compiled", 10)
-        job = DefinitiveJob(
+        job = recorded_days.DefinitiveJob(
             id=self._ids.new(),
             spacecraft=spacecraft,
             run=run,
@@ -237,14 +225,14 @@ class DefinitiveAttitudes:
             self._worker.submit(self._make, job.id, _Wanted(spacecraft, run, start, end))
         return job
 
-    def all(self, spacecraft: str) -> DefinitiveJobList:
+    def all(self, spacecraft: str) -> recorded_days.DefinitiveJobList:
         """The jobs of a spacecraft, the newest first."""
         self._context.mission(spacecraft)
         with self._lock:
             found = [each for each in self._jobs.values() if each.spacecraft == spacecraft]
-        return DefinitiveJobList(items=found[::-1])
+        return recorded_days.DefinitiveJobList(items=found[::-1])
 
-    def get(self, spacecraft: str, id: str) -> DefinitiveJob:
+    def get(self, spacecraft: str, id: str) -> recorded_days.DefinitiveJob:
         """One job; raises `NotFound`."""
         for job in self.all(spacecraft).items:
             if job.id == id:
@@ -267,7 +255,7 @@ class DefinitiveAttitudes:
             self._schedule.join()
         self._worker.shutdown(cancel_futures=True)
 
-    def begin_due(self, now: Utc) -> list[DefinitiveJob]:
+    def begin_due(self, now: Utc) -> list[recorded_days.DefinitiveJob]:
         """Queue a job for each mission whose last day is complete and not made yet."""
         today = shifted(now, -SETTLED_S).bucket(DAY_S)
         begun = []

@@ -7,15 +7,7 @@ from service.gyro import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
 from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import mission_named
-from service.storage.gyro import (
-    BlockFilter,
-    Recorded,
-    find_block,
-    list_blocks,
-    read_block,
-    record_block,
-    row_of,
-)
+from service.storage import gyro as blocks
 from service.storage.models.base import Page
 from service.storage.models.gyro import GyroBlockRow, GyroSamples
 from service.storage.recording.ids import Ulids
@@ -30,19 +22,19 @@ class Gyro:
         self._context = context
         self._ids = Ulids()
 
-    def submit(self, name: str, sent: bytes) -> Recorded:
+    def submit(self, name: str, sent: bytes) -> blocks.Recorded:
         """Record the block of a JSON body; see `record`."""
         mission_named(self._context.missions, name)
         return self.record(block_from_json(sent, name))
 
-    def record(self, block: GyroBlock) -> Recorded:
+    def record(self, block: GyroBlock) -> blocks.Recorded:
         """Record a block, and wait for that; a repeat of the same body gets the recorded one.
 
         See `begin` for what is refused.
         """
         return self.begin(block)()
 
-    def begin(self, block: GyroBlock) -> Callable[[], Recorded]:
+    def begin(self, block: GyroBlock) -> Callable[[], blocks.Recorded]:
         """Queue a block for the writer; to call what it gives waits until it is recorded.
 
         Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
@@ -52,15 +44,17 @@ class Gyro:
         """
         mission = mission_in_input(self._context.missions, block.spacecraft)
         require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
-        row = row_of(block, self._ids.new(), utc_now())
+        row = blocks.row_of(block, self._ids.new(), utc_now())
         store = self._context.store
         # Looked up here as well: an error in the writer's transaction would make it begin anew.
         with store.reading_record() as connection:
-            found = find_block(connection, block, row)
+            found = blocks.find_block(connection, block, row)
         if found is not None:
-            recorded = Recorded(found, replayed=True)
+            recorded = blocks.Recorded(found, replayed=True)
             return lambda: recorded
-        return store.writer.change(lambda connection: record_block(connection, block, row)).result
+        return store.writer.change(
+            lambda connection: blocks.record_block(connection, block, row)
+        ).result
 
     def page(
         self,
@@ -74,11 +68,11 @@ class Gyro:
     ) -> Page[GyroBlockRow]:
         """The blocks of a period without their samples, the earliest first."""
         self._context.mission(name)
-        selected = BlockFilter(name, run or LIVE, start, end)
+        selected = blocks.BlockFilter(name, run or LIVE, start, end)
         with self._context.reading() as connection:
-            return list_blocks(connection, selected, limit=limit, cursor=cursor)
+            return blocks.list_blocks(connection, selected, limit=limit, cursor=cursor)
 
     def get(self, name: str, id: str) -> GyroSamples:
         """A block of a spacecraft with its samples."""
         with self._context.reading() as connection:
-            return read_block(connection, name, known_id(id, "gyro block"))
+            return blocks.read_block(connection, name, known_id(id, "gyro block"))

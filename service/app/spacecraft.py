@@ -13,22 +13,14 @@ from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
+from service.storage.models import spacecraft as records
 from service.storage.models.base import Page
 from service.storage.models.overview import Fleet, Overview
-from service.storage.models.spacecraft import (
-    AttitudeRow,
-    History,
-    MissionNow,
-    Ranking,
-    Rates,
-    SpacecraftRow,
-    SpacecraftState,
-)
 from service.storage.projections import rollups
 from service.storage.queries import fleet, histories, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
-from service.storage.recording.tracker_values import is_waiting
+from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now, utc_of_unix
 
@@ -59,7 +51,7 @@ class Spacecraft:
         with self._context.reading() as connection:
             return fleet.fleet(connection, missions, run, period, utc_now(), spacecraft)
 
-    def states(self, run: str | None = None) -> list[SpacecraftRow]:
+    def states(self, run: str | None = None) -> list[records.SpacecraftRow]:
         """Every spacecraft, retired ones included, with its state in a run."""
         moment = utc_now()
         with self._context.reading() as connection:
@@ -68,15 +60,15 @@ class Spacecraft:
                 for mission in self._context.known.values()
             ]
 
-    def state(self, name: str, run: str | None = None) -> SpacecraftState:
+    def state(self, name: str, run: str | None = None) -> records.SpacecraftState:
         """One spacecraft's state in a run, its mission's settings and their history."""
         mission = self._context.mission(name)
         with self._context.reading() as connection:
             state = histories.live_state(connection, mission, run or LIVE, utc_now())
             settings = mission.model_dump(mode="json")
-            return SpacecraftState(
+            return records.SpacecraftState(
                 **structs.asdict(state),
-                mission=MissionNow(digest=mission.digest, settings=settings),
+                mission=records.MissionNow(digest=mission.digest, settings=settings),
                 history=histories.mission_history(connection, name),
             )
 
@@ -89,7 +81,7 @@ class Spacecraft:
         end: Utc | None = None,
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[AttitudeRow]:
+    ) -> Page[records.AttitudeRow]:
         """The attitudes of current results, oldest batch time first."""
         self._context.mission(name)
         stretch = ResultFilter(run or LIVE, name, start, end)
@@ -106,7 +98,7 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         bucket: rollups.Bucket = "hour",
-    ) -> list[Rates]:
+    ) -> list[records.Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
         Raises `BadInput` for a period with too many of them.
@@ -116,7 +108,7 @@ class Spacecraft:
             found = rollups.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
-        return [Rates(**each) for each in found]
+        return [records.Rates(**each) for each in found]
 
     def history(
         self,
@@ -129,7 +121,7 @@ class Spacecraft:
         size: int = 500,
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
-    ) -> History:
+    ) -> records.History:
         """Histories of quantities, all of them unless named, in at most `size` points each.
 
         `minmax` gives buckets with mean, least and greatest, `latest` the newest
@@ -154,7 +146,7 @@ class Spacecraft:
         end: Utc | None = None,
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
-    ) -> Iterator[History]:
+    ) -> Iterator[records.History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
         mission = self._context.mission(name)
         return trends.every_batch(
@@ -177,7 +169,7 @@ class Spacecraft:
         end: Utc | None = None,
         limit: int = 20,
         tracker: str | None = None,
-    ) -> Ranking:
+    ) -> records.Ranking:
         """The batches of a period with the worst values of a quantity, worst first.
 
         With a tracker they are ranked by its own values.
@@ -188,7 +180,9 @@ class Spacecraft:
         with self._context.reading() as connection:
             own = self._split_tracker(mission, tracker)
             items = worst_batches(connection, stretch, by, limit, own)
-            return Ranking(by=by, items=items, **_named(connection, mission, run or LIVE, tracker))
+            return records.Ranking(
+                by=by, items=items, **_named(connection, mission, run or LIVE, tracker)
+            )
 
     def _split_tracker(self, mission: Mission, tracker: str | None) -> str | None:
         """The tracker whose own values are read; None where the spacecraft's are.
@@ -243,7 +237,7 @@ BUCKET_PARTS = {
 }
 
 
-def history_table(history: History) -> Table:
+def history_table(history: records.History) -> Table:
     """The table of a history; see `trends.history`."""
     if history.strategy == "latest":
         return batch_table(iter([history]))
@@ -258,7 +252,7 @@ def history_table(history: History) -> Table:
     return Table([*BUCKET_COLUMNS, *columns], [page], _about(history))
 
 
-def batch_table(pages: Iterator[History]) -> Table:
+def batch_table(pages: Iterator[records.History]) -> Table:
     """The table of pages of batches; see `trends.every_batch`.
 
     The first page is read at once: its errors are raised here.
@@ -268,7 +262,7 @@ def batch_table(pages: Iterator[History]) -> Table:
     return Table(columns, (_batch_page(page) for page in chain([first], pages)), _about(first))
 
 
-def _batch_page(page: History) -> TablePage:
+def _batch_page(page: records.History) -> TablePage:
     values: list[Any] = [each.value for each in page.series.values()]
     return [*(getattr(page, each.name) for each in BATCH_COLUMNS), *values]
 
@@ -281,7 +275,7 @@ def _column(name: QuantityName, part: str = "", meaning: str = "") -> Column:
     return Column(f"{name}_{part}" if part else name, unit=quantity.unit, description=about)
 
 
-def _about(history: History) -> dict[str, str]:
+def _about(history: records.History) -> dict[str, str]:
     return {
         "product": "history",
         "spacecraft": history.spacecraft,
