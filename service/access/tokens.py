@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
@@ -179,41 +178,18 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
     connection.execute(delete(access_sessions).where(access_sessions.c.token_id == row.id))
 
 
-def holder_of(connection: Connection, digest: str, moment: str) -> Caller | None:
-    """The caller of a token that is valid at `moment`; None for an invalid one."""
-    return _caller(connection, access_tokens.c.digest == digest, moment)
-
-
-def session_holder(connection: Connection, digest: str, moment: str) -> Caller | None:
-    """The caller of a browser's session that is valid at `moment`; else None."""
-    held = (
-        select(access_sessions.c.token_id)
-        .where(access_sessions.c.digest == digest, access_sessions.c.expires > moment)
-        .scalar_subquery()
-    )
-    return _caller(connection, access_tokens.c.id == held, moment)
-
-
-def add_session(
-    connection: Connection, *, secret: str, token_id: str, created: str, expires: str
-) -> None:
-    """Begin a browser's session; expired ones are deleted."""
-    connection.execute(delete(access_sessions).where(access_sessions.c.expires <= created))
-    connection.execute(
-        insert(access_sessions).values(
-            digest=secret_digest(secret), token_id=token_id, created=created, expires=expires
+def _caller(connection: Connection, kind: str, digest: str, moment: str) -> Caller | None:
+    """The caller of a token or of a browser's session that is valid at `moment`; else None."""
+    condition = access_tokens.c.digest == digest
+    if kind == "session":
+        held = (
+            select(access_sessions.c.token_id)
+            .where(access_sessions.c.digest == digest, access_sessions.c.expires > moment)
+            .scalar_subquery()
         )
-    )
-
-
-def end_session(connection: Connection, digest: str) -> None:
-    """End a browser's session, if there is one."""
-    connection.execute(delete(access_sessions).where(access_sessions.c.digest == digest))
-
-
-def _caller(connection: Connection, condition: object, moment: str) -> Caller | None:
+        condition = access_tokens.c.id == held
     query = select(access_tokens).where(
-        condition,  # type: ignore[arg-type]
+        condition,
         access_tokens.c.revoked.is_(None),
         access_tokens.c.expires > moment,
     )
@@ -417,9 +393,8 @@ class Access:
         known = self._known.get(key)
         if known is not None and clock_s < known[1]:
             return known[0]
-        look_up = holder_of if kind == "token" else session_holder
         with self._reading() as connection:
-            caller = look_up(connection, digest, self._now().text)
+            caller = _caller(connection, kind, digest, self._now().text)
         with self._lock:
             self._known.pop(key, None)
             if caller is None:
@@ -461,22 +436,27 @@ class Access:
         if caller.token_id is None:
             raise Unauthenticated("access is open: signing in is not needed")
         token_id, secret, begun = caller.token_id, new_secret(), self._now()
-        expires = shifted(begun, SESSION_H * 3600)
-        self._change(
-            partial(
-                add_session,
-                secret=secret,
-                token_id=token_id,
-                created=begun.text,
-                expires=expires.text,
-            )
-        )
+        row = {
+            "digest": secret_digest(secret),
+            "token_id": token_id,
+            "created": begun.text,
+            "expires": shifted(begun, SESSION_H * 3600).text,
+        }
+
+        def begin(connection: Connection) -> None:
+            # Expired ones are deleted.
+            expired = access_sessions.c.expires <= begun.text
+            connection.execute(delete(access_sessions).where(expired))
+            connection.execute(insert(access_sessions).values(row))
+
+        self._change(begin)
         return secret, caller
 
     def sign_out(self, session: str) -> None:
         """End a browser's session."""
         digest = secret_digest(session)
-        self._change(partial(end_session, digest=digest))
+        ended = delete(access_sessions).where(access_sessions.c.digest == digest)
+        self._change(lambda connection: connection.execute(ended))
         with self._lock:
             self._known.pop(("session", digest), None)
 

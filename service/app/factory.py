@@ -14,7 +14,7 @@ from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
-from service.app.service import Audit, Events, Service
+from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Spacecraft
 from service.app.tracks import Tracks
@@ -80,7 +80,6 @@ class App:
         self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
         self.adoptions = CalibrationAdoptions(context, self.replays.bulk.workers.restart)
         self.events = Events(context)
-        self.audit = Audit(context)
         self.expiries = ExpiryDates(context.reading_record)
         self.webhooks = Webhooks(context, self.access)
         self.upgrade = BackgroundUpgrade(

@@ -1,4 +1,4 @@
-"""The service itself: readiness, its description, its log of events, and the audit list."""
+"""The service itself: readiness, its description, and its log of events."""
 
 import gc
 import logging
@@ -8,7 +8,6 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from msgspec import structs
 
 from service import __version__
-from service.access import audit
 from service.acquire.kernel_build import KernelBuild, progress_logged
 from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
@@ -20,8 +19,6 @@ from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.models.access import AuditEntry
-from service.storage.models.base import Page
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording import events
@@ -208,15 +205,3 @@ class Events:
     def unlisten(self, listener: Callable[[], object]) -> None:
         """Stop calling a function after each commit that has events."""
         self._context.store.writer.after_events.remove(listener)
-
-
-class Audit:
-    """Reads the audit list."""
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-
-    def page(self, limit: int = 100, cursor: str | None = None) -> Page[AuditEntry]:
-        """The audit list of changes, newest first."""
-        with self._context.reading() as connection:
-            return audit.list_entries(connection, limit, cursor)

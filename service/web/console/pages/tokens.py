@@ -6,6 +6,7 @@ from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
+from service.access.audit import list_entries
 from service.access.tokens import MAX_DAYS, SCOPES
 from service.storage.recording.events import EVENT_KINDS
 from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
@@ -26,7 +27,8 @@ class AuditPageQuery(PageQuery):
 @console_page("/audit", "Audit list", OPERATE, section="/about")
 def audit_page(query: Annotated[AuditPageQuery, InQuery()], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
-    page = context.app.audit.page(ROWS, query.cursor)
+    with context.app.context.reading() as connection:
+        page = list_entries(connection, ROWS, query.cursor)
     return rendered("audit.html.jinja", context.layout(query.run), page=page)
 
 
