@@ -16,7 +16,7 @@ from service.errors import AcquisitionError, Busy
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
 from service.ingest.solver_pool import Solver
-from service.ingest.submit import Answers, SubmissionService
+from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.batch import ObservationBatch
 from service.observations.schema import Submission, submission_from_json
@@ -174,7 +174,7 @@ class Bulk:
         workers: int,
     ) -> None:
         """`begin_block` queues a gyro block; see `Gyro.begin`."""
-        self._submissions = submissions
+        self.submissions = submissions
         self.begin_block = begin_block
         self._store = store
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
@@ -203,7 +203,7 @@ class Bulk:
     @property
     def _gives_way(self) -> bool:
         """True if batches come one by one as well."""
-        return self._submissions.idle_s < INTERACTIVE_WINDOW_S
+        return self.submissions.idle_s < INTERACTIVE_WINDOW_S
 
     def begin(
         self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
@@ -214,9 +214,9 @@ class Bulk:
         ends that where it raises.
         """
         # Without them each worker would compile what it does not find.
-        self._submissions.require_kernels()
+        self.submissions.require_kernels()
         self.workers.start()
-        self._submissions.yield_to_interactive()
+        self.submissions.yield_to_interactive()
         named = [identity_in(text, run) for text in texts]
         with self._store.reading_record() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
@@ -240,28 +240,16 @@ class Bulk:
             made = []
             for each in fresh:
                 require()
-                made.append(self.solve_here(each))
+                made.append(self.submissions.solve_one_of_many(each))
             return made
 
-        asks_for_last = self._submissions.solver.asks_for_last
+        asks_for_last = self.submissions.solver.asks_for_last
         return line_results(lines, unsaved_results, asks_for_last)
 
     def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
         """Record a line that asks for the last attitude, when all before it are recorded."""
-        self._submissions.yield_to_interactive()
-        return self._submissions.submit_tracked(submission_from_json(line.text))
-
-    def asks_for_last(self, submission: Submission) -> bool:
-        """True if a line asks for the last attitude."""
-        return self._submissions.solver.asks_for_last(submission.batch)
-
-    def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
-        """The result of one line, computed when no single post waits."""
-        return self._submissions.solve_one_of_many(submission)
-
-    def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
-        """Queue results for a transaction of their own; the function returned waits for it."""
-        return self._submissions.begin_writing(unsaved_results)
+        self.submissions.yield_to_interactive()
+        return self.submissions.submit_tracked(submission_from_json(line.text))
 
 
 class BulkChunk:
@@ -293,7 +281,7 @@ class BulkChunk:
             if isinstance(each, GyroBlock) and place not in self._begun:
                 self._begun[place] = self._begin_block(each)
         unsaved_results = [each for each in self._decided if isinstance(each, UnsavedResult)]
-        self._finish = self._bulk.begin_writing(unsaved_results)
+        self._finish = self._bulk.submissions.begin_writing(unsaved_results)
 
     def _begin_block(self, block: GyroBlock) -> Callable[[], LineAnswer]:
         try:
@@ -378,9 +366,9 @@ class BulkChunk:
         if first is None:
             # It is not called what it seemed to be called.
             submission = submission_from_json(text, run=self._lines.run)
-            if self._bulk.asks_for_last(submission):
+            if self._bulk.submissions.solver.asks_for_last(submission.batch):
                 return TrackedLine(seen.identity, submission.text)
-            return self._bulk.solve_here(submission)
+            return self._bulk.submissions.solve_one_of_many(submission)
         answer = self._stored[first.result_id]
         if isinstance(answer, AcquisitionError):
             # The archive may be out of reach for long: the other lines do not wait for it.
