@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import msgspec
-from msgspec import UNSET, Struct, UnsetType
+from msgspec import UNSET, Struct, UnsetType, structs
 
 from service.acquire import Acquisition
 from service.acquire.result import RivalAttitude, TrackerResult
@@ -64,8 +64,7 @@ def answer_of(
     `warnings` follow those of the acquisition.  The time of recording stays None: it
     is known when the rows are handed over.
     """
-    batch, provenance = acquisition.batch, acquisition.provenance
-    run_catalog = acquisition.run_catalog
+    batch, run_catalog = acquisition.batch, acquisition.run_catalog
     return Answer(
         id=id,
         spacecraft=batch.spacecraft,
@@ -80,13 +79,7 @@ def answer_of(
         reason=None if acquisition.reason is None else str(acquisition.reason),
         warnings=[*acquisition.warnings, *warnings],
         timings_us=Timings(**acquisition.timings_us, record=None),
-        provenance=Provenance(
-            catalog=provenance.catalog,
-            run_catalog=provenance.run_catalog,
-            epoch_year=provenance.epoch_year,
-            mission=provenance.mission,
-            version=provenance.version,
-        ),
+        provenance=Provenance(**structs.asdict(acquisition.provenance)),
         parent=parent,
         recorded=recorded,
         frame=frame,
