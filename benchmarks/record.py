@@ -44,7 +44,7 @@ SIMULATOR = (
 IMAGING = (
     "service/imaging",
     "studies/star_image_report",
-    "service/simulate/drawing.py",
+    "studies/documents.py",
     "service/observations/scans/profile.py",
     "service/observations/scans/cross_scan.py",
     "service/observations/scans/line_peaks.py",

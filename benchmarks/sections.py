@@ -18,7 +18,7 @@ from pathlib import Path
 
 from benchmarks.bounds import Bound, shown
 from benchmarks.record import CORE, ROOT, SIMULATOR, Record, digest_of, read_record
-from service.simulate.drawing import Folder, pictures_in
+from studies.documents import Folder, pictures_in
 
 _KEPT = re.compile(
     r"<!-- section (?P<name>[\w-]+); seed (?P<seed>\d+); (?P<size>[^;]+); "

@@ -172,7 +172,7 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
     for late in (
         *("service.demo", "service.replay", "service.simulate", "studies"),
         *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
-        *("service.imaging.frames.fits", "service.imaging.sky_overlay", "service.products.spice"),
+        *("service.imaging.frames.fits", "service.imaging.sky_overlay", "service.products.ck"),
         *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "acquire_client"),
     ):
         assert late not in loaded

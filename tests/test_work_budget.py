@@ -13,8 +13,8 @@ from service.identify.sighting import Sighting
 from service.identify.voting.starid import identify_by_votes
 from service.missions.identifiers import IDENTIFIERS
 from service.observations.schema import submission_from_json
-from service.simulate.two_groups import MOMENT, Views
 from tests.reference.sightings import identified
+from tests.reference.two_group_views import MOMENT, Views
 
 
 @pytest.fixture

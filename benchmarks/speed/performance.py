@@ -20,7 +20,7 @@ from benchmarks.record import ROOT, SERVICE, digest_of, read_record
 from benchmarks.sections import bounds_table, table
 from benchmarks.speed.posts import LEAST_OF_CEILING, LEAST_OF_NO_OP, MOST_READY_S, MOST_WAIT
 from service import __version__
-from service.simulate.drawing import Folder, pictures_in
+from studies.documents import Folder, pictures_in
 
 RESULTS = Path(__file__).parent / "results.json"
 TARGET = ROOT / "docs" / "performance.md"

@@ -15,8 +15,8 @@ from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from benchmarks.validation.verified_views import Condition, interval, judged_views
-from service.simulate.drawing import Folder
 from service.vectors import Vector
+from studies.documents import Folder
 
 VIEWS, QUICK_VIEWS = 10_000, 120
 EDGES = (0.0, 0.5, 0.9, 0.99, 0.999, 1.0)

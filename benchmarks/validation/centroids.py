@@ -25,7 +25,7 @@ from benchmarks.sections import Section, Written, table
 from service.imaging.centroids.centroid import METHODS, centroid
 from service.imaging.centroids.psf import GaussianPsf, Psf, airy_psf
 from service.imaging.centroids.window import Detector, cutout
-from studies.star_image_report.windows import WindowStar, draw_stars, flux_of_peak
+from tests.reference.star_windows import WindowStar, draw_stars, flux_of_peak
 
 RATIOS = (10.0, 30.0, 100.0, 300.0, 1000.0)
 DETECTOR = Detector(gain_e_per_count=2.0, read_noise_e=10.0, saturation_counts=1e9)

@@ -16,14 +16,13 @@ from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
-from service.simulate.drawing import Folder
-from studies.paper_1994.command import document
+from studies.documents import Folder
+from studies.paper_1994.command import PAPER_IDENTIFIER, document
+from studies.paper_1994.command import measured as measured_times
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.plots import draw
 from studies.paper_1994.printed import Run, the_paper
 from studies.paper_1994.region import differences, is_inside
-from studies.paper_1994.report import PAPER_IDENTIFIER
-from studies.paper_1994.report import measured as measured_times
 from studies.paper_1994.tables import TITLES
 from studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
 

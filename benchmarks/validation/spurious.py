@@ -15,7 +15,7 @@ from benchmarks.report import Report
 from benchmarks.sections import Section, Written, pictures_of, table
 from benchmarks.validation.verified_views import Condition, judged_views
 from service.missions.mission import Identifier
-from service.simulate.drawing import Folder
+from studies.documents import Folder
 
 SPURIOUS, QUICK_SPURIOUS = 20_000, 300
 VOTES_SHARE = 0.1

@@ -26,8 +26,8 @@ from service.calibration.linearise import directions, prepared, residuals
 from service.calibration.stars import IdentifiedStars
 from service.calibration.unknowns import Model, unknowns_of
 from service.missions.mission import Tracker
-from service.simulate.drawing import Folder
 from service.vectors import ARCSEC_PER_RADIAN
+from studies.documents import Folder
 
 Array = npt.NDArray[np.float64]
 

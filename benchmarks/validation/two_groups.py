@@ -22,10 +22,10 @@ from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.missions.mission import load_missions
-from service.simulate.two_groups import Group, Views
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
+from tests.reference.two_group_views import Group, Views
 from tests.reference.two_groups import Counted, Simple, simple, two_groups
 
 MISSIONS = ("XTE", "SWAS", "SOHO")

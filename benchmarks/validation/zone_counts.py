@@ -7,7 +7,7 @@ from benchmarks.sections import Section, Written, table
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from studies.paper_1994.zone_counts import ZoneQuantity, counts
+from tests.reference.zone_counts import ZoneQuantity, counts
 
 
 def run(quick: bool, seed: int) -> Report:

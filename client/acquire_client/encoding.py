@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 from urllib.parse import quote
 
 import httpx
@@ -21,6 +21,8 @@ Time: TypeAlias = str | datetime
 Query: TypeAlias = Mapping[str, str | int | float | bool | list[str] | datetime | None]
 
 PIECE_BYTES = 1 << 16
+
+T = TypeVar("T")
 
 
 def checked_address(url: str) -> httpx.URL:
@@ -61,9 +63,7 @@ def parameters_of(query: Query) -> dict[str, Any]:
 
 
 def _parameter(name: str, value: object) -> object:
-    if not isinstance(value, datetime):
-        return value
-    return _utc(name, value)
+    return _utc(name, value) if isinstance(value, datetime) else value
 
 
 def _utc(name: str, value: datetime) -> str:
@@ -94,7 +94,7 @@ def _plain(value: Any) -> Any:
     raise InvalidArgument(f"JSON has no form for {value!r}")
 
 
-def decoded(response: httpx.Response, kind: Any) -> Any:
+def decoded(response: httpx.Response, kind: type[T]) -> T:
     """The body of an answer as a model of that kind."""
     try:
         return msgspec.json.decode(response.content, type=kind)

@@ -94,32 +94,17 @@ class PackageMissing(ClientError):
 
 
 class Problem(ClientError):
-    """The service refuses a request."""
+    """The service refuses a request.
+
+    `status` is that of HTTP, `type` a page of the service such as `/problems/bad-input`; `detail`
+    has the fault in a sentence, `errors` every fault, field by field.
+    """
 
     def __init__(self, document: ProblemDocument, retry_after_s: float | None = None) -> None:
-        self.document = document
-        self.retry_after_s = retry_after_s
+        self.document, self.retry_after_s = document, retry_after_s
+        self.status, self.type = document.status, document.type
+        self.detail, self.errors = document.detail, document.errors
         super().__init__(document.detail)
-
-    @property
-    def status(self) -> int:
-        """The status of HTTP."""
-        return self.document.status
-
-    @property
-    def type(self) -> str:
-        """The type of the problem, such as `/problems/bad-input`: a page of the service."""
-        return self.document.type
-
-    @property
-    def detail(self) -> str:
-        """The fault, in a sentence."""
-        return self.document.detail
-
-    @property
-    def errors(self) -> Sequence[FieldFault]:
-        """Every fault, field by field."""
-        return self.document.errors
 
 
 class BadInput(Problem):

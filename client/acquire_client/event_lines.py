@@ -10,82 +10,76 @@ from .base import Model
 from .errors import UnexpectedAnswer
 
 
-class BatchesEvent(Model, frozen=True):
+class _Numbered(Model, frozen=True):
+    id: int
+
+
+class BatchesEvent(_Numbered, frozen=True):
     """Batches that were recorded."""
 
-    id: int
     kind: Literal["batches"]
     data: models.Recorded
 
 
-class AdoptedEvent(Model, frozen=True):
+class AdoptedEvent(_Numbered, frozen=True):
     """A what-if that was adopted."""
 
-    id: int
     kind: Literal["adopted"]
     data: models.Adopted
 
 
-class AlarmEvent(Model, frozen=True):
+class AlarmEvent(_Numbered, frozen=True):
     """An alarm that changed."""
 
-    id: int
     kind: Literal["alarm"]
     data: models.Alarm
 
 
-class LimitEvent(Model, frozen=True):
+class LimitEvent(_Numbered, frozen=True):
     """Limits that were set."""
 
-    id: int
     kind: Literal["limit"]
     data: models.Limit
 
 
-class AnnotationEvent(Model, frozen=True):
+class AnnotationEvent(_Numbered, frozen=True):
     """A note that was written or deleted."""
 
-    id: int
     kind: Literal["annotation"]
     data: models.AnnotationChange
 
 
-class ReplayEvent(Model, frozen=True):
+class ReplayEvent(_Numbered, frozen=True):
     """A replay that went on."""
 
-    id: int
     kind: Literal["replay"]
     data: models.ReplayProgress
 
 
-class GyroEvent(Model, frozen=True):
+class GyroEvent(_Numbered, frozen=True):
     """A gyro block that was recorded."""
 
-    id: int
     kind: Literal["gyro"]
     data: models.GyroBlock
 
 
-class TrackingEvent(Model, frozen=True):
+class TrackingEvent(_Numbered, frozen=True):
     """A tracking state that changed."""
 
-    id: int
     kind: Literal["tracking"]
     data: models.TrackingChange
 
 
-class CalibrationEvent(Model, frozen=True):
+class CalibrationEvent(_Numbered, frozen=True):
     """A calibration that was adopted, or taken back."""
 
-    id: int
     kind: Literal["calibration"]
     data: models.CalibrationChange
 
 
-class OtherEvent(Model, frozen=True):
+class OtherEvent(_Numbered, frozen=True):
     """An event of a kind that a later service added: the word is `name`."""
 
-    id: int
     kind: Literal["other"]
     name: str
     data: dict[str, Any]

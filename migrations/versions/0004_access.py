@@ -5,8 +5,6 @@ from alembic import op
 
 revision = "0004"
 down_revision = "0001"
-branch_labels = None
-depends_on = None
 
 
 def upgrade() -> None:

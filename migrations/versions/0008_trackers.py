@@ -10,8 +10,6 @@ from alembic import op
 
 revision = "0008"
 down_revision = "0007"
-branch_labels = None
-depends_on = None
 
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
 MEASURED = (

@@ -5,8 +5,6 @@ from alembic import op
 
 revision = "0015"
 down_revision = "0014"
-branch_labels = None
-depends_on = None
 
 ADDED = ("scale_offset_ppm", "alignment_offset_arcsec")
 ROLLUPS = ("rollups_hourly", "rollups_daily", "tracker_rollups_hourly", "tracker_rollups_daily")

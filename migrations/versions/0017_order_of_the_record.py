@@ -5,8 +5,6 @@ from alembic import op
 
 revision = "0017"
 down_revision = "0016"
-branch_labels = None
-depends_on = None
 
 WITH_DIGESTS = ("missions", "catalogs", "mission_uses", "tracker_values")
 

@@ -8,16 +8,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from service.acquire import Acquisition
+from service.advice import trackers
 from service.advice.evidence import evidence_of, merged
 from service.advice.tolerances import ToleranceFinding, tolerance_findings
-from service.advice.trackers import (
-    AlignmentFinding,
-    MagnitudeFinding,
-    NoiseFinding,
-    alignment_findings,
-    magnitude_findings,
-    noise_findings,
-)
 from service.advice.trials import (
     TrialCounts,
     Variant,
@@ -66,9 +59,9 @@ class Findings:
     refused: int
     refusal: str | None
     tolerances: tuple[ToleranceFinding, ...]
-    noise: tuple[NoiseFinding, ...]
-    magnitudes: tuple[MagnitudeFinding, ...]
-    alignment: tuple[AlignmentFinding, ...]
+    noise: tuple[trackers.NoiseFinding, ...]
+    magnitudes: tuple[trackers.MagnitudeFinding, ...]
+    alignment: tuple[trackers.AlignmentFinding, ...]
     trials: tuple[VariantOutcome, ...]
     uses_voting: bool
     with_rival: int
@@ -118,9 +111,9 @@ def advise(
         sampled=len(sample.cases),
         identified=evidence.batches,
         tolerances=tolerances,
-        noise=tuple(noise_findings(mission, evidence)),
-        magnitudes=tuple(magnitude_findings(mission, evidence)),
-        alignment=tuple(alignment_findings(mission, evidence)),
+        noise=tuple(trackers.noise_findings(mission, evidence)),
+        magnitudes=tuple(trackers.magnitude_findings(mission, evidence)),
+        alignment=tuple(trackers.alignment_findings(mission, evidence)),
         trials=tuple(_trials(tolerances, sample, run, own or {}, pace)),
         refused=sample.refused,
         refusal=sample.refusal,

@@ -31,7 +31,7 @@ from service.advice.intervals import Interval
 from service.advice.statements import FileChange, Statement
 from service.advice.trackers import NoiseFinding
 from service.filtering.state import Outcome
-from service.grades.innovations import MeasuredInnovations
+from service.grades.innovations import MeasuredInnovations, full_matrices
 from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
 from service.vectors import Vector
@@ -139,13 +139,9 @@ def _unbroken(whole: MeasuredInnovations) -> Iterator[MeasuredInnovations]:
             yield whole.taken(slice(first, end))
 
 
-def _full(upper: Vector) -> Full:
-    return upper[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-
-
 def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
     """Axes, as columns, about which the errors of an attitude are independent on average."""
-    mean = np.mean(np.concatenate([_full(each.measured_arcsec2) for each in parts]), axis=0)
+    mean = np.mean(np.concatenate([full_matrices(each.measured_arcsec2) for each in parts]), axis=0)
     return np.asarray(np.linalg.eigh(mean)[1])
 
 
@@ -153,7 +149,7 @@ def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
     """The two equations of each measurement, summed over the axes: left sides and right side."""
     z = part.innovation_arcsec @ axes
     predicted, measured = (
-        np.einsum("ji,njk,ki->ni", axes, _full(each), axes)
+        np.einsum("ji,njk,ki->ni", axes, full_matrices(each), axes)
         for each in (part.predicted_arcsec2, part.measured_arcsec2)
     )
     by_axis = [

@@ -10,14 +10,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.acquire.choices import idle_reason
-from service.advice.zone_census import (
-    Extremes,
-    Spread,
-    ZoneCensus,
-    share_below,
-    star_counts,
-    star_spread,
-)
+from service.advice import zone_census
 from service.missions.mission import Band, Mission, Tracker
 from service.missions.scan import Raster, Sweep
 from service.sky.catalog.run_catalog import RunCatalog
@@ -55,7 +48,7 @@ class TrackerView:
     """How many stars of the run catalog a tracker sees over the whole sky."""
 
     tracker: str
-    stars: Spread
+    stars: zone_census.Spread
     few_share: float
     """The share of the sky where it sees fewer than `FEW_STARS`."""
 
@@ -65,9 +58,9 @@ def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView
     found = []
     for tracker in mission.trackers:
         view = run_catalog.direction, 0.0, tracker.field_of_view_radius_deg
-        counts = star_counts(*view)
-        stars = star_spread(Extremes(*view), counts)
-        found.append(TrackerView(tracker.name, stars, share_below(counts, FEW_STARS)))
+        counts = zone_census.star_counts(*view)
+        stars = zone_census.star_spread(zone_census.Extremes(*view), counts)
+        found.append(TrackerView(tracker.name, stars, zone_census.share_below(counts, FEW_STARS)))
     return found
 
 
@@ -84,7 +77,7 @@ def findings(
     mission: Mission,
     faintest_mag: float,
     views: list[TrackerView],
-    zones: list[ZoneCensus],
+    zones: list[zone_census.ZoneCensus],
 ) -> list[Finding]:
     """Everything that is wrong or unusual, what is wrong first.
 
@@ -253,7 +246,10 @@ def _scan(key: str, tracker: Tracker) -> Iterator[Finding]:
 
 
 def _stars(
-    mission: Mission, faintest_mag: float, views: list[TrackerView], zones: list[ZoneCensus]
+    mission: Mission,
+    faintest_mag: float,
+    views: list[TrackerView],
+    zones: list[zone_census.ZoneCensus],
 ) -> Iterator[Finding]:
     limit_mag = mission.catalog.magnitude_limit_mag
     if limit_mag > faintest_mag:

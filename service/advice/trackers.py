@@ -6,17 +6,11 @@ from typing import Literal
 
 import numpy as np
 
+from service import vectors
 from service.advice.evidence import Evidence, StarEvidence, TrackerAttitude
 from service.advice.intervals import Interval, intervals, median, quantile, robust_fit
 from service.missions.mission import Mission, Tracker
 from service.times import Utc
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Vector,
-    attitude_error_arcsec,
-    matrix_from_quaternion,
-    rotate_about,
-)
 
 LEAST_BATCHES = 20
 LEAST_STARS = 50
@@ -139,11 +133,13 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     )
 
 
-def _noise_period(fits: list[TrackerAttitude], squared: Vector, tracker: Tracker) -> NoisePeriod:
+def _noise_period(
+    fits: list[TrackerAttitude], squared: vectors.Vector, tracker: Tracker
+) -> NoisePeriod:
     return NoisePeriod(_sigma(squared, tracker), len(fits), fits[0].time, fits[-1].time)
 
 
-def _worst_in_a_row(squared: Vector) -> slice | None:
+def _worst_in_a_row(squared: vectors.Vector) -> slice | None:
     """The batches in a row that most certainly show more noise than all others; None if none do.
 
     Of every stretch the sum of its ranks is compared with what chance gives (Mann & Whitney);
@@ -167,14 +163,14 @@ def _worst_in_a_row(squared: Vector) -> slice | None:
     return found if more else None
 
 
-def _sigma(squared: Vector, tracker: Tracker) -> Interval:
+def _sigma(squared: vectors.Vector, tracker: Tracker) -> Interval:
     ratio = median(squared)
     # Of fewer than six values the median is not bounded, below not by zero either.
     bounds = (max(each, 0.0) for each in (ratio.value, ratio.low, ratio.high))
     return Interval(*map(math.sqrt, bounds)).scaled(tracker.sigma_arcsec)
 
 
-def _latest_with_own_noise(squared: Vector) -> int:
+def _latest_with_own_noise(squared: vectors.Vector) -> int:
     """How many of the latest batches show another noise than those before; all if none do.
 
     The fewest that do so with certainty: of a noise that grows all the time they
@@ -192,7 +188,7 @@ def _latest_with_own_noise(squared: Vector) -> int:
     return count
 
 
-def _squared_noise(fits: list[TrackerAttitude]) -> Vector:
+def _squared_noise(fits: list[TrackerAttitude]) -> vectors.Vector:
     """One estimate a fit of the squared noise, in units of the stars' sigmas."""
     from scipy.stats import chi2
 
@@ -289,8 +285,9 @@ def _alignment(
     turned, whiten = [], []
     for a, b in both:
         turned.append(
-            attitude_error_arcsec(
-                matrix_from_quaternion(b.quaternion), matrix_from_quaternion(a.quaternion)
+            vectors.attitude_error_arcsec(
+                vectors.matrix_from_quaternion(b.quaternion),
+                vectors.matrix_from_quaternion(a.quaternion),
             )
         )
         covariance = a.covariance_arcsec2 + b.covariance_arcsec2
@@ -301,7 +298,7 @@ def _alignment(
     beta, covariance = robust_fit(root.reshape(-1, 3), values, cluster)
     certain = float(beta @ np.linalg.solve(covariance, beta)) > CERTAIN_CHI2
     x, y, z = intervals(beta, covariance)
-    axes = rotate_about(beta / ARCSEC_PER_RADIAN, tracker.body_from_tracker.T)
+    axes = vectors.rotate_about(beta / vectors.ARCSEC_PER_RADIAN, tracker.body_from_tracker.T)
     return AlignmentFinding(
         tracker.name,
         first.name,

@@ -14,15 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.advice.zone_census import (
-    COLUMNS,
-    ROWS,
-    Extremes,
-    Spread,
-    axes_of_sky,
-    median_of,
-    star_spread,
-)
+from service.advice import zone_census
 from service.advice.zone_size import geometric_k_g
 from service.missions.mission import Band, Mission
 from service.sky.catalog.run_catalog import RunCatalog
@@ -82,8 +74,8 @@ class ZoneEstimate:
     size_deg: float
     pair_separation_max_deg: float
     magnitude_limit_mag: float
-    stars: Spread
-    pairs: Spread
+    stars: zone_census.Spread
+    pairs: zone_census.Spread
     richest_deg: tuple[float, float]
     k_g: float
     pairs_counted: int
@@ -173,7 +165,7 @@ def zone_estimates(
 
     `neighbours` are those of the run catalog as far as the mission's HMAX.
     """
-    zone, axes = mission.zone, axes_of_sky()
+    zone, axes = mission.zone, zone_census.axes_of_sky()
     is_band = isinstance(zone, Band)
     size_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
     # The cache snaps an axis by half the diagonal of a cell at most; see `sky.zones.zone_for`.
@@ -184,15 +176,18 @@ def zone_estimates(
         shape = shape_of(least_deg, most_deg, limit_deg)
         both = np.array([predicted(neighbours, shape, axis) for axis in axes])
         stars, pairs = both[:, 0], both[:, 1]
-        grid = stars.reshape(ROWS, COLUMNS), pairs.reshape(ROWS, COLUMNS)
-        sky = Extremes(run_catalog.direction, least_deg, most_deg, limit_deg)
-        star_range = star_spread(sky, grid[0])
+        grid = (
+            stars.reshape(zone_census.ROWS, zone_census.COLUMNS),
+            pairs.reshape(zone_census.ROWS, zone_census.COLUMNS),
+        )
+        sky = zone_census.Extremes(run_catalog.direction, least_deg, most_deg, limit_deg)
+        star_range = zone_census.star_spread(sky, grid[0])
         pairs_counted, richest = sky.pairs(grid[1], most=True)
         _, poorest = sky.pairs(grid[1], most=False)
         in_richest, most_pairs = predicted(neighbours, shape, richest)
         _, least_pairs = predicted(neighbours, shape, poorest)
         grown = max(0.0, least_deg - grown_by_deg), min(180.0, most_deg + grown_by_deg)
-        cached = Extremes(run_catalog.direction, *grown, limit_deg)
+        cached = zone_census.Extremes(run_catalog.direction, *grown, limit_deg)
         most_bytes = zone_bytes(
             cached.stars(grid[0], most=True)[0], cached.pairs(grid[1], most=True)[0], is_band
         )
@@ -205,7 +200,9 @@ def zone_estimates(
                 pair_separation_max_deg=limit_deg,
                 magnitude_limit_mag=mission.catalog.magnitude_limit_mag,
                 stars=star_range,
-                pairs=Spread(round(least_pairs), median_of(np.rint(grid[1])), round(most_pairs)),
+                pairs=zone_census.Spread(
+                    round(least_pairs), zone_census.median_of(np.rint(grid[1])), round(most_pairs)
+                ),
                 richest_deg=(float(ra_deg), float(dec_deg)),
                 k_g=float(most_pairs / max(1.0, _all_pairs(in_richest))),
                 pairs_counted=pairs_counted,

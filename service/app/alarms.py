@@ -23,7 +23,7 @@ from service.storage.models.base import Page
 from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms, limits
 from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.recording import events
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
@@ -242,7 +242,7 @@ class Limits:
         subject = subject_of(quantity, own)
         with self._context.reading() as connection:
             in_force = limits.limits_of(connection, mission)[subject]
-            last = limits.latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
+            last = latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
             time_ns: list[int] = []
             samples: list[Sample] = []
             if last is not None:

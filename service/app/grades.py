@@ -19,6 +19,7 @@ from service.storage.grades import days as recorded_days
 from service.storage.grades import period
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
 from service.storage.models.base import Page
+from service.storage.models.products import DefinitiveJob, Innovation
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
@@ -115,7 +116,7 @@ class Grades:
         end: Utc | None = None,
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[recorded_days.Innovation]:
+    ) -> Page[Innovation]:
         """How the measured attitudes of a period met the filter, the earliest first."""
         self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
@@ -173,7 +174,7 @@ class DefinitiveAttitudes:
         self._context, self._grades, self._kernels = context, grades, kernels
         self._ids = Ulids()
         self._lock = threading.Lock()
-        self._jobs: dict[str, recorded_days.DefinitiveJob] = {}
+        self._jobs: dict[str, DefinitiveJob] = {}
         self._worker = ThreadPoolExecutor(1, "definitive-attitude")
         self._stopped = threading.Event()
         self._schedule: threading.Thread | None = None
@@ -188,7 +189,7 @@ class DefinitiveAttitudes:
         start: Utc | None = None,
         end: Utc | None = None,
         who: str,
-    ) -> recorded_days.DefinitiveJob:
+    ) -> DefinitiveJob:
         """Queue a job for the UTC days of a period that have batches; without one, all days.
 
         Raises `Busy` where too many wait or kernels are still compiled, `Stopping` while the
@@ -199,7 +200,7 @@ class DefinitiveAttitudes:
         self._context.store.writer.require()
         if self._kernels is not None and self._kernels.is_needed:
             raise Busy("the kernels of the filter are still being compiled", 10)
-        job = recorded_days.DefinitiveJob(
+        job = DefinitiveJob(
             id=self._ids.new(),
             spacecraft=spacecraft,
             run=run,
@@ -225,16 +226,16 @@ class DefinitiveAttitudes:
             self._worker.submit(self._make, job.id, _Wanted(spacecraft, run, start, end))
         return job
 
-    def all(self, spacecraft: str) -> recorded_days.DefinitiveJobList:
+    def all(self, spacecraft: str) -> list[DefinitiveJob]:
         """The jobs of a spacecraft, the newest first."""
         self._context.mission(spacecraft)
         with self._lock:
             found = [each for each in self._jobs.values() if each.spacecraft == spacecraft]
-        return recorded_days.DefinitiveJobList(items=found[::-1])
+        return found[::-1]
 
-    def get(self, spacecraft: str, id: str) -> recorded_days.DefinitiveJob:
+    def get(self, spacecraft: str, id: str) -> DefinitiveJob:
         """One job; raises `NotFound`."""
-        for job in self.all(spacecraft).items:
+        for job in self.all(spacecraft):
             if job.id == id:
                 return job
         raise NotFound(f"{spacecraft} has no job {id[:40]!r} since the start of the service")
@@ -255,7 +256,7 @@ class DefinitiveAttitudes:
             self._schedule.join()
         self._worker.shutdown(cancel_futures=True)
 
-    def begin_due(self, now: Utc) -> list[recorded_days.DefinitiveJob]:
+    def begin_due(self, now: Utc) -> list[DefinitiveJob]:
         """Queue a job for each mission whose last day is complete and not made yet."""
         today = shifted(now, -SETTLED_S).bucket(DAY_S)
         begun = []

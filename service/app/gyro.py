@@ -9,7 +9,7 @@ from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import mission_named
 from service.storage import gyro as blocks
 from service.storage.models.base import Page
-from service.storage.models.gyro import GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now

@@ -14,7 +14,8 @@ from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import day_bounds
 from service.missions.mission import mission_named
 from service.storage.grades.inputs import recorded_in
-from service.storage.grades.rows import LiveAttitude, live_attitude
+from service.storage.grades.rows import live_attitude
+from service.storage.models.products import LiveAttitude
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
 from service.storage.recording.unsaved_result import LIVE

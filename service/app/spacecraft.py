@@ -15,9 +15,8 @@ from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models import spacecraft as records
 from service.storage.models.base import Page
-from service.storage.models.overview import Fleet, Overview
-from service.storage.projections import rollups
-from service.storage.queries import fleet, histories, trends
+from service.storage.models.overview import Overview
+from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
 from service.storage.recording.result_metrics import is_waiting
@@ -45,7 +44,7 @@ class Spacecraft:
         run: str,
         period: fleet.Period,
         spacecraft: Collection[str] | None = None,
-    ) -> Fleet:
+    ) -> fleet.Fleet:
         """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
         missions = [self._context.known[name] for name in names]
         with self._context.reading() as connection:
@@ -97,7 +96,7 @@ class Spacecraft:
         run: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
-        bucket: rollups.Bucket = "hour",
+        bucket: time_buckets.Bucket = "hour",
     ) -> list[records.Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
@@ -105,10 +104,9 @@ class Spacecraft:
         """
         self._context.mission(name)
         with self._context.reading() as connection:
-            found = rollups.rates(
+            return time_buckets.rates(
                 connection, name, run=run or LIVE, start=start, end=end, bucket=bucket
             )
-        return [records.Rates(**each) for each in found]
 
     def history(
         self,
@@ -130,11 +128,9 @@ class Spacecraft:
         mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
         own = self._split_tracker(mission, tracker)
-        asked = trends.HistoryRequest(names, strategy, size, own)
+        asked = trends.HistoryRequest(name, run or LIVE, start, end, names, strategy, size, own)
         with self._context.reading() as connection:
-            found = trends.history(
-                connection, name, run=run or LIVE, start=start, end=end, request=asked
-            )
+            found = trends.history(connection, asked)
             return structs.replace(found, **_named(connection, mission, run or LIVE, tracker))
 
     def every_batch(
@@ -149,15 +145,10 @@ class Spacecraft:
     ) -> Iterator[records.History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
         mission = self._context.mission(name)
-        return trends.every_batch(
-            self._context.reading,
-            name,
-            run=run or LIVE,
-            start=start,
-            end=end,
-            quantities=_quantities(quantities, tracker),
-            tracker=self._split_tracker(mission, tracker),
-        )
+        names = _quantities(quantities, tracker)
+        own = self._split_tracker(mission, tracker)
+        asked = trends.HistoryRequest(name, run or LIVE, start, end, names, tracker=own)
+        return trends.every_batch(self._context.reading, asked)
 
     def ranking(
         self,

@@ -10,12 +10,12 @@ from service.app.context import Context, known_id
 from service.errors import WrongState
 from service.ingest.solver_pool import mission_in_input
 from service.settings import networks
+from service.storage import webhooks
 from service.storage.models.base import Page
 from service.storage.recording.events import events_between, last_event
 from service.storage.recording.ids import Ulids
 from service.storage.sql.columns import Row
-from service.storage.webhooks import deliveries, registered
-from service.storage.webhooks.registered import (
+from service.storage.webhooks import (
     Webhook,
     WebhookDelivery,
     WebhookQueued,
@@ -44,13 +44,13 @@ class Webhooks:
         """Every webhook, the oldest first."""
         is_open = self._access.is_open
         with self._context.reading() as connection:
-            return registered.list_webhooks(connection, utc_now().text, is_open)
+            return webhooks.list_webhooks(connection, utc_now().text, is_open)
 
     def get(self, id: str) -> Webhook:
         """One webhook."""
         is_open = self._access.is_open
         with self._context.reading() as connection:
-            return registered.read_webhook(connection, _known(id), utc_now().text, is_open)
+            return webhooks.read_webhook(connection, _known(id), utc_now().text, is_open)
 
     def add(self, settings: Row, caller: Caller, entry: Entry | None = None) -> WebhookWithSecret:
         """Register a webhook, which is sent the events from now on.
@@ -65,11 +65,11 @@ class Webhooks:
         row = settings | _of(caller) | {"id": id, "created": now, "secret": secret}
 
         def change(connection: Connection) -> Webhook:
-            if registered.count_webhooks(connection) >= MAX_WEBHOOKS:
+            if webhooks.count_webhooks(connection) >= MAX_WEBHOOKS:
                 raise WrongState(f"there are {MAX_WEBHOOKS} webhooks already; delete one first")
             position = last_event(connection)
-            registered.add_webhook(connection, row | {"position": position})
-            return registered.read_webhook(connection, id, now, is_open)
+            webhooks.add_webhook(connection, row | {"position": position})
+            return webhooks.read_webhook(connection, id, now, is_open)
 
         added = self._context.change_audited(change, entry)
         self.sender.changed()
@@ -85,9 +85,9 @@ class Webhooks:
         changes = settings | _of(caller) | {"gone_at": None, "held_until": None}
 
         def change(connection: Connection) -> Webhook:
-            registered.change_webhook(connection, known, changes)
-            deliveries.resume(connection, known, now)
-            return registered.read_webhook(connection, known, now, is_open)
+            webhooks.change_webhook(connection, known, changes)
+            webhooks.resume(connection, known, now)
+            return webhooks.read_webhook(connection, known, now, is_open)
 
         changed = self._context.change_audited(change, entry)
         self.sender.changed()
@@ -98,8 +98,8 @@ class Webhooks:
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
 
         def change(connection: Connection) -> Webhook:
-            found = registered.read_webhook(connection, known, now, is_open)
-            registered.delete_webhook(connection, known)
+            found = webhooks.read_webhook(connection, known, now, is_open)
+            webhooks.delete_webhook(connection, known)
             return found
 
         deleted = self._context.change_audited(change, entry)
@@ -115,15 +115,15 @@ class Webhooks:
         secret, until = new_webhook_secret(), shifted(now, hours * HOUR_S).text
 
         def change(connection: Connection) -> Webhook:
-            before = registered.registered_webhook(connection, known, now.text, is_open)
+            before = webhooks.registered_webhook(connection, known, now.text, is_open)
             if hours and len(before.secrets(now.text)) > 1:
                 raise WrongState(
                     f"the secret before the present one signs until {before.previous_until}: make "
                     "a new one after that, or with `previous_hours` 0, which ends both at once"
                 )
             changes = {"secret": secret, "previous_secret": before.secret, "previous_until": until}
-            registered.change_webhook(connection, known, changes)
-            return registered.read_webhook(connection, known, now.text, is_open)
+            webhooks.change_webhook(connection, known, changes)
+            return webhooks.read_webhook(connection, known, now.text, is_open)
 
         rotated = self._context.change_audited(change, entry)
         self.sender.changed()
@@ -136,7 +136,7 @@ class Webhooks:
         """
         is_open = self._access.is_open
         with self._context.reading() as connection:
-            webhook = registered.registered_webhook(connection, _known(id), utc_now().text, is_open)
+            webhook = webhooks.registered_webhook(connection, _known(id), utc_now().text, is_open)
         if webhook.state != "active":
             raise WrongState(f"the webhook is {webhook.state}: {webhook.reason}")
         message_id, outcome = self.sender.try_out(webhook)
@@ -160,8 +160,8 @@ class Webhooks:
         """A webhook's waiting deliveries and dead letters, or one of these; the latest first."""
         known, is_open = _known(id), self._access.is_open
         with self._context.reading() as connection:
-            registered.read_webhook(connection, known, utc_now().text, is_open)
-            return deliveries.list_deliveries(
+            webhooks.read_webhook(connection, known, utc_now().text, is_open)
+            return webhooks.list_deliveries(
                 connection,
                 known,
                 dead=dead,
@@ -180,8 +180,8 @@ class Webhooks:
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
 
         def change(connection: Connection) -> int:
-            registered.registered_webhook(connection, known, now, is_open)
-            return deliveries.retry_dead(connection, known, numbers, now)
+            webhooks.registered_webhook(connection, known, now, is_open)
+            return webhooks.retry_dead(connection, known, numbers, now)
 
         return WebhookQueued(queued=self._context.change_audited(change, entry))
 
@@ -193,7 +193,7 @@ class Webhooks:
         end = utc_now() if until is None else until
         # Not in the writer, which others would wait for.
         with self._context.reading() as connection:
-            webhook = registered.registered_webhook(connection, known, now, is_open)
+            webhook = webhooks.registered_webhook(connection, known, now, is_open)
             kept = events_between(connection, since, end)
         # What was not queued yet comes by itself.
         found = [each for each in kept if each.id <= webhook.position]
@@ -201,8 +201,8 @@ class Webhooks:
         rows = [delivery_row(known, each, now, again=True) for each in wanted]
 
         def change(connection: Connection) -> int:
-            registered.registered_webhook(connection, known, now, is_open)
-            return deliveries.queue_again(connection, known, rows)
+            webhooks.registered_webhook(connection, known, now, is_open)
+            return webhooks.queue_again(connection, known, rows)
 
         return WebhookQueued(queued=self._context.change_audited(change, entry))
 

@@ -7,7 +7,7 @@ least squares over all attitudes and unknowns together.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,20 +37,12 @@ class Normal:
     full: Vector
 
     def __add__(self, other: "Normal") -> "Normal":
-        return Normal(
-            self.matrix + other.matrix,
-            self.right + other.right,
-            self.squares + other.squares,
-            self.full + other.full,
-        )
+        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        return Normal(*(one + another for one, another in pairs))
 
     def __sub__(self, other: "Normal") -> "Normal":
-        return Normal(
-            self.matrix - other.matrix,
-            self.right - other.right,
-            self.squares - other.squares,
-            self.full - other.full,
-        )
+        pairs = ((getattr(self, each.name), getattr(other, each.name)) for each in fields(self))
+        return Normal(*(one - another for one, another in pairs))
 
     def solution(self, free: Indices) -> Vector:
         """The step (p,) that is zero but for the unknowns `free`."""

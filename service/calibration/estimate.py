@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.calibration import linearise
 from service.calibration.elimination import (
     Eliminated,
     Marks,
@@ -20,14 +21,6 @@ from service.calibration.elimination import (
     inverse,
     not_observable,
     observable,
-)
-from service.calibration.linearise import (
-    TrackerStars,
-    Weights,
-    linearised,
-    prepared,
-    residuals,
-    turned_attitudes,
 )
 from service.calibration.stars import IdentifiedStars, Indices
 from service.calibration.unknowns import Model, Unknown, unknowns_of
@@ -66,7 +59,7 @@ class Calibration:
     attitude: Matrix
     before: Vector
     residual: Vector
-    weight: Weights
+    weight: linearise.Weights
     freedom: int
     not_observable: tuple[NotObservable, ...]
 
@@ -103,13 +96,13 @@ class Fit:
     none for others.
     """
 
-    parts: Sequence[TrackerStars]
+    parts: Sequence[linearise.TrackerStars]
     unknowns: Sequence[Unknown]
     marks: Marks
     values: Vector
     attitude: Matrix
     residual: Vector
-    weight: Weights
+    weight: linearise.Weights
     counted: Marks
     reduced: Eliminated
     scale: float = 1.0
@@ -161,7 +154,7 @@ def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
 def begun(stars: IdentifiedStars, model: Model) -> Fit:
     """A fit at the mission's present settings, all stars with full weight."""
     unknowns = unknowns_of(stars.trackers, model)
-    parts = prepared(stars, unknowns, model.reference_temperature_c)
+    parts = linearise.prepared(stars, unknowns, model.reference_temperature_c)
     values, every = np.zeros(len(unknowns)), np.ones(len(stars), dtype=np.bool_)
     residual = _residuals(parts, values, stars.attitude, len(stars))
     reduced = _eliminated(parts, values, stars.attitude, residual, every, model)
@@ -195,7 +188,7 @@ def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tup
         if leave_out and length < SETTLED * found.scale:
             break
     found.values = found.values + moved
-    found.attitude = turned_attitudes(found.attitude, turned)
+    found.attitude = linearise.turned_attitudes(found.attitude, turned)
     found.residual = _residuals(found.parts, found.values, found.attitude, len(stars))
     angles = [abs(v) for v, each in zip(moved, found.unknowns, strict=True) if each.unit != "s"]
     return steps, max([float(np.abs(turned).max()), *angles]) > FAR_RAD
@@ -208,25 +201,25 @@ def _reduced(found: Fit, model: Model) -> Eliminated:
 
 
 def _eliminated(
-    parts: Sequence[TrackerStars],
+    parts: Sequence[linearise.TrackerStars],
     values: Vector,
     attitude: Matrix,
     residual: Vector,
     counted: Marks,
     model: Model,
 ) -> Eliminated:
-    derivatives = [linearised(part, values, attitude) for part in parts]
+    derivatives = [linearise.linearised(part, values, attitude) for part in parts]
     edges = np.array([0, len(attitude)])
     arguments = residual, counted.astype(np.float64), len(values), edges
     return eliminate(derivatives, *arguments, model.attitudes_known)
 
 
 def _residuals(
-    parts: Sequence[TrackerStars], values: Vector, attitude: Matrix, stars: int
+    parts: Sequence[linearise.TrackerStars], values: Vector, attitude: Matrix, stars: int
 ) -> Vector:
     found = np.empty((2, stars))
     for part in parts:
-        found[:, part.rows] = residuals(part, values, attitude)
+        found[:, part.rows] = linearise.residuals(part, values, attitude)
     return found
 
 
@@ -292,7 +285,7 @@ def scale_of(residual: Vector, used: int, freedom: int) -> float:
     return max(float(np.median(length)) / MEDIAN_RADIUS * math.sqrt(used / max(freedom, 1)), 1e-12)
 
 
-def weights(residual: Vector, scale: float, leave_out: bool) -> Weights:
+def weights(residual: Vector, scale: float, leave_out: bool) -> linearise.Weights:
     """Weights (n,) of stars with these residuals (2, n).
 
     With `leave_out` those beyond `WRONG` have none.
@@ -359,7 +352,9 @@ def held_out(
     that the fit left out are left out here.
     """
     edges = _edges(stars.batches, blocks)
-    derivatives = [linearised(part, settled.values, settled.attitude) for part in settled.parts]
+    derivatives = [
+        linearise.linearised(part, settled.values, settled.attitude) for part in settled.parts
+    ]
     used = settled.used.astype(np.float64)
     count = len(settled.unknowns)
     arguments = settled.residual, used, count, edges, model.attitudes_known

@@ -68,8 +68,8 @@ def build_parser() -> argparse.ArgumentParser:
     parser = add_command(
         None,
         "acquire",
-        "Star identification and attitude: from observed stars to a recorded attitude.",
-        """
+        summary="Star identification and attitude: from observed stars to a recorded attitude.",
+        examples="""
         acquire demo                                 start the service and replay sample passes
         acquire serve                                serve on http://127.0.0.1:8000
         acquire replay pass.ndjson --results out.ndjson

@@ -5,6 +5,7 @@ Modules of commands import nothing heavy before they run: help answers at once.
 
 import argparse
 import difflib
+import inspect
 import sys
 import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -84,15 +85,21 @@ def _meant(text: str, known: Iterable[str]) -> str:
 def add_command(
     parent: Any,
     name: str,
-    summary: str,
-    examples: str,
     function: Function | None = None,
+    *,
+    summary: str = "",
+    examples: str = "",
     notes: str = "",
 ) -> argparse.ArgumentParser:
     """Add a command that runs `function`, which returns the exit code.
 
-    `parent` None makes the parser of the whole command.  `notes` follow the examples in the help.
+    The help is the function's docstring: what the command does, an empty line, examples.  A group,
+    and a command whose function serves several, has `summary` and `examples` instead.  `notes`
+    follow the examples.  `parent` None makes the parser of the whole command.
     """
+    if not summary:
+        summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
+        summary = " ".join(summary.splitlines())
     lines = [line.strip() for line in examples.strip().splitlines()]
     epilog = "examples:\n" + "\n".join(f"  {line}" for line in lines)
     arguments: dict[str, Any] = {
@@ -110,7 +117,7 @@ def add_command(
 
 def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:
     """Add a command that has commands of its own; returns what takes these."""
-    return add_subcommands(add_command(parent, name, summary, examples))
+    return add_subcommands(add_command(parent, name, summary=summary, examples=examples))
 
 
 def add_subcommands(parser: argparse.ArgumentParser) -> Any:

@@ -39,22 +39,7 @@ All settings see the same stars and draws. Nothing is searched outside the zone.
 
 def add_mission(group: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        group,
-        "mission",
-        "Simulate the views of a mission's tracker as Fink & Shoup (1994) do, and print which "
-        "shares of the stars are identified rightly, ambiguous, unmatched or wrong, with "
-        "confidence intervals; tolerances, size of the zone and errors may be swept.",
-        """
-        acquire simulate mission XTE
-        acquire simulate mission mine.toml --sweep separation_deg=.01,.02 --sweep magnitude=.3:.9:.2
-        acquire simulate mission XTE --identifier starid --sweep psi_deg=0:100:10 --page psi.html
-        acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
-        acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
-        """,
-        _run_mission,
-        NOTES,
-    )
+    parser = add_command(group, "mission", _run_mission, notes=NOTES)
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
     )
@@ -105,7 +90,6 @@ def add_mission(group: Any) -> None:
 
 
 def _add_draws(parser: ArgumentParser) -> None:
-    """Declare how much is drawn."""
     parser.add_argument(
         "--stars",
         type=count,
@@ -114,7 +98,11 @@ def _add_draws(parser: ArgumentParser) -> None:
         help=f"approximate number of stars for each setting; default {DEFAULT_STARS}",
     )
     parser.add_argument(
-        "--views", type=count, default=10, metavar="N", help="views in each zone; default 10"
+        "--views",
+        type=count,
+        default=10,
+        metavar="N",
+        help="views in each zone; default 10",
     )
     parser.add_argument(
         "--stars-per-view",
@@ -127,7 +115,6 @@ def _add_draws(parser: ArgumentParser) -> None:
 
 
 def _add_outputs(parser: ArgumentParser) -> None:
-    """Declare what is printed and written."""
     parser.add_argument(
         "--at-most-ambiguous",
         type=_share,
@@ -144,25 +131,33 @@ def _add_outputs(parser: ArgumentParser) -> None:
 
 
 def _run_mission(parsed: Namespace) -> int:
-    """Simulate and print the rates."""
+    """Simulate the views of a mission's tracker as Fink & Shoup (1994) do, and print which shares
+    of the stars are identified rightly, ambiguous, unmatched or wrong, with confidence
+    intervals; tolerances, size of the zone and errors may be swept.
+
+    acquire simulate mission XTE
+    acquire simulate mission mine.toml --sweep separation_deg=.01,.02 --sweep magnitude=.3:.9:.2
+    acquire simulate mission XTE --identifier starid --sweep psi_deg=0:100:10 --page psi.html
+    acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
+    acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
+    """
     from service.cli.configuration import mission_of_file_or_name
     from service.settings import Settings
-    from studies.mission_rates import page
-    from studies.mission_rates.plot import checked, draw
+    from studies.mission_rates import plot
     from studies.mission_rates.report import report_json, report_text
     from studies.mission_rates.simulation import simulate
 
     plan = _plan(parsed, mission_of_file_or_name(parsed.mission))
     if parsed.plot is not None:
-        checked(plan, parsed.plot)
+        plot.checked_plot(plan, parsed.plot)
     if parsed.page is not None:
-        page.checked(plan, parsed.page)
+        plot.checked(plan, "--page", parsed.page, ".html")
     catalog = Settings.from_environment().catalog
     rates = simulate(plan, catalog, parsed.processes, parsed.quiet)
     if parsed.plot is not None:
-        draw(plan, rates, parsed.plot)
+        plot.draw(plan, rates, parsed.plot)
     if parsed.page is not None:
-        page.write_page(plan, rates, parsed.at_most_ambiguous, parsed.page)
+        plot.write_page(plan, rates, parsed.at_most_ambiguous, parsed.page)
     if parsed.json:
         print_json(report_json(plan, rates, parsed.at_most_ambiguous))
     else:
@@ -256,25 +251,12 @@ same after the attitude check of the identifier `ptp`."""
 
 def add_paper(group: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        group,
-        "paper",
-        "Repeat the experiments of a paper and compare its tables with our results: Fink & "
-        "Shoup 1994 by table number, Zhou & Ye 2015 (PTP, lost in space) by table name.",
-        """
-        acquire simulate paper --table 3 --stars 2000
-        acquire simulate paper --table ptp-6 --scenes 2000 --seed 7
-        acquire simulate paper --table ptp --plots docs/plots --report docs/ptp.md
-        acquire simulate paper --json rates.json
-        acquire simulate paper --table 3 --stars 2000 --json
-        acquire simulate paper --identifier starid --seed 1 2 3 --plots docs/plots --report paper.md
-        acquire simulate paper --identifier verified --report verified.md
-        """,
-        _run_paper,
-        PTP_HELP,
-    )
+    parser = add_command(group, "paper", _run_paper, notes=PTP_HELP)
     parser.add_argument(
-        "--table", type=table, metavar="N|NAME", help="2 to 14 (default: all of these), or a name"
+        "--table",
+        type=table,
+        metavar="N|NAME",
+        help="2 to 14 (default: all of these), or a name",
     )
     parser.add_argument(
         "--stars",
@@ -309,7 +291,17 @@ def add_paper(group: Any) -> None:
 
 
 def _run_paper(parsed: Namespace) -> int:
-    """Fly the experiments of a paper and print its tables."""
+    """Repeat the experiments of a paper and compare its tables with our results: Fink & Shoup 1994
+    by table number, Zhou & Ye 2015 (PTP, lost in space) by table name.
+
+    acquire simulate paper --table 3 --stars 2000
+    acquire simulate paper --table ptp-6 --scenes 2000 --seed 7
+    acquire simulate paper --table ptp --plots docs/plots --report docs/ptp.md
+    acquire simulate paper --json rates.json
+    acquire simulate paper --table 3 --stars 2000 --json
+    acquire simulate paper --identifier starid --seed 1 2 3 --plots docs/plots --report paper.md
+    acquire simulate paper --identifier verified --report verified.md
+    """
     if isinstance(parsed.table, str):
         return _run_ptp(parsed)
     if parsed.scenes is not None:
@@ -318,8 +310,7 @@ def _run_paper(parsed: Namespace) -> int:
                 "--scenes", "goes with a table by name, such as --table ptp-6", str(parsed.scenes)
             )
         )
-    from studies.paper_1994.command import DEFAULT_STARS, run_paper
-    from studies.paper_1994.report import PROPORTIONS, TIMES
+    from studies.paper_1994.command import DEFAULT_STARS, PROPORTIONS, TIMES, run_paper
 
     if parsed.stars is not None and parsed.table in (*TIMES, *PROPORTIONS):
         message = f"has no effect on table {parsed.table}, whose zones are as many as the paper's"

@@ -7,26 +7,10 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from service.app import calibration_estimates
 from service.app.advice import no_changes_text
-from service.app.calibration_estimates import (
-    not_observable_of,
-    notes,
-    residuals_by_tracker,
-    result_of,
-    unknowns_of,
-)
 from service.ingest.reprocess import ReprocessProgress
-from service.storage.models.advice import (
-    Advice,
-    AlignmentAdvice,
-    GroupAdvice,
-    InnovationAdvice,
-    MagnitudeAdvice,
-    NoiseAdvice,
-    ToleranceAdvice,
-    Trial,
-    ZoneAdvice,
-)
+from service.storage.models.advice import Advice, Trial
 from service.storage.models.compare import RunComparison, RunTransition
 from service.storage.tracks import Track, TrackList
 
@@ -34,23 +18,13 @@ if TYPE_CHECKING:
     from service.app.calibration_estimates import CalibrationRun
     from service.calibration.estimate import Calibration
 
-
-Finding = (
-    GroupAdvice
-    | ZoneAdvice
-    | ToleranceAdvice
-    | NoiseAdvice
-    | MagnitudeAdvice
-    | AlignmentAdvice
-    | InnovationAdvice
-)
 WIDTH = 96
 
 
 def advice_text(advice: Advice) -> str:
     """The advice as lines of text."""
     lines = [*_heading(advice), ""]
-    sections: tuple[tuple[str, Sequence[Finding]], ...] = (
+    sections: tuple[tuple[str, Sequence[Any]], ...] = (
         ("Groups of stars", advice.groups),
         ("Zone", advice.zone),
         ("Tolerances", advice.tolerances),
@@ -75,7 +49,8 @@ def _heading(advice: Advice) -> list[str]:
     return [*lines, *textwrap.wrap(sampled + ".", WIDTH)]
 
 
-def _sentences(findings: Iterable[Finding]) -> list[str]:
+def _sentences(findings: Iterable[Any]) -> list[str]:
+    """The findings, whatever they are about, by their `text` and the mark of their `action`."""
     marks = {"keep": "  ok  ", "wait": "  ?   "}
     return [
         line
@@ -141,13 +116,15 @@ def calibration_text(result: "CalibrationRun") -> str:
         )
         lines += ["", f"Held-out residual over sigma by degree of the distortion: {tried}."]
     lines += ["", f"{'':2}{'unknown':34}{'value':>14}{'sigma':>12}  unit"]
-    for each in unknowns_of(result):
+    for each in calibration_estimates.unknowns_of(result):
         mark = "* " if abs(each.value) > CERTAIN_SIGMAS * each.sigma else "  "
         lines.append(f"{mark}{each.name:34}{each.value:>14.6g}{each.sigma:>12.2g}  {each.unit}")
     lines.append(f"* differs from the mission's by more than {CERTAIN_SIGMAS:g} sigmas")
     lines += ["", "Not observable:"]
-    lines += [f"  {each.name}: {each.reason}." for each in not_observable_of(result)]
-    lines += ["", *(f"Note: {each}." for each in notes(result))]
+    lines += [
+        f"  {each.name}: {each.reason}." for each in calibration_estimates.not_observable_of(result)
+    ]
+    lines += ["", *(f"Note: {each}." for each in calibration_estimates.notes(result))]
     return "\n".join(lines).rstrip()
 
 
@@ -159,7 +136,7 @@ def _residual_lines(found: "Calibration") -> list[str]:
             f"arcsec, {each.before_over_sigma:.2f} -> {each.after_over_sigma:.2f} sigmas, "
             f"{each.stars} stars"
         )
-        for each in residuals_by_tracker(found)
+        for each in calibration_estimates.residuals_by_tracker(found)
     ]
     lines.append(f"  together, per degree of freedom: {found.residual_over_sigma:.3f} sigmas")
     return lines
@@ -167,7 +144,7 @@ def _residual_lines(found: "Calibration") -> list[str]:
 
 def calibration_json(result: "CalibrationRun") -> dict[str, Any]:
     """The result as `GET /api/v1/calibrations/{id}` has it, with its covariance."""
-    found: dict[str, Any] = msgspec.to_builtins(result_of(result))
+    found: dict[str, Any] = msgspec.to_builtins(calibration_estimates.result_of(result))
     return found | {"covariance": result.covariance.tolist()}
 
 

@@ -2,26 +2,20 @@
 
 import getpass
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from typing import Any, Protocol
 from urllib.parse import quote
 
 import msgspec
 from sqlalchemy import Connection
 
+from service import errors
 from service.access.audit import Entry
 from service.access.tokens import MAX_DAYS, Tokens
 from service.cli.arguments import print_json
-from service.errors import (
-    AcquisitionError,
-    BadInput,
-    Busy,
-    Fault,
-    Forbidden,
-    Unauthenticated,
-    shown_value,
-)
+from service.cli.configuration import http_client, refusal_of, service_url, settings_of
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.storage.models.access import NewToken, Token
@@ -35,46 +29,34 @@ from service.times import DAY_S, shifted, utc_now
 TIMEOUT_S = 30.0
 
 
-class Refused(AcquisitionError):
+class Refused(errors.AcquisitionError):
     """The service refused the request; the message is its own."""
 
 
 class TokenService(Protocol):
     """Makes and revokes tokens."""
 
-    def add(
-        self,
-        name: str,
-        scopes: Collection[str],
-        *,
-        spacecraft: Collection[str] | None,
-        days: int,
-        rate_per_s: float | None,
-    ) -> NewToken:
-        """Make a token."""
+    def add(self, name: str, scopes: Collection[str], **more: Any) -> NewToken:
+        """Make a token; `more` are the keywords of `Tokens.add`."""
 
     def revoke(self, name: str) -> Token:
         """End a token."""
 
 
-def create(
-    settings: Settings,
-    url: str,
-    name: str,
-    scopes: Collection[str],
-    spacecraft: Collection[str] | None,
-    days: int,
-    rate_per_s: float | None,
-) -> int:
+def create_token(parsed: Namespace) -> int:
     """Make a token and print it; the way to use it goes to the standard error output."""
+    days, spacecraft = parsed.days, parsed.spacecraft
     if days > MAX_DAYS:
-        raise BadInput(Fault("--days", f"must be at most {MAX_DAYS}", shown_value(days)))
-    with _opened(settings, url, create=True) as tokens:
-        made = tokens.add(name, scopes, spacecraft=spacecraft, days=days, rate_per_s=rate_per_s)
+        raise errors.BadInput(
+            errors.Fault("--days", f"must be at most {MAX_DAYS}", errors.shown_value(days))
+        )
+    about = {"spacecraft": spacecraft, "days": days, "rate_per_s": parsed.rate}
+    with opened_tokens(settings_of(parsed), service_url(parsed), create=True) as tokens:
+        made = tokens.add(parsed.name, parsed.scope, **about)
     print(made.token)
-    about = "" if spacecraft is None else f" about {', '.join(spacecraft)}"
+    bound = "" if spacecraft is None else f" about {', '.join(spacecraft)}"
     print(
-        f"{name} may {', '.join(scopes)}{about} until {made.expires[:10]}.\n"
+        f"{parsed.name} may {', '.join(parsed.scope)}{bound} until {made.expires[:10]}.\n"
         "The token is shown only now. Programs send it as `Authorization: Bearer acq_...`; "
         "commands\nthat talk to the service read it from ACQUIRE_TOKEN.",
         file=sys.stderr,
@@ -82,13 +64,10 @@ def create(
     return 0
 
 
-def show(settings: Settings, as_json: bool = False) -> int:
+def print_tokens(settings: Settings, as_json: bool) -> int:
     """Print every token without its secret."""
-    readers = Readers(settings.database)
-    try:
+    with closing(Readers(settings.database)) as readers:
         rows = Tokens(_Direct(readers, None), {}).all()
-    finally:
-        readers.close()
     if as_json:
         print_json(msgspec.to_builtins(rows))
         return 0
@@ -104,33 +83,16 @@ def show(settings: Settings, as_json: bool = False) -> int:
     return 0
 
 
-def revoke(settings: Settings, url: str, name: str) -> int:
-    """End a token."""
-    with _opened(settings, url) as tokens:
-        tokens.revoke(name)
-    print(f"{name} is revoked; a running service heeds that within a second")
-    return 0
-
-
 @contextmanager
-def _opened(settings: Settings, url: str, create: bool = False) -> Iterator[TokenService]:
+def opened_tokens(settings: Settings, url: str, create: bool = False) -> Iterator[TokenService]:
     """The tokens of the database, or of the service that alone writes to its file."""
     file = database_file(database_url(settings.database))
     if file is not None and file.path.exists() and is_written(file):
-        import httpx
-
-        headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
-        # The service may listen to this machine alone, where no proxy reaches it.
-        with httpx.Client(
-            base_url=url, timeout=TIMEOUT_S, trust_env=False, headers=headers
-        ) as client:
+        with http_client(settings, url, TIMEOUT_S) as client:
             yield _OverHttp(client, url)
         return
-    store = Store(settings.database, create=create)
-    try:
+    with closing(Store(settings.database, create=create)) as store:
         yield _InDatabase(store, settings)
-    finally:
-        store.close()
 
 
 class _Direct:
@@ -186,18 +148,15 @@ class _OverHttp:
         try:
             response = self._client.request(method, f"/api/v1/tokens{path}", **arguments)
         except httpx.HTTPError as error:
-            raise Busy(
+            raise errors.Busy(
                 f"a service writes to the database, but none answers at {self._url} ({error}): "
                 "name its address with --url"
             ) from None
         if response.is_success:
             return bytes(response.content)
-        try:
-            detail = str(response.json()["detail"])
-        except (ValueError, KeyError, TypeError):
-            detail = f"HTTP {response.status_code}"
+        detail = refusal_of(response)
         if response.status_code in (401, 403):
-            kind = Unauthenticated if response.status_code == 401 else Forbidden
+            kind = errors.Unauthenticated if response.status_code == 401 else errors.Forbidden
             raise kind(
                 f"{detail}; tokens are changed through the service at {self._url}: set "
                 "ACQUIRE_TOKEN to a token with the scope operate that is bound to no spacecraft, "

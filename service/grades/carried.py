@@ -113,15 +113,15 @@ def last_stretch(recorded: Recorded, mission: Mission) -> Stretch | None:
     Gyro samples come in blocks: measurements after the last sample wait for it, as long as a
     gap may be.
     """
-    stretches = cut(recorded, mission).stretches
-    if not stretches:
+    found = cut(recorded, mission).stretches
+    if not found:
         return None
-    end_ns = max(_end_ns(each) for each in stretches)
-    with_gyro = [each for each in stretches if each.gyro is not None]
+    end_ns = max(_end_ns(each) for each in found)
+    with_gyro = [each for each in found if each.gyro is not None]
     for each in reversed(with_gyro):
         if end_ns - _end_ns(each) <= LONGEST_GAP_S * 1e9:
             return each
-    return max(stretches, key=_end_ns)
+    return max(found, key=_end_ns)
 
 
 def _end_ns(stretch: Stretch) -> int:

@@ -24,6 +24,12 @@ UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""
 
 
+def full_matrices(upper: Vector) -> Vector:
+    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6) in the order of `UPPER`."""
+    full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))
+
+
 @dataclass(frozen=True, eq=False)
 class TimedColumns:
     """Columns of equal length, the first of which are times."""

@@ -16,6 +16,7 @@ from service.filtering.samples import (
     DirectionMeasurements,
     GyroSamples,
 )
+from service.grades.innovations import full_matrices
 from service.gyro import Nanoseconds
 from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.mission import Mission
@@ -98,8 +99,7 @@ def usable_attitudes(
 
     `covariance_arcsec2` (m, 6) is the upper triangle: 11, 12, 13, 22, 23, 33.
     """
-    full = covariance_arcsec2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
-    full = full / ARCSEC_PER_RADIAN**2
+    full = full_matrices(covariance_arcsec2) / ARCSEC_PER_RADIAN**2
     sound: Mask = np.asarray(np.isfinite(full).all(axis=(1, 2)))
     sound &= np.asarray(np.isfinite(quaternion).all(axis=1))
     variances = np.linalg.eigvalsh(np.where(sound[:, None, None], full, np.eye(3)))

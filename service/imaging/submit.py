@@ -22,25 +22,10 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
+from service.observations import schema
 from service.observations.batch import Aberration
 from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
-from service.observations.schema import (
-    APrioriIn,
-    BatchIn,
-    BodyRate,
-    Key,
-    Number,
-    OptionsIn,
-    Position,
-    RunName,
-    Speed,
-    Submission,
-    UnitVector,
-    Wire,
-    is_time,
-    submission_from_model,
-)
 from service.times import utc_now
 from service.vectors import Vector
 
@@ -58,24 +43,24 @@ One with the share r of the light moves it by 0.86 r sigma at most, where it sta
 MAX_SHARP_KEPT = 500
 
 
-class FrameIn(Wire):
+class FrameIn(schema.Wire):
     """What is told of a frame: the fields of a batch but its stars."""
 
-    batch: Key | None = None
-    time: Annotated[str, AfterValidator(is_time)] | None = None
-    run: RunName = "live"
-    tracker: Key | None = None
-    a_priori: APrioriIn | None = None
-    body_rates_deg_per_s: tuple[BodyRate, BodyRate, BodyRate] = (0.0, 0.0, 0.0)
-    velocity_km_per_s: tuple[Speed, Speed, Speed] | None = None
-    sun_vector: UnitVector | None = None
-    position_km: Position | None = None
+    batch: schema.Key | None = None
+    time: Annotated[str, AfterValidator(schema.is_time)] | None = None
+    run: schema.RunName = "live"
+    tracker: schema.Key | None = None
+    a_priori: schema.APrioriIn | None = None
+    body_rates_deg_per_s: tuple[schema.BodyRate, schema.BodyRate, schema.BodyRate] = (0.0, 0.0, 0.0)
+    velocity_km_per_s: tuple[schema.Speed, schema.Speed, schema.Speed] | None = None
+    sun_vector: schema.UnitVector | None = None
+    position_km: schema.Position | None = None
     aberration: Aberration = "to_correct"
-    exposure_s: Annotated[Number, Field(gt=0, le=3600)] | None = None
+    exposure_s: Annotated[schema.Number, Field(gt=0, le=3600)] | None = None
     centroid: CentroidMethod | None = None
     image: Annotated[str, Field(min_length=1, max_length=80)] | None = None
     """Which image of a file with several; see `FrameLimits`."""
-    options: OptionsIn = OptionsIn()
+    options: schema.OptionsIn = schema.OptionsIn()
 
     def batch_of(self, digest: str) -> str:
         """The batch id: the one given, else a name made from the digest and the image chosen."""
@@ -103,7 +88,7 @@ def read_known(values: dict[str, Any]) -> FrameIn:
 
 def submission_of_frame(
     file: IO[bytes], digest: str, known: FrameIn, mission: Mission, max_pixels: int
-) -> Submission:
+) -> schema.Submission:
     """The batch of the stars on a frame, with the record of how they were found.
 
     Raises `BadFile` for a file that is no frame of the tracker's and for a frame
@@ -151,9 +136,9 @@ def submission_of_frame(
     )
     record = _record(frame, found, stars, tracker, camera, known, steps)
     record = replace(record, remarks=[*remarks, *choices_of(frame)])
-    submission = submission_from_model(model)
+    submission = schema.submission_from_model(model)
     fingerprint = known.fingerprint(mission.name, digest)
-    return Submission(submission.batch, submission.text, fingerprint, record)
+    return schema.Submission(submission.batch, submission.text, fingerprint, record)
 
 
 def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
@@ -188,7 +173,7 @@ def batch_of_stars(
     time: str,
     tracker: Tracker,
     stars: list[dict[str, Any]],
-) -> BatchIn:
+) -> schema.BatchIn:
     """The batch of a tracker's stars, with what is told of their frame."""
     fields = json.loads(known.model_dump_json(exclude_defaults=True))
     for name in ("tracker", "exposure_s", "centroid", "image"):
@@ -201,7 +186,7 @@ def batch_of_stars(
         "time": time,
         "observations": [{"tracker": tracker.name, "stars": stars}],
     }
-    return BatchIn.model_validate_json(json.dumps(whole))
+    return schema.BatchIn.model_validate_json(json.dumps(whole))
 
 
 def _observed(stars: "list[MeasuredStar]", camera: Camera) -> list[dict[str, Any]]:

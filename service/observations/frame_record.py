@@ -37,17 +37,14 @@ class FrameRecord:
     def summary(self) -> dict[str, Any]:
         """The part of the answer that is about the frame."""
         used = sum(bool(star["used"]) for star in self.stars)
+        plain = (
+            *("tracker", "width_px", "height_px", "exposure_s", "centroid"),
+            *("background_counts", "noise_counts", "candidates"),
+        )
         return {
             "digest": self.digest,
             "format": self.file_format,
-            "tracker": self.tracker,
-            "width_px": self.width_px,
-            "height_px": self.height_px,
-            "exposure_s": self.exposure_s,
-            "centroid": self.centroid,
-            "background_counts": self.background_counts,
-            "noise_counts": self.noise_counts,
-            "candidates": self.candidates,
+            **{name: getattr(self, name) for name in plain},
             "measured": len(self.stars),
             "used": used,
             "hot_or_cosmic": len(self.sharp),

@@ -11,23 +11,22 @@ from service.errors import Fault
 from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
 from service.observations.faults import faults_of
 from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
-from service.packets.clock import (
-    NS,
-    Moment,
-    finite,
-    finite_all,
-    moment_of,
-    names_of,
-    number,
-    text,
-    whole,
-)
+from service.packets import clock
 from service.packets.definition import PacketFault
 from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns
 from service.packets.stream import SpacePacket
 
 CARRIED_WITHIN_S = 10.0
 """Rates, velocity and position of another packet serve stars that are so near in time."""
+
+STATE_FIELDS = {
+    "rates": "body_rates_deg_per_s",
+    "velocity": "velocity_km_per_s",
+    "position": "position_km",
+}
+"""The tables of a spacecraft's state in `[packets]`, and the fields of a batch that they fill."""
+SCALES = {"rad_per_s": 180.0 / math.pi, "m_per_s": 1e-3, "m": 1e-3}
+"""The factors to degrees per second and kilometres, of units that need one."""
 
 Values = Mapping[str, Any]
 
@@ -37,7 +36,7 @@ class StarBatch:
     """A batch in the making, with the packet that it began with."""
 
     packet: SpacePacket
-    moment: Moment
+    moment: clock.Moment
     body: dict[str, Any]
     columns: list[TrackerColumns] = field(default_factory=list)
     slots: list[list[int]] = field(default_factory=list)
@@ -52,7 +51,7 @@ class StarBatch:
 class PacketAttitude:
     """An a priori attitude: scalar last, inertial to body, and its time."""
 
-    moment: Moment
+    moment: clock.Moment
     quaternion: tuple[float, float, float, float]
 
 
@@ -63,7 +62,7 @@ def quaternion_in(
 
     Raises `PacketFault` for a norm other than 1.
     """
-    numbers = [number(values, name) for name in names]
+    numbers = [clock.number(values, name) for name in names]
     if not all(map(math.isfinite, numbers)) or not any(numbers):
         return None
     norm = math.hypot(*numbers)
@@ -94,17 +93,17 @@ class GyroRates:
         self._turn = 1 << gyro.counter_bits
         self._last: tuple[int, tuple[int, ...]] | None = None
 
-    def add(self, values: Mapping[str, Any], moment: Moment) -> list[float] | None:
+    def add(self, values: Mapping[str, Any], moment: clock.Moment) -> list[float] | None:
         """The rates in deg/s at a packet; None where an angle has no packet just before."""
         gyro = self._gyro
         if gyro.kind == "rate":
-            counts = finite_all(values, self._names)
+            counts = clock.finite_all(values, self._names)
             return [count * scale for count, scale in zip(counts, gyro.scale_deg, strict=True)]
-        angles = tuple(whole(values, name) for name in self._names)
+        angles = tuple(clock.whole(values, name) for name in self._names)
         before, self._last = self._last, (moment.tai_ns, angles)
         if before is None:
             return None
-        passed_s = (moment.tai_ns - before[0]) / NS
+        passed_s = (moment.tai_ns - before[0]) / clock.NS
         if not 0.0 < passed_s <= gyro.max_gap_s:
             return None
         return [
@@ -117,15 +116,15 @@ class Held:
     """Values of the latest packet that had them, with their time."""
 
     def __init__(self, within_s: float) -> None:
-        self._within_ns = round(within_s * NS)
-        self._moment: Moment | None = None
+        self._within_ns = round(within_s * clock.NS)
+        self._moment: clock.Moment | None = None
         self._values: list[float] | None = None
 
-    def hold(self, moment: Moment, values: list[float] | None) -> None:
+    def hold(self, moment: clock.Moment, values: list[float] | None) -> None:
         """Take values in place of those before; None: there are none any more."""
         self._moment, self._values = moment, values
 
-    def near(self, moment: Moment) -> list[float] | None:
+    def near(self, moment: clock.Moment) -> list[float] | None:
         """The values, if their time is near enough to a moment."""
         if self._moment is None or abs(self._moment.tai_ns - moment.tai_ns) > self._within_ns:
             return None
@@ -141,18 +140,8 @@ class BatchMaker:
         table = self._table = mapped.table
         self._prior = table.prior
         self._gyro = GyroRates(table.gyro, mapped.gyro) if table.gyro else None
-        self._rates_scale = (
-            180.0 / math.pi if table.rates and table.rates.unit == "rad_per_s" else 1.0
-        )
-        metres = 1e-3
-        self._velocity_scale = (
-            metres if table.velocity and table.velocity.unit == "m_per_s" else 1.0
-        )
-        self._position_scale = metres if table.position and table.position.unit == "m" else 1.0
         self._attitude = Held(table.prior.max_age_s if table.prior else 0.0)
-        self._rates = Held(CARRIED_WITHIN_S)
-        self._velocity = Held(CARRIED_WITHIN_S)
-        self._position = Held(CARRIED_WITHIN_S)
+        self._state = {name: Held(CARRIED_WITHIN_S) for name in STATE_FIELDS}
         self._pending: StarBatch | None = None
         self.without_attitude = 0
         """Packets whose a priori quaternion was zero or not finite."""
@@ -166,7 +155,7 @@ class BatchMaker:
         if quaternion is None:
             self.without_attitude += 1
             return None
-        return PacketAttitude(moment_of(prior.time or self._table.time, values), quaternion)
+        return PacketAttitude(clock.moment_of(prior.time or self._table.time, values), quaternion)
 
     def add(self, packet: SpacePacket, values: Values) -> Iterator[StarBatch]:
         """Take a packet; gives the batch that is complete with it.  Raises `PacketFault`."""
@@ -178,7 +167,7 @@ class BatchMaker:
         state = (mapped.rates, mapped.gyro, mapped.velocity, mapped.position)
         if not trackers and not any(names and names[0] in values for names in state):
             return
-        moment = moment_of(self._table.time, values)
+        moment = clock.moment_of(self._table.time, values)
         self._hold_state(values, moment)
         if not trackers:
             return
@@ -190,7 +179,7 @@ class BatchMaker:
             pending = None
         if pending is None:
             pending = self._pending = self._begun(packet, values, moment)
-        later_s = (moment.tai_ns - pending.moment.tai_ns) / NS
+        later_s = (moment.tai_ns - pending.moment.tai_ns) / clock.NS
         for columns, (slots, seen) in zip(trackers, stars, strict=True):
             _shift(seen, later_s)
             pending.columns.append(columns)
@@ -206,28 +195,28 @@ class BatchMaker:
         if pending is not None:
             yield pending
 
-    def _hold_state(self, values: Values, moment: Moment) -> None:
+    def _hold_state(self, values: Values, moment: clock.Moment) -> None:
         mapped = self._mapped
-        if mapped.rates and mapped.rates[0] in values:
-            self._rates.hold(moment, finite_all(values, mapped.rates, self._rates_scale))
-        if self._gyro is not None and mapped.gyro[0] in values:
-            self._rates.hold(moment, self._gyro.add(values, moment))
-        if mapped.velocity and mapped.velocity[0] in values:
-            self._velocity.hold(moment, finite_all(values, mapped.velocity, self._velocity_scale))
-        if mapped.position and mapped.position[0] in values:
-            self._position.hold(moment, finite_all(values, mapped.position, self._position_scale))
+        for name, held in self._state.items():
+            if (names := getattr(mapped, name)) and names[0] in values:
+                scale = SCALES.get(getattr(self._table, name).unit, 1.0)
+                held.hold(moment, clock.finite_all(values, names, scale))
+            if name == "rates" and self._gyro is not None and mapped.gyro[0] in values:
+                held.hold(moment, self._gyro.add(values, moment))
 
-    def _joins(self, pending: StarBatch, moment: Moment, trackers: list[TrackerColumns]) -> bool:
+    def _joins(
+        self, pending: StarBatch, moment: clock.Moment, trackers: list[TrackerColumns]
+    ) -> bool:
         apart_ns = abs(moment.tai_ns - pending.moment.tai_ns)
         held = {each.tracker for each in pending.columns}
-        return apart_ns <= self._table.join_within_s * NS and not any(
+        return apart_ns <= self._table.join_within_s * clock.NS and not any(
             each.tracker in held for each in trackers
         )
 
-    def _begun(self, packet: SpacePacket, values: Values, moment: Moment) -> StarBatch:
+    def _begun(self, packet: SpacePacket, values: Values, moment: clock.Moment) -> StarBatch:
         table = self._table
         name = (
-            text(values, table.batch)
+            clock.text(values, table.batch)
             if table.batch
             else f"{packet.apid}-{moment.text}-{packet.sequence_count}"
         )
@@ -239,15 +228,12 @@ class BatchMaker:
             "aberration": table.aberration,
             "observations": [],
         }
-        optional = {
-            "body_rates_deg_per_s": self._rates.near(moment),
-            "velocity_km_per_s": self._velocity.near(moment),
-            "position_km": self._position.near(moment),
-        }
-        body |= {key: value for key, value in optional.items() if value is not None}
+        for name, field_name in STATE_FIELDS.items():
+            if (value := self._state[name].near(moment)) is not None:
+                body[field_name] = value
         return StarBatch(packet, moment, body)
 
-    def _a_priori(self, moment: Moment) -> dict[str, Any] | None:
+    def _a_priori(self, moment: clock.Moment) -> dict[str, Any] | None:
         if self._prior is None:
             return None
         if self._prior.sun_pointed:
@@ -263,15 +249,15 @@ class BatchMaker:
         """The slots that hold a star, and the stars."""
         used = columns.slots
         if columns.count is not None:
-            used = whole(values, columns.count)
+            used = clock.whole(values, columns.count)
             if not 0 <= used <= columns.slots:
                 message = f"must be from 0 to {columns.slots}, the number of slots"
                 raise PacketFault(columns.count, message, used)
         slots, stars = [], []
         for slot in range(used):
-            if columns.valid is not None and not number(values, columns.valid[slot]):
+            if columns.valid is not None and not clock.number(values, columns.valid[slot]):
                 continue
-            direction = [number(values, each[slot]) for each in columns.directions]
+            direction = [clock.number(values, each[slot]) for each in columns.directions]
             if not all(map(math.isfinite, direction)):
                 continue
             star: dict[str, Any]
@@ -283,13 +269,13 @@ class BatchMaker:
                     "v_deg": direction[1] * columns.scale,
                 }
             if columns.magnitude is not None:
-                magnitude = number(values, columns.magnitude[slot])
+                magnitude = clock.number(values, columns.magnitude[slot])
                 if not math.isnan(magnitude):
                     star["magnitude"] = magnitude
             if columns.time_offset_s is not None:
-                star["time_offset_s"] = finite(values, columns.time_offset_s[slot])
+                star["time_offset_s"] = clock.finite(values, columns.time_offset_s[slot])
             if columns.sigma_arcsec is not None:
-                sigma = number(values, columns.sigma_arcsec[slot])
+                sigma = clock.number(values, columns.sigma_arcsec[slot])
                 if not math.isnan(sigma):
                     star["sigma_arcsec"] = sigma
             slots.append(slot)
@@ -306,11 +292,10 @@ class BatchMaker:
         mapped = self._mapped
         whole_fields = {
             "batch": (mapped.table.batch or "",),
-            "time": names_of(mapped.table.time),
+            "time": clock.names_of(mapped.table.time),
             "a_priori": mapped.quaternion,
+            **{field: getattr(mapped, name) for name, field in STATE_FIELDS.items()},
             "body_rates_deg_per_s": mapped.rates or mapped.gyro,
-            "velocity_km_per_s": mapped.velocity,
-            "position_km": mapped.position,
         }
         if head != "observations":
             return ", ".join(whole_fields.get(head, ()))
@@ -377,29 +362,29 @@ class MeasurementMaker:
         if fault.field.startswith(("measurement.sigma", "measurement.covariance")):
             names = columns.sigma or columns.covariance or names
         elif fault.field == "time":
-            names = names_of(columns.table.time or self._mapped.table.time)
+            names = clock.names_of(columns.table.time or self._mapped.table.time)
         return ", ".join(names)
 
     def _body(
         self, columns: MeasurementColumns, packet: SpacePacket, values: Mapping[str, Any]
     ) -> dict[str, Any] | None:
         table = columns.table
-        if table.valid is not None and not number(values, table.valid):
+        if table.valid is not None and not clock.number(values, table.valid):
             return None
         quaternion = quaternion_in(values, columns.quaternion, table)
         if quaternion is None:
             return None
-        moment = moment_of(table.time or self._mapped.table.time, values)
+        moment = clock.moment_of(table.time or self._mapped.table.time, values)
         measured: dict[str, Any] = {"quaternion": quaternion, "frame": table.frame}
         if table.tracker is not None:
             measured["tracker"] = table.tracker
         if columns.covariance:
             scale = columns.arcsec**2
-            p11, p12, p13, p22, p23, p33 = finite_all(values, columns.covariance, scale)
+            p11, p12, p13, p22, p23, p33 = clock.finite_all(values, columns.covariance, scale)
             rows = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
             measured["covariance_arcsec2"] = rows
         else:
-            measured["sigma_arcsec"] = table.sigma_arcsec or finite_all(
+            measured["sigma_arcsec"] = table.sigma_arcsec or clock.finite_all(
                 values, columns.sigma, columns.arcsec
             )
         axes = table.tracker or "body"

@@ -9,18 +9,13 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import chain
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from service.products.attitudes import (
-    AttitudeBlock,
-    AttitudeSeries,
-    Integers,
-    SeriesInfo,
-    stretches,
-)
+from service.products import attitudes
 from service.products.spool import pieces, spool
 from service.products.tables import rows_of_texts
 from service.vectors import Vector
@@ -96,7 +91,7 @@ RATE_WORDS = {
 """How a rate is described, by the origins that occur."""
 
 
-def header(about: SeriesInfo) -> Pairs:
+def header(about: attitudes.SeriesInfo) -> Pairs:
     """Comments that say where the message comes from, its date and its originator."""
     comments = [f"Written by attitude-acquisition {about.version}", f"Run {about.run}"]
     comments.append(
@@ -119,7 +114,7 @@ def header(about: SeriesInfo) -> Pairs:
     ]
 
 
-def identity(about: SeriesInfo) -> Pairs:
+def identity(about: attitudes.SeriesInfo) -> Pairs:
     """The object that a message is about."""
     return [
         ("OBJECT_NAME", one_line(about.spacecraft)),
@@ -141,7 +136,7 @@ _ARCSEC2_IN_DEG2 = 3600.0**2
 _DESIGNATOR = re.compile(r"\d{4}-\d{3}[A-Z]{1,3}")
 
 
-def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
+def write_acm(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
     """Write a series, which has an attitude at least.
 
     The covariances of all stretches are kept in a temporary file: they follow the last state.
@@ -151,7 +146,7 @@ def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
     stars = np.zeros(len(COUNTS), dtype=np.int64)
     zero_ns: int | None = None
     with spool() as covariances:
-        for stretch in stretches(series):
+        for stretch in attitudes.stretches(series):
             first = next(stretch)
             if zero_ns is None:
                 zero_ns = int(first.time_ns[0])
@@ -177,7 +172,7 @@ def write_acm(series: AttitudeSeries) -> Iterator[bytes]:
     yield f"\nUSER_START\n{kvn(user_defined)}USER_STOP\n".encode()
 
 
-def _opening(about: SeriesInfo, first: str) -> str:
+def _opening(about: attitudes.SeriesInfo, first: str) -> str:
     id = one_line(about.object_id or about.spacecraft)
     key = "INTERNATIONAL_DESIGNATOR" if _DESIGNATOR.fullmatch(id) else "OBJECT_DESIGNATOR"
     metadata = [
@@ -190,7 +185,7 @@ def _opening(about: SeriesInfo, first: str) -> str:
     return f"{opening}\nMETA_START\n{kvn(metadata)}META_STOP\n"
 
 
-def _state_metadata(about: SeriesInfo, has_rates: bool) -> Pairs:
+def _state_metadata(about: attitudes.SeriesInfo, has_rates: bool) -> Pairs:
     pairs: Pairs = [
         ("REF_FRAME_A", REF_FRAME_A),
         ("REF_FRAME_B", REF_FRAME_B),
@@ -205,13 +200,13 @@ def _state_metadata(about: SeriesInfo, has_rates: bool) -> Pairs:
     return [("COMMENT", comment), *pairs, ("RATE_TYPE", "ANGVEL")]
 
 
-def _states(part: AttitudeBlock, has_rates: bool) -> Vector:
+def _states(part: attitudes.AttitudeBlock, has_rates: bool) -> Vector:
     if not has_rates:
         return part.quaternion
     return np.concatenate([part.quaternion, part.rate_deg_per_s], axis=1)
 
 
-def _covariance_metadata(about: SeriesInfo) -> Pairs:
+def _covariance_metadata(about: attitudes.SeriesInfo) -> Pairs:
     words, frame = "in body axes; the rest of the matrix is left out", REF_FRAME_B
     if len(about.trackers) == 1:
         name = one_line(about.trackers[0].name)
@@ -224,15 +219,15 @@ def _covariance_metadata(about: SeriesInfo) -> Pairs:
     ]
 
 
-def _variances_deg2(about: SeriesInfo, part: AttitudeBlock) -> Vector:
-    p = part.covariance_arcsec2[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3)
+def _variances_deg2(about: attitudes.SeriesInfo, part: attitudes.AttitudeBlock) -> Vector:
+    p = attitudes.full_matrices(part.covariance_arcsec2)
     if len(about.trackers) == 1:
         axes = np.array(about.trackers[0].body_from_tracker)
         p = axes.T @ p @ axes
     return np.asarray(np.diagonal(p, axis1=1, axis2=2) / _ARCSEC2_IN_DEG2)
 
 
-def _determination(about: SeriesInfo, methods: Counter[str]) -> str:
+def _determination(about: attitudes.SeriesInfo, methods: Counter[str]) -> str:
     ((method, _),) = methods.most_common(1)
     pairs: list[tuple[str, str]] = []
     if len(methods) > 1:
@@ -260,7 +255,7 @@ def _determination(about: SeriesInfo, methods: Counter[str]) -> str:
     return f"\nAD_START\n{kvn(pairs)}{''.join(sensors)}AD_STOP\n"
 
 
-def _seconds(elapsed_ns: Integers) -> list[str]:
+def _seconds(elapsed_ns: attitudes.Integers) -> list[str]:
     """Seconds with all their digits."""
     whole, rest = np.divmod(elapsed_ns, 10**9)
     return [f"{s}.{ns:09d}" for s, ns in zip(whole.tolist(), rest.tolist(), strict=True)]
@@ -286,19 +281,19 @@ class Form:
 
     opening: Callable[[Pairs], str]
     metadata: Callable[[Pairs], str]
-    states: Callable[[AttitudeBlock], str]
+    states: Callable[[attitudes.AttitudeBlock], str]
     end_of_segment: str
     closing: str
 
 
-def write_aem(series: AttitudeSeries, form: Form) -> Iterator[bytes]:
+def write_aem(series: attitudes.AttitudeSeries, form: Form) -> Iterator[bytes]:
     """Write a series.
 
     The states of a stretch are kept in a temporary file, because its metadata begins with
     the time of its last one.
     """
     yield form.opening(header(series.about)).encode()
-    for stretch in stretches(series):
+    for stretch in attitudes.stretches(series):
         with spool() as file:
             metadata = _metadata(series.about, _spooled(stretch, form, file.write))
             yield form.metadata(metadata).encode()
@@ -308,14 +303,14 @@ def write_aem(series: AttitudeSeries, form: Form) -> Iterator[bytes]:
 
 
 def _spooled(
-    stretch: Iterable[AttitudeBlock], form: Form, write: Callable[[bytes], object]
-) -> Iterator[AttitudeBlock]:
+    stretch: Iterable[attitudes.AttitudeBlock], form: Form, write: Callable[[bytes], object]
+) -> Iterator[attitudes.AttitudeBlock]:
     for part in stretch:
         write(form.states(part).encode())
         yield part
 
 
-def _metadata(about: SeriesInfo, parts: Iterable[AttitudeBlock]) -> Pairs:
+def _metadata(about: attitudes.SeriesInfo, parts: Iterable[attitudes.AttitudeBlock]) -> Pairs:
     """The metadata of a stretch; reads all of it."""
     start = stop = ""
     origins: set[str] = set()
@@ -338,7 +333,7 @@ def _metadata(about: SeriesInfo, parts: Iterable[AttitudeBlock]) -> Pairs:
     ]
 
 
-def _values(part: AttitudeBlock) -> list[tuple[str, ...]]:
+def _values(part: attitudes.AttitudeBlock) -> list[tuple[str, ...]]:
     """The numbers of each state as texts: the quaternion and, where known, the rate in deg/s."""
     values = part.quaternion
     if not np.isnan(part.rate_deg_per_s).any():
@@ -346,27 +341,11 @@ def _values(part: AttitudeBlock) -> list[tuple[str, ...]]:
     return rows_of_texts(values)
 
 
-def _kvn_opening(pairs: Pairs) -> str:
-    return kvn([("CCSDS_AEM_VERS", "2.0")]) + kvn(pairs)
-
-
-def _kvn_metadata(pairs: Pairs) -> str:
-    return f"\nMETA_START\n{kvn(pairs)}META_STOP\n\nDATA_START\n"
-
-
-def _kvn_states(part: AttitudeBlock) -> str:
+def _kvn_states(part: attitudes.AttitudeBlock) -> str:
     return "".join(
         f"{time[:-1]} {' '.join(values)}\n"
         for time, values in zip(part.time.tolist(), _values(part), strict=True)
     )
-
-
-def _xml_opening(pairs: Pairs) -> str:
-    return xml_opening("aem", pairs)
-
-
-def _xml_metadata(pairs: Pairs) -> str:
-    return f"    <segment>\n      <metadata>\n{xml(pairs, 8)}      </metadata>\n      <data>\n"
 
 
 _QUATERNION = "<quaternion><Q1>%s</Q1><Q2>%s</Q2><Q3>%s</Q3><QC>%s</QC></quaternion>"
@@ -382,27 +361,37 @@ _STATES = {
 """By the number of values of a state."""
 
 
-def _xml_states(part: AttitudeBlock) -> str:
+def _xml_states(part: attitudes.AttitudeBlock) -> str:
     return "".join(
         _STATES[len(values)] % (time[:-1], *values)
         for time, values in zip(part.time.tolist(), _values(part), strict=True)
     )
 
 
-KVN = Form(_kvn_opening, _kvn_metadata, _kvn_states, "DATA_STOP\n", "")
-XML = Form(
-    _xml_opening,
-    _xml_metadata,
-    _xml_states,
-    "      </data>\n    </segment>\n",
-    xml_closing("aem"),
+KVN = Form(
+    opening=lambda pairs: kvn([("CCSDS_AEM_VERS", "2.0")]) + kvn(pairs),
+    metadata=lambda pairs: f"\nMETA_START\n{kvn(pairs)}META_STOP\n\nDATA_START\n",
+    states=_kvn_states,
+    end_of_segment="DATA_STOP\n",
+    closing="",
 )
+XML = Form(
+    opening=lambda pairs: xml_opening("aem", pairs),
+    metadata=lambda pairs: (
+        f"    <segment>\n      <metadata>\n{xml(pairs, 8)}      </metadata>\n      <data>\n"
+    ),
+    states=_xml_states,
+    end_of_segment="      </data>\n    </segment>\n",
+    closing=xml_closing("aem"),
+)
+write_aem_kvn = partial(write_aem, form=KVN)
+write_aem_xml = partial(write_aem, form=XML)
 
 
 _FRAMES = [("REF_FRAME_A", REF_FRAME_A), ("REF_FRAME_B", REF_FRAME_B)]
 
 
-def write_apm(series: AttitudeSeries) -> Iterator[bytes]:
+def write_apm(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
     """Write the last attitude of a series, which has one at least; reads all of it."""
     for block in series.blocks:
         last = block.taken(slice(-1, None))

@@ -17,13 +17,7 @@ import numpy.typing as npt
 
 from service.attitude.rotations import rotation_vectors
 from service.errors import BadBatch, Fault, shown_value
-from service.missions.product_settings import (
-    DEFAULT_LARGEST_GAP_S,
-    DEFAULT_NAIF_ID,
-    MAX_LARGEST_GAP_S,
-    MIN_NAIF_ID,
-    OBJECT_ID,
-)
+from service.missions import product_settings
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.int64]
@@ -63,9 +57,9 @@ class SeriesInfo:
     status: StatusWanted = "good"
     grade: ProductGrade = "raw"
     newest_first: bool = False
-    largest_gap_s: float = DEFAULT_LARGEST_GAP_S
+    largest_gap_s: float = product_settings.DEFAULT_LARGEST_GAP_S
     object_id: str | None = None
-    naif_id: int = DEFAULT_NAIF_ID
+    naif_id: int = product_settings.DEFAULT_NAIF_ID
     sclk_kernel: Path | None = None
     trackers: tuple[SeriesTracker, ...] = ()
 
@@ -76,18 +70,19 @@ class SeriesInfo:
             for name, is_good, expected in (
                 (
                     "largest_gap_s",
-                    0 < self.largest_gap_s <= MAX_LARGEST_GAP_S,
-                    f"must be above 0 and at most {MAX_LARGEST_GAP_S:g}",
+                    0 < self.largest_gap_s <= product_settings.MAX_LARGEST_GAP_S,
+                    f"must be above 0 and at most {product_settings.MAX_LARGEST_GAP_S:g}",
                 ),
                 (
                     "naif_id",
-                    MIN_NAIF_ID <= self.naif_id < 0,
-                    f"must be from {MIN_NAIF_ID} to -1",
+                    product_settings.MIN_NAIF_ID <= self.naif_id < 0,
+                    f"must be from {product_settings.MIN_NAIF_ID} to -1",
                 ),
                 (
                     "object_id",
-                    self.object_id is None or re.fullmatch(OBJECT_ID, self.object_id),
-                    f"must match {OBJECT_ID}",
+                    self.object_id is None
+                    or re.fullmatch(product_settings.OBJECT_ID, self.object_id),
+                    f"must match {product_settings.OBJECT_ID}",
                 ),
             )
             if not is_good
@@ -330,3 +325,9 @@ def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
     result = np.where(missing[:, None], derived, rows.rate_deg_per_s)
     origin = np.where(missing, DERIVED, rows.rate_origin)
     return replace(rows, rate_deg_per_s=result, rate_origin=origin)
+
+
+def full_matrices(upper: Vector) -> Vector:
+    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6): 11, 12, 13, 22, 23, 33."""
+    full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))

@@ -8,7 +8,8 @@ and `acquire export`.
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import chain, islice
-from typing import TYPE_CHECKING, TypeVar
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from service.errors import BadBatch, Fault, NotFound
 from service.extras import require_extra
@@ -104,120 +105,61 @@ def _read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
     return not first, chain(first, rest)
 
 
-# Each writer imports its own libraries when it is called: a command that prints help loads none.
-
-
-def _json(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.attitude_table import write_json
-
-    return write_json(series)
-
-
-def _aem(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm import KVN, write_aem
-
-    return write_aem(series, KVN)
-
-
-def _aem_xml(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm import XML, write_aem
-
-    return write_aem(series, XML)
-
-
-def _apm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm import write_apm
-
-    return write_apm(series)
-
-
-def _acm(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.adm import write_acm
-
-    return write_acm(series)
-
-
-def _ck(series: "AttitudeSeries") -> Iterator[bytes]:
-    from service.products.spice.ck import write_ck
-
-    return write_ck(series)
-
-
-def _parquet(table: Table) -> Iterator[bytes]:
-    from service.products.table_files import write_parquet
-
-    return write_parquet(table)
-
-
-def _fits(table: Table) -> Iterator[bytes]:
-    from service.products.table_files import write_fits
-
-    return write_fits(table)
+def _later(name: str) -> Callable[[Any], Iterator[bytes]]:
+    """The writer of a name, imported when it is called: a command that prints help loads none."""
+    return lambda content: resolve_name(f"service.products.{name}")(content)
 
 
 JSON_FORMAT = "json"
-JSON = OutputFormat("JSON", "application/json", write_attitudes=_json)
+JSON = OutputFormat("JSON", "application/json", write_attitudes=_later("attitude_table:write_json"))
 """The API's own form; a history as JSON is no table."""
+
+
+def _message(title: str, media_type: str, writer: str, **more: Any) -> OutputFormat:
+    """A format of attitudes alone, oldest first, at least one."""
+    arguments = {"most_batches": MOST_BATCHES, **more}
+    return OutputFormat(
+        title,
+        media_type,
+        write_attitudes=_later(writer),
+        any_order=False,
+        may_be_empty=False,
+        **arguments,
+    )
+
 
 OUTPUT_FORMATS: dict[str, OutputFormat] = {
     "csv": OutputFormat("CSV", "text/csv", write_table=write_csv),
     "parquet": OutputFormat(
         "Parquet",
         "application/vnd.apache.parquet",
-        write_table=_parquet,
+        write_table=_later("table_files:write_parquet"),
         extra="tables",
         package="pyarrow",
     ),
     "fits": OutputFormat(
         "FITS",
         "application/fits",
-        write_table=_fits,
+        write_table=_later("table_files:write_fits"),
         extra="tables",
         package="astropy",
         most_batches=MOST_BATCHES,
     ),
-    "aem": OutputFormat(
-        "CCSDS AEM",
-        "text/plain",
-        write_attitudes=_aem,
-        any_order=False,
-        may_be_empty=False,
-        most_batches=MOST_BATCHES,
+    "aem": _message("CCSDS AEM", "text/plain", "adm:write_aem_kvn"),
+    "aem-xml": _message(
+        "CCSDS AEM (XML)", "application/xml", "adm:write_aem_xml", suffix="aem.xml"
     ),
-    "aem-xml": OutputFormat(
-        "CCSDS AEM (XML)",
-        "application/xml",
-        write_attitudes=_aem_xml,
-        suffix="aem.xml",
-        any_order=False,
-        may_be_empty=False,
-        most_batches=MOST_BATCHES,
+    "apm": _message(
+        "CCSDS APM (the last attitude)", "text/plain", "adm:write_apm", most_batches=None
     ),
-    "apm": OutputFormat(
-        "CCSDS APM (the last attitude)",
-        "text/plain",
-        write_attitudes=_apm,
-        any_order=False,
-        may_be_empty=False,
-    ),
-    "acm": OutputFormat(
-        "CCSDS ACM",
-        "text/plain",
-        write_attitudes=_acm,
-        any_order=False,
-        may_be_empty=False,
-        most_batches=MOST_BATCHES,
-    ),
-    "ck": OutputFormat(
+    "acm": _message("CCSDS ACM", "text/plain", "adm:write_acm"),
+    "ck": _message(
         "SPICE CK",
         "application/zip",
-        write_attitudes=_ck,
+        "ck:write_ck",
         suffix="ck.zip",
         extra="spice",
         package="spiceypy",
-        any_order=False,
-        may_be_empty=False,
-        most_batches=MOST_BATCHES,
     ),
 }
 """The output formats by name."""

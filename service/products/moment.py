@@ -2,15 +2,20 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from service.errors import NotFound
-from service.products.attitudes import AttitudeBlock, AttitudeRows, SeriesInfo, series_of
+from service.products.attitudes import (
+    AttitudeBlock,
+    AttitudeRows,
+    SeriesInfo,
+    full_matrices,
+    series_of,
+)
 from service.products.reading.known import between
 from service.times import Utc
-from service.vectors import Vector
 
 AtMethod = Literal["nearest", "interpolated"]
 
@@ -73,7 +78,7 @@ def _nearest(rows: AttitudeBlock, place: int, moment: Utc, method: AtMethod) -> 
         moment.text,
         method,
         rows.quaternion[place].tolist(),
-        _matrix(rows.covariance_arcsec2[place]),
+        full_matrices(rows.covariance_arcsec2[place]).tolist(),
         0.0 if offset_s == 0.0 else motion,
         offset_s,
         [str(rows.id[place])],
@@ -96,12 +101,8 @@ def _interpolated(rows: AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
         moment.text,
         "interpolated",
         q.tolist(),
-        _matrix(weights[0] * one + weights[1] * other),
+        full_matrices(weights[0] * one + weights[1] * other).tolist(),
         None if np.isnan(change) else change * step_s / 8.0,
         offset_s * 1e-9,
         list(dict.fromkeys(str(each) for each in rows.id[pair])),
     )
-
-
-def _matrix(upper: Vector) -> Any:
-    return upper[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3).tolist()

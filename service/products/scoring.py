@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from service.attitude.rotations import rotation_vectors
-from service.products.attitudes import AttitudeBlock, Integers
+from service.products.attitudes import AttitudeBlock, Integers, full_matrices
 from service.products.reading.known import KnownAttitudes
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
@@ -49,8 +49,7 @@ def errors_of(blocks: Iterable[AttitudeBlock], truth: KnownAttitudes) -> Errors:
         known = ~np.isnan(true[:, 0])
         outside += int(np.count_nonzero(~known))
         error = rotation_vectors(true[known], block.quaternion[known]) * ARCSEC_PER_RADIAN
-        places = [0, 1, 2, 1, 3, 4, 2, 4, 5]
-        covariance = block.covariance_arcsec2[known][:, places].reshape(-1, 3, 3)
+        covariance = full_matrices(block.covariance_arcsec2[known])
         # Not every covariance has an inverse: TRIAD's of two stars that nearly coincide.
         weights = np.linalg.pinv(covariance, hermitian=True)
         weighted = np.einsum("nij,nj->ni", weights, error)

@@ -117,13 +117,8 @@ def together(scores: Iterable[Score]) -> Score:
         whole.batches += each.batches
         whole.refused += each.refused
         whole.stars += each.stars
-        for name in (
-            "worst_axis_arcsec",
-            "predicted_arcsec",
-            "chi_square",
-            "solving_us",
-            "whole_us",
-        ):
+        lists = ("worst_axis_arcsec", "predicted_arcsec", "chi_square", "solving_us", "whole_us")
+        for name in lists:
             getattr(whole, name).extend(getattr(each, name))
     return whole
 

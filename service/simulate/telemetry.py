@@ -16,36 +16,19 @@ from typing import Any, TextIO, cast
 
 import numpy as np
 
+from service import vectors
 from service.errors import BadFile, Fault
 from service.missions.mission import Band, Mission
 from service.observations.batch import Aberration
 from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.telemetry import telemetry_format
 from service.observations.schema import BatchIn
-from service.simulate.motion import (
-    body_rates_deg_per_s,
-    orbit_of,
-    pointed,
-    random_axis,
-    slewing_attitudes,
-    tilted,
-)
+from service.simulate import motion
 from service.simulate.sightings import BatchScene, Seen, real_sky
 from service.simulate.stretches import Pass
 from service.sky.ephemeris import observer_velocity, sun_direction
 from service.sky.model import SkyModel
 from service.times import Utc, parse_utc, shifted
-from service.vectors import (
-    Matrix,
-    Vector,
-    angle_between_deg,
-    attitude_error_arcsec,
-    coordinate_rotation,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    to_ra_dec,
-    unit,
-)
 
 CAP_A_PRIORI_DEG = 3.0
 BAND_A_PRIORI_DEG = 0.1
@@ -73,12 +56,12 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
     start, cadence_s = parse_utc(wanted.start_of(mission), "start"), wanted.cadence_of(mission)
     root = (wanted.seed, *mission.name.encode())
     rng = np.random.default_rng([*root, 0])
-    rates = body_rates_deg_per_s(mission, wanted.batches, rng)
+    rates = motion.body_rates_deg_per_s(mission, wanted.batches, rng)
     drift = rng.uniform(-1.0, 1.0, 3)
     drift /= np.abs(drift).max()
     states = _motion(mission, rates, cadence_s, rng)
     words, shares = zip(*wanted.aberration.items(), strict=True)
-    orbit = orbit_of(mission)
+    orbit = motion.orbit_of(mission)
     digits = max(4, len(str(wanted.batches)))
     for k, (stretch, state) in enumerate(zip(wanted.stretches(mission), states, strict=True)):
         time = _rounded(shifted(start, k * cadence_s))
@@ -122,8 +105,8 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
 
 
 def _motion(
-    mission: Mission, rates: Vector, cadence_s: float, rng: np.random.Generator
-) -> Iterable[Matrix | float]:
+    mission: Mission, rates: vectors.Vector, cadence_s: float, rng: np.random.Generator
+) -> Iterable[vectors.Matrix | float]:
     """The motion of each batch by its rates: the attitude, or the roll about a pole on the Sun."""
     if isinstance(mission.zone, Band):
         steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
@@ -131,26 +114,26 @@ def _motion(
             rng.uniform(0.0, math.tau) + np.cumsum(steps_rad) - steps_rad
         ).tolist()
         return rolls_rad
-    first = pointed(mission.axis_body, random_axis(rng), rng.uniform(0.0, math.tau))
-    return slewing_attitudes(rates, cadence_s, first)
+    first = motion.pointed(mission.axis_body, motion.random_axis(rng), rng.uniform(0.0, math.tau))
+    return motion.slewing_attitudes(rates, cadence_s, first)
 
 
 def _on_the_sun(
-    scene: BatchScene, sun: Vector, roll_rad: float, most: int
-) -> tuple[Matrix, Matrix, list[Seen]]:
+    scene: BatchScene, sun: vectors.Vector, roll_rad: float, most: int
+) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
     """A pole close to the Sun; the a priori attitude has it on the Sun, with any roll."""
     rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
     tilt_deg = rng.uniform(0.0, BAND_A_PRIORI_DEG)
     if stretch.kind == "attitude_error":
         tilt_deg = BAND_A_PRIORI_DEG + (stretch.size - BAND_A_PRIORI_DEG) * stretch.progress
-    pole = tilted(sun, math.radians(tilt_deg), rng)
-    attitude, seen = scene.look(pointed(axis, pole, roll_rad), most)
-    return attitude, _as_sent(pointed(axis, sun, rng.uniform(0.0, math.tau))), seen
+    pole = motion.tilted(sun, math.radians(tilt_deg), rng)
+    attitude, seen = scene.look(motion.pointed(axis, pole, roll_rad), most)
+    return attitude, _as_sent(motion.pointed(axis, sun, rng.uniform(0.0, math.tau))), seen
 
 
 def _on_the_sky(
-    scene: BatchScene, attitude: Matrix, drift: Vector, most: int
-) -> tuple[Matrix, Matrix, list[Seen]]:
+    scene: BatchScene, attitude: vectors.Matrix, drift: vectors.Vector, most: int
+) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
     """Anywhere; the a priori attitude is off: attitude = R1(psi) R2(theta) R3(phi) a priori."""
     rng, stretch, limit = scene.rng, scene.stretch, CAP_A_PRIORI_DEG
     attitude, seen = scene.look(attitude, most)
@@ -158,14 +141,16 @@ def _on_the_sky(
     if stretch.kind == "attitude_error":
         angles = drift * (limit + (stretch.size - limit) * stretch.progress)
     psi, theta, phi = angles
-    error = coordinate_rotation(0, psi) @ coordinate_rotation(1, theta)
-    error = error @ coordinate_rotation(2, phi)
+    error = vectors.coordinate_rotation(0, psi) @ vectors.coordinate_rotation(1, theta)
+    error = error @ vectors.coordinate_rotation(2, phi)
     return attitude, _as_sent(error.T @ attitude), seen
 
 
-def _as_sent(attitude: Matrix) -> Matrix:
+def _as_sent(attitude: vectors.Matrix) -> vectors.Matrix:
     """The attitude of the quaternion as it is written."""
-    return matrix_from_quaternion(unit(np.round(quaternion_from_matrix(attitude), 10)))
+    return vectors.matrix_from_quaternion(
+        vectors.unit(np.round(vectors.quaternion_from_matrix(attitude), 10))
+    )
 
 
 def _rounded(time: Utc) -> Utc:
@@ -175,29 +160,35 @@ def _rounded(time: Utc) -> Utc:
     return shifted(whole, nanoseconds * 1e-9) if nanoseconds else whole
 
 
-def _prior(mission: Mission, presumed: Matrix, by_direction: bool) -> dict[str, Any]:
+def _prior(mission: Mission, presumed: vectors.Matrix, by_direction: bool) -> dict[str, Any]:
     if not by_direction:
-        quaternion = np.round(quaternion_from_matrix(presumed), 10)
+        quaternion = np.round(vectors.quaternion_from_matrix(presumed), 10)
         return {"quaternion": quaternion.tolist(), "frame": "EME2000"}
     if isinstance(mission.zone, Band):
         return {"sun_pointed": True}
-    ra_deg, dec_deg = to_ra_dec(presumed.T @ mission.axis_body)
+    ra_deg, dec_deg = vectors.to_ra_dec(presumed.T @ mission.axis_body)
     return {"boresight": {"ra_deg": round(float(ra_deg), 8), "dec_deg": round(float(dec_deg), 8)}}
 
 
 def _truth(
-    batch: dict[str, Any], scene: BatchScene, attitude: Matrix, presumed: Matrix, seen: list[Seen]
+    batch: dict[str, Any],
+    scene: BatchScene,
+    attitude: vectors.Matrix,
+    presumed: vectors.Matrix,
+    seen: list[Seen],
 ) -> dict[str, Any]:
     axis = scene.mission.axis_body
-    error_deg = attitude_error_arcsec(presumed, attitude) / 3600.0
+    error_deg = vectors.attitude_error_arcsec(presumed, attitude) / 3600.0
     return {
         "spacecraft": batch["spacecraft"],
         "batch": batch["batch"],
         "time": batch["time"],
         "stretch": scene.stretch.kind,
-        "quaternion": quaternion_from_matrix(attitude).tolist(),
+        "quaternion": vectors.quaternion_from_matrix(attitude).tolist(),
         "a_priori_error_deg": error_deg.tolist() if "quaternion" in batch["a_priori"] else None,
-        "a_priori_axis_error_deg": float(angle_between_deg(presumed.T @ axis, attitude.T @ axis)),
+        "a_priori_axis_error_deg": float(
+            vectors.angle_between_deg(presumed.T @ axis, attitude.T @ axis)
+        ),
         "observations": [
             {
                 "tracker": each.tracker.name,

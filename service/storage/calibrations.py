@@ -22,9 +22,9 @@ from service.storage.models.base import (
     doc,
 )
 from service.storage.recording.ids import following_ulid
-from service.storage.sql.calibration_tables import calibration_adoptions, calibrations
 from service.storage.sql.columns import Row
-from service.storage.sql.statements import execute
+from service.storage.sql.statements import execute, rows_of
+from service.storage.sql.tables import calibration_adoptions, calibrations
 
 CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
 UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag", "magnitude"]
@@ -162,6 +162,7 @@ class CalibrationResult(Record, frozen=True, kw_only=True):
 class CalibrationProgress(Record, frozen=True, kw_only=True):
     """What every calibration has from its start on."""
 
+    component: ClassVar[str] = ""
     id: Id
     spacecraft: str
     version: Annotated[Count, doc("From 1 for each spacecraft.")]
@@ -241,19 +242,7 @@ _GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])
 _RESULT = msgspec.json.Decoder(CalibrationResult)
 UNFINISHED = ("queued", "running")
 _NEWEST_ADOPTION = "SELECT max(id) FROM calibration_adoptions"
-_PLAIN = (
-    "id",
-    "spacecraft",
-    "version",
-    "run",
-    "state",
-    "who",
-    "created",
-    "ended",
-    "done",
-    "total",
-    "fault",
-)
+_PLAIN = (*(n for n in CalibrationProgress.__struct_fields__ if n != "mission"), "fault")
 _SUMMARY = tuple(calibrations.c[name] for name in (*_PLAIN, "mission_digest", "result"))
 
 
@@ -313,7 +302,7 @@ def list_calibrations(
         query = query.where(calibrations.c.spacecraft == spacecraft)
     if cursor is not None:
         query = query.where(calibrations.c.id < cursor)
-    rows = [_summary(dict(row)) for row in connection.execute(query).mappings()]
+    rows = [_summary(row) for row in rows_of(connection, query)]
     return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
 
 
@@ -339,7 +328,7 @@ def add_adoption(connection: Connection, row: Row) -> None:
 def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationAdoption]:
     """What a spacecraft's calibration was from when on, newest first."""
     query = _adoptions().where(calibration_adoptions.c.spacecraft == spacecraft)
-    return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
+    return [_adoption(row) for row in rows_of(connection, query)]
 
 
 def newest_adoption(connection: Connection) -> str:
@@ -365,7 +354,7 @@ def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:
         calibration_adoptions.c.spacecraft
     )
     query = _adoptions().where(calibration_adoptions.c.id.in_(latest))
-    return [_adoption(dict(row)) for row in connection.execute(query).mappings()]
+    return [_adoption(row) for row in rows_of(connection, query)]
 
 
 def _adoptions() -> Select[tuple[object, ...]]:
@@ -384,13 +373,8 @@ def _adoptions() -> Select[tuple[object, ...]]:
 def _adoption(row: Row) -> CalibrationAdoption:
     trackers = row["trackers"]
     return CalibrationAdoption(
-        id=row["id"],
-        spacecraft=row["spacecraft"],
-        adopted=row["adopted"],
-        who=row["who"],
-        note=row["note"],
+        **{name: row[name] for name in ("id", "spacecraft", "adopted", "who", "note", "version")},
         calibration=row["calibration_id"],
-        version=row["version"],
         file=row["file_digest"],
         mission=row["mission_digest"],
         trackers=None if trackers is None else _GEOMETRIES.decode(trackers),

@@ -9,24 +9,12 @@ from typing import Any
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, insert, select
 
+from service import gyro
 from service.errors import BadBatch, Conflict, Fault, NotFound, shown_value
-from service.gyro import (
-    MAX_SPAN_S,
-    SAME_TIME_NS,
-    GyroBlock,
-    Nanoseconds,
-    SampleTaken,
-    first_shared_ns,
-    pack,
-    tai_ns_of,
-    texts_of,
-    times_of_steps,
-    unpack,
-)
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models.base import Page
-from service.storage.models.gyro import GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import gyro_blocks
@@ -36,7 +24,7 @@ from service.times import Utc, recorded_utc, shifted
 from service.vectors import Vector
 
 SHOWN = GyroBlockRow.__struct_fields__
-SPAN_NS = int(MAX_SPAN_S) * 10**9
+SPAN_NS = int(gyro.MAX_SPAN_S) * 10**9
 TIMES = [gyro_blocks.c[name] for name in ("start_ns", "samples", "step_s", "times_s")]
 """The columns that tell the times of a block's samples."""
 
@@ -73,7 +61,7 @@ class BlockFilter:
         return chosen
 
 
-def row_of(block: GyroBlock, id: str, received: Utc) -> Row:
+def row_of(block: gyro.GyroBlock, id: str, received: Utc) -> Row:
     """The row of a new block."""
     times_ns = block.tai_ns
     return {
@@ -89,12 +77,12 @@ def row_of(block: GyroBlock, id: str, received: Utc) -> Row:
         "fingerprint": block.fingerprint,
         "samples": times_ns.size,
         "step_s": block.step_s,
-        "times_s": pack(block.times_s) if block.step_s is None else None,
-        "rates_rad_per_s": pack(block.rates_rad_per_s),
+        "times_s": gyro.pack(block.times_s) if block.step_s is None else None,
+        "rates_rad_per_s": gyro.pack(block.rates_rad_per_s),
     }
 
 
-def find_block(connection: Connection, block: GyroBlock, row: Row) -> GyroBlockRow | None:
+def find_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> GyroBlockRow | None:
     """The block of the same body that is recorded already, or None.
 
     Raises `Conflict` where another body has its name, `SampleTaken` where another block holds one
@@ -113,23 +101,25 @@ def find_block(connection: Connection, block: GyroBlock, row: Row) -> GyroBlockR
     near = select(c.block, c.end_ns, *TIMES).where(
         c.spacecraft == block.spacecraft,
         c.run == block.run,
-        c.start_ns < row["end_ns"] + SAME_TIME_NS,
-        c.end_ns > row["start_ns"] - SAME_TIME_NS,
+        c.start_ns < row["end_ns"] + gyro.SAME_TIME_NS,
+        c.end_ns > row["start_ns"] - gyro.SAME_TIME_NS,
         # The index has the start first, and no block spans more than so much.
-        c.start_ns > row["start_ns"] - SAME_TIME_NS - SPAN_NS,
+        c.start_ns > row["start_ns"] - gyro.SAME_TIME_NS - SPAN_NS,
     )
     for other in connection.execute(near.order_by(c.start_ns)).mappings():
-        shared_ns = first_shared_ns(times_ns, tai_ns_of(other["start_ns"], times_of(other)))
+        shared_ns = gyro.first_shared_ns(
+            times_ns, gyro.tai_ns_of(other["start_ns"], times_of(other))
+        )
         if shared_ns is not None:
             at = shifted(block.start, (shared_ns - row["start_ns"]) * 1e-9).text
-            raise SampleTaken(
+            raise gyro.SampleTaken(
                 f"{where} has a sample at {at}, which block {shown_value(other['block'])} holds "
                 "already"
             )
     return None
 
 
-def record_block(connection: Connection, block: GyroBlock, row: Row) -> Recorded:
+def record_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> Recorded:
     """Record a block that is new, and add an event; see `find_block`."""
     insert_runs(connection, {block.run: row["received"]})
     # Of two processes that record blocks of a run, one waits: neither sees the other's samples.
@@ -173,9 +163,9 @@ def read_block(connection: Connection, spacecraft: str, id: str) -> GyroSamples:
     )
 
 
-def block_of(row: Any) -> GyroBlock:
+def block_of(row: Any) -> gyro.GyroBlock:
     """The block of a row; raises `ValueError` for samples that cannot be read."""
-    return GyroBlock(
+    return gyro.GyroBlock(
         row["spacecraft"],
         row["run"],
         row["block"],
@@ -189,13 +179,13 @@ def block_of(row: Any) -> GyroBlock:
 def times_of(row: Any) -> Vector:
     """The times of a block's samples, in seconds after its start."""
     if row["step_s"] is not None:
-        return times_of_steps(row["step_s"], row["samples"])
-    return unpack(row["times_s"], (row["samples"],))
+        return gyro.times_of_steps(row["step_s"], row["samples"])
+    return gyro.unpack(row["times_s"], (row["samples"],))
 
 
 def rates_of(row: Any) -> Vector:
     """The rates of a block's samples, shape (n, 3)."""
-    return unpack(row["rates_rad_per_s"], (row["samples"], 3))
+    return gyro.unpack(row["rates_rad_per_s"], (row["samples"], 3))
 
 
 def shown(row: Any) -> GyroBlockRow:
@@ -264,16 +254,12 @@ def _page(row: Any, selected: BlockFilter) -> TablePage:
     """The samples of a block that lie in the period."""
     block = block_of(row)
     times_ns = block.tai_ns
-    inside = _inside(times_ns, selected)
-    texts = texts_of(block.start, block.times_s[inside])
-    names = [block.block] * len(texts)
-    return [texts, times_ns[inside].tolist(), names, *block.rates_rad_per_s[inside].T.tolist()]
-
-
-def _inside(times_ns: Nanoseconds, selected: BlockFilter) -> slice:
     first, last = 0, times_ns.size
     if selected.start is not None:
         first = int(np.searchsorted(times_ns, selected.start.tai_ns))
     if selected.end is not None:
         last = int(np.searchsorted(times_ns, selected.end.tai_ns))
-    return slice(first, last)
+    inside = slice(first, last)
+    texts = gyro.texts_of(block.start, block.times_s[inside])
+    names = [block.block] * len(texts)
+    return [texts, times_ns[inside].tolist(), names, *block.rates_rad_per_s[inside].T.tolist()]

@@ -13,20 +13,10 @@ from service.errors import Busy
 from service.storage.archive.reading import Archive
 from service.storage.recording.events import HeardEvents
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, may_pass, remove_probe
+from service.storage.sql import engines
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile, FileLock
-from service.storage.sql.engines import (
-    LONGEST_WAIT_S,
-    TO_COMMIT,
-    TO_LOOK_UP,
-    TO_READ,
-    TO_SHOW,
-    database_file,
-    database_url,
-    reading_engine,
-    writing_engine,
-)
-from service.storage.sql.migrations import bring_up_to_date, require_revision, require_up_to_date
+from service.storage.sql.migrations import bring_up_to_date, disposed, require_up_to_date
 from service.storage.sql.projector_lock import ProjectorLock
 
 log = logging.getLogger(__name__)
@@ -47,16 +37,19 @@ class Readers:
         With `serving`, waiting for a database that does not answer is bounded.  The file of
         SQLite must stay the one that is there now.
         """
-        self.url = database_url(database)
-        self.file = file or database_file(self.url)
+        self.url = engines.database_url(database)
+        self.file = file or engines.database_file(self.url)
         if self.file is not None:
             self.file.remember()
-        self._readers = reading_engine(self.url, TO_SHOW if serving else None)
+        self._readers = engines.reading_engine(self.url, engines.TO_SHOW if serving else None)
         self._lookup_engine = self._readers
         if serving and self.file is None:
-            self._lookup_engine = reading_engine(self.url, TO_LOOK_UP, 1)
+            self._lookup_engine = engines.reading_engine(self.url, engines.TO_LOOK_UP, 1)
         self._lookup_connection = PersistentConnection(
-            self._lookup_engine, TO_READ, self.file, LONGEST_WAIT_S if serving else None
+            self._lookup_engine,
+            engines.TO_READ,
+            self.file,
+            engines.LONGEST_WAIT_S if serving else None,
         )
 
     def reading(self) -> AbstractContextManager[Connection]:
@@ -125,14 +118,14 @@ class Store(Readers):
         Raises `BadConfiguration` with what to do.
         """
         self.archive = Archive(archive_folder)
-        url = database_url(database)
-        file = database_file(url)
+        url = engines.database_url(database)
+        file = engines.database_file(url)
         if file is not None and not create:
             file.require_there()
-        timeouts = TO_COMMIT if serving else None
+        timeouts = engines.TO_COMMIT if serving else None
         self.file_lock = None if file is None else FileLock(file)
         """The lock of a SQLite file."""
-        self._writing = writing_engine(url, file=file, create=create, timeouts=timeouts)
+        self._writing = engines.writing_engine(url, file=file, create=create, timeouts=timeouts)
         try:
             if self.file_lock is None:
                 require_up_to_date(self._writing)
@@ -140,7 +133,8 @@ class Store(Readers):
                 if serving:
                     self.require_writing()
                 if file is not None and file.is_read_only:
-                    require_revision(database)
+                    with disposed(engines.reading_engine(url)) as engine:
+                        require_up_to_date(engine)
                 else:
                     bring_up_to_date(self._writing, self.file_lock.take)
         except BaseException:
@@ -151,7 +145,7 @@ class Store(Readers):
         super().__init__(database, serving=serving, file=file)
         self.lock = ProjectorLock() if serving and file is None else None
         """The lock of PostgreSQL: nothing is projected before it is taken."""
-        wait_s = LONGEST_WAIT_S if serving else None
+        wait_s = engines.LONGEST_WAIT_S if serving else None
         self.at_work = set[str]() if self.lock is None else self.lock.at_work
         """The ids of replays and calibrations that this process is at work on."""
         self.writer = Writer(

@@ -1,7 +1,7 @@
 """The unexplained points of batches whose attitude is known, carried to inertial directions."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -14,10 +14,10 @@ from service.sky.ephemeris import natural, observer_velocity
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 
-_COLUMNS = ("batch", "tracker", "number", "time_s", "direction", "covariance", "place")
-_NAMES = (*_COLUMNS, "sigma_rad", "magnitude_mag")
-
-
+_NAMES = (
+    *("batch", "tracker", "number", "time_s", "direction", "covariance"),
+    *("place", "sigma_rad", "magnitude_mag"),
+)
 Indices = npt.NDArray[np.int64]
 
 
@@ -63,17 +63,7 @@ class Points:
 
     def taken(self, chosen: Indices) -> "Points":
         """Some of the points, in ascending order of their places."""
-        return Points(
-            self.trackers,
-            self.field_sr,
-            *(
-                getattr(self, name)[chosen]
-                for name in (
-                    *("batch", "tracker", "number", "time_s", "direction", "covariance"),
-                    *("place", "sigma_rad", "magnitude_mag"),
-                )
-            ),
-        )
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _NAMES})
 
     def per_steradian(self) -> Vector:
         """The density (n,) of unexplained points about each: those of its batch and tracker."""

@@ -28,7 +28,6 @@ from service.web.api import (
     calibrations,
     events,
     frames,
-    gyro,
     probes,
     products,
     runs,
@@ -38,10 +37,10 @@ from service.web.api import (
 )
 from service.web.api import tokens as access
 from service.web.console import console_router
-from service.web.console.rendering import page_or_problem
+from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
-from service.web.openapi.document import add_reference
+from service.web.openapi import add_reference
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
@@ -59,7 +58,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     frames.router,
     spacecraft.router,
     products.router,
-    gyro.router,
+    batches.gyro_router,
     products.tracks_router,
     spacecraft.advice_router,
     batches.compare_router,

@@ -94,13 +94,14 @@ class Live:
             await asyncio.gather(*self._tasks, return_exceptions=True)
 
     async def stream(
-        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
+        self, listener: Listener, last: int | None, run: str | None, spacecraft: str | None
     ) -> AsyncIterator[bytes]:
         """Events after `last`, or from now on, as lines of an event stream.
 
-        It ends when the listener's token or session does; the caller says when the
-        listener has left.  Raises `RateLimited` where
-        the token has as many streams as it may, `Busy` where there are too many of all.
+        "Now" is this call, before the head of the answer is sent: a listener that has the head
+        misses nothing.  The stream ends when the listener's token or session does; the caller
+        says when the listener has left.  Raises `RateLimited` where the token has as many
+        streams as it may, `Busy` where there are too many of all.
         """
         if self._stopping:
             raise Busy("the service is stopping")
@@ -112,25 +113,29 @@ class Live:
         if len(self._listeners) >= MAX_LISTENERS:
             raise Busy(f"{len(self._listeners)} event streams are open already", 30)
         self._listeners.add(listener)
-        return self._lines(listener, last, run, spacecraft)
+        if last is not None:
+            newest = last
+        else:
+            try:
+                last = await self._read(self._app.events.last)
+                # How many events there are of others is no business of a bound token.
+                newest = await self._read(self._app.events.last, listener.caller.spacecraft)
+            except BaseException:
+                self.leave(listener)
+                raise
+        begin = f"retry: {RETRY_MS}\n\n".encode() + _line(newest, "hello", f'{{"last":{newest}}}')
+        return self._lines(listener, begin, last, run, spacecraft)
 
-    def leave(self, listener: "Listener") -> None:
+    def leave(self, listener: Listener) -> None:
         """Make room for another listener."""
         self._listeners.discard(listener)
 
     async def _lines(
-        self, listener: "Listener", last: int | None, run: str | None, spacecraft: str | None
+        self, listener: Listener, begin: bytes, last: int, run: str | None, spacecraft: str | None
     ) -> AsyncIterator[bytes]:
         clock = asyncio.get_running_loop().time
         end_s = clock() + LONGEST_S
-        yield f"retry: {RETRY_MS}\n\n".encode()
-        if last is None:
-            last = await self._read(self._app.events.last)
-            # How many events there are of others is no business of a bound token.
-            newest = await self._read(self._app.events.last, listener.caller.spacecraft)
-        else:
-            newest = last
-        yield _line(newest, "hello", f'{{"last":{newest}}}')
+        yield begin
         heard_s = clock()
         while not self._stopping and listener.is_admitted and clock() < end_s:
             news = self._news
@@ -142,7 +147,11 @@ class Live:
             if found:
                 last = found[-1].id
                 named = None if spacecraft is None else (spacecraft,)
-                lines = b"".join(_event_line(e) for e in found if e.concerns(run, named))
+                lines = b"".join(
+                    _line(each.id, each.kind, each.data)
+                    for each in found
+                    if each.concerns(run, named)
+                )
                 if lines:
                     heard_s = clock()
                     yield lines
@@ -224,10 +233,6 @@ class Live:
 
     async def _read(self, ask: Callable[..., T], *arguments: object) -> T:
         return await run_sync(ask, *arguments, limiter=self._threads)
-
-
-def _event_line(event: Event) -> bytes:
-    return _line(event.id, event.kind, event.data)
 
 
 def _line(id: int, kind: str, data: str) -> bytes:

@@ -73,7 +73,9 @@ class Connection(asyncio.BufferedProtocol):
     ) -> None:
         """`admission` counts the connection in place of the server's own."""
         self._buffer = server_state.buffer
-        self._http = _Http(config, server_state, app_state, _loop, admission)
+        self._http = _Http(config, server_state, app_state, _loop)
+        self._http.shared = server_state
+        self._http.admission = admission or server_state.admission
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """A client has connected."""
@@ -138,6 +140,8 @@ class _Flow(FlowControl):
 class _Http(HttpToolsProtocol):
     """uvicorn's protocol with bounds and deadlines."""
 
+    shared: SharedState
+    admission: Admission
     flow: _Flow
     _unread_timer: asyncio.TimerHandle | None = None
     _discard_timer: asyncio.TimerHandle | None = None
@@ -158,25 +162,13 @@ class _Http(HttpToolsProtocol):
     """Bytes read, with up to `READ_BYTES` before them: the parser reports whole fields."""
     _body_bytes = _framing_bytes = 0
 
-    def __init__(
-        self,
-        config: uvicorn.Config,
-        server_state: SharedState,
-        app_state: dict[str, Any],
-        _loop: asyncio.AbstractEventLoop | None,
-        admission: Admission | None,
-    ) -> None:
-        super().__init__(config, server_state, app_state, _loop)
-        self._state = server_state
-        self._admission = admission or server_state.admission
-
     # ---- the connection ------------------------------------------------------------------------
 
     # uvicorn narrows what asyncio's protocol takes, and ignores that as well.
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         super().connection_made(transport)
         self.flow = _Flow(transport)
-        if not self._admission.admit(self, self.client[0] if self.client else ""):
+        if not self.admission.admit(self, self.client[0] if self.client else ""):
             self._is_over = True
             transport.write(RAW_RESPONSES[HTTPStatus.SERVICE_UNAVAILABLE])
             transport.close()
@@ -186,7 +178,7 @@ class _Http(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._is_over = True
-        self._admission.remove(self)
+        self.admission.remove(self)
         self._stop_unread_timer()
         for each in (self._head_timer, self._discard_timer, self._close_timer):
             if each is not None:
@@ -268,7 +260,7 @@ class _Http(HttpToolsProtocol):
         self._no_head_since_s = None
         self._in_body = True
         self._section_bytes = self._fields = self._body_bytes = self._framing_bytes = 0
-        self._admission.set_busy(self)
+        self.admission.set_busy(self)
         if len(self.pipeline) > MAX_PIPELINED:
             self._refuse()
 
@@ -291,7 +283,7 @@ class _Http(HttpToolsProtocol):
         # Of a pipelined request the head is there already.
         if self.cycle.response_complete:
             self._no_head_since_s = self.loop.time()
-            self._admission.set_idle(self)
+            self.admission.set_idle(self)
 
     def _start_asgi_task(self, cycle: RequestResponseCycle, app: ASGI3Application) -> None:
         self._answering = cycle
@@ -334,8 +326,8 @@ class _Http(HttpToolsProtocol):
     def _hold(self, seconds: float) -> None:
         """Read nothing until it is this connection's turn; its client is not silent meanwhile."""
         now = self.loop.time()
-        turn_s = max(self._state.discarding_until_s, now) + seconds
-        self._state.discarding_until_s = turn_s
+        turn_s = max(self.shared.discarding_until_s, now) + seconds
+        self.shared.discarding_until_s = turn_s
         if self._discard_timer is None and turn_s - now > LEAST_PAUSE_S:
             self._held_since_s = now
             self.flow.hold(True)

@@ -15,7 +15,7 @@ import msgspec
 from service.alarms.limits import Severity
 from service.storage.recording.events import Event
 from service.storage.sql.columns import Row
-from service.storage.webhooks.registered import Registered
+from service.storage.webhooks import Registered
 
 log = logging.getLogger(__name__)
 

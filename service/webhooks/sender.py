@@ -22,12 +22,11 @@ from sqlalchemy import Connection
 
 from service.errors import Busy, Stopping
 from service.settings import Network
+from service.storage import webhooks
 from service.storage.recording.events import Event, events_after, first_event, last_event
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.store import Store
-from service.storage.webhooks import deliveries
-from service.storage.webhooks.deliveries import Attempt, Queue, Waiting, hold_sender, read_sender
-from service.storage.webhooks.registered import Registered, count_webhooks, registered_webhooks
+from service.storage.webhooks import Attempt, Queue, Registered, Waiting
 from service.times import DAY_S, recorded_utc, shifted, utc_now
 from service.webhooks import messages
 
@@ -221,7 +220,7 @@ class WebhookSender:
             if missed:
                 log.warning("webhook %s misses %d events that were deleted", webhook.id, missed)
             move = partial(
-                deliveries.queue_events,
+                webhooks.queue_events,
                 id=webhook.id,
                 before=position,
                 after=after,
@@ -300,7 +299,7 @@ class WebhookSender:
         """Note what came of attempts; the queue waits, so that nothing is sent again meanwhile."""
         while True:
             try:
-                return await self._change(partial(deliveries.settle, attempt=attempt))
+                return await self._change(partial(webhooks.settle, attempt=attempt))
             except Busy as error:
                 if self._is_stopping or isinstance(error, Stopping):
                     raise
@@ -357,15 +356,15 @@ class WebhookSender:
 
     def _list(self) -> Sequence[Registered]:
         with self._store.reading_record() as connection:
-            if not count_webhooks(connection):
+            if not webhooks.count_webhooks(connection):
                 return ()
         is_open = self._is_open()
         with self._store.reading_record() as connection:
-            return registered_webhooks(connection, utc_now().text, is_open)
+            return webhooks.registered_webhooks(connection, utc_now().text, is_open)
 
     def _last_and_waiting(self) -> tuple[int, dict[str, int]]:
         with self._store.reading_record() as connection:
-            return last_event(connection), deliveries.count_waiting(connection)
+            return last_event(connection), webhooks.count_waiting(connection)
 
     def _after(self, position: int) -> tuple[Sequence[Event], int]:
         """The next events, and how many are no longer kept; none where the position is unknown."""
@@ -381,11 +380,11 @@ class WebhookSender:
 
     def _heads(self) -> list[tuple[Queue, str]]:
         with self._store.reading_record() as connection:
-            return deliveries.heads(connection)
+            return webhooks.heads(connection)
 
     def _next_of(self, queue: Queue) -> list[Waiting]:
         with self._store.reading_record() as connection:
-            return deliveries.next_of(connection, queue, DELIVERED_AT_ONCE)
+            return webhooks.next_of(connection, queue, DELIVERED_AT_ONCE)
 
 
 BEAT_S = 3.0
@@ -435,7 +434,7 @@ class Turn:
 
     async def _hold(self, name: str | None) -> bool:
         asked_s = time.monotonic()
-        change = partial(hold_sender, holder=name, beat=self._beat)
+        change = partial(webhooks.hold_sender, holder=name, beat=self._beat)
         if not await asyncio.wrap_future(self._store.writer.change(change)):
             return False
         self._beat += 1
@@ -444,4 +443,4 @@ class Turn:
 
     def _read(self) -> tuple[str | None, int]:
         with self._store.reading_record() as connection:
-            return read_sender(connection)
+            return webhooks.read_sender(connection)

@@ -5,9 +5,9 @@ from dataclasses import asdict
 from typing import Any
 
 from service.advice.intervals import Interval
+from studies.documents import markdown
 from studies.mission_rates.settings import sigobs_arcsec
 from studies.mission_rates.simulation import OUTCOMES, Plan, Rates
-from studies.paper_1994.tables import markdown
 
 TITLES = {name: name.replace("_", " ") for name in OUTCOMES}
 

@@ -6,21 +6,16 @@ zone's number alone, not on how the work is shared out.
 """
 
 import math
-import multiprocessing
-import os
-from collections.abc import Iterable, Iterator, Mapping
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
 
 from service.acquire import BatchColumns, acquire_many
-from service.acquire.kernel_build import exit_after_parent
 from service.advice.intervals import Interval, share_of
-from service.identify.identification import Identification, Outcome
 from service.missions.mission import Identifier
 from service.simulate.motion import random_axis, tilted
 from service.sky.cache import LruCache
@@ -29,8 +24,16 @@ from service.sky.model import SkyModel
 from service.vectors import Vector, from_ra_dec, to_ra_dec
 from studies.mission_rates.settings import Errors, Setting, sigobs_arcsec
 from studies.paper_1994.printed import PrintedCounts, Reference, Run, World
-from studies.paper_1994.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHED, Integers
+from studies.paper_1994.tally import (
+    AMBIGUOUS,
+    CORRECT,
+    MISIDENTIFIED,
+    UNMATCHED,
+    Integers,
+    counts_of,
+)
 from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone
+from studies.workers import mapping, number_of
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
@@ -86,27 +89,18 @@ def simulate(
     where it is None; 1 works in this process.  Raises `BadInput` where a zone would hold too
     many pairs.
     """
-    count = min(processes or len(os.sched_getaffinity(0)), plan.zones)
-    numbers = range(plan.zones)
-    with tqdm(total=plan.zones, unit="zone", disable=True if quiet else None) as bar:
-        if count == 1:
-            sky = _open(catalog)
-            found = _followed((zone_counts(plan, number, sky) for number in numbers), bar)
-        else:
-            context = multiprocessing.get_context("spawn")
-            with ProcessPoolExecutor(count, context, _start, (catalog,)) as workers:
-                task = partial(_in_worker, plan)
-                found = _followed(workers.map(task, numbers, chunksize=4), bar)
-    counts = np.stack(found, axis=1)
-    return [_rates(*each) for each in zip(plan.settings, counts, strict=True)]
-
-
-def _followed(parts: Iterable[Integers], bar: "tqdm[None]") -> list[Integers]:
-    found = []
-    for part in parts:
-        found.append(part)
-        bar.update()
-    return found
+    count = min(number_of(processes), plan.zones)
+    task = partial(_zone_counts, plan, catalog)
+    with (
+        tqdm(total=plan.zones, unit="zone", disable=True if quiet else None) as bar,
+        mapping(count) as mapped,
+    ):
+        found = []
+        for counts in mapped(task, range(plan.zones)):
+            found.append(counts)
+            bar.update()
+    by_setting = np.stack(found, axis=1)
+    return [_rates(*each) for each in zip(plan.settings, by_setting, strict=True)]
 
 
 def _rates(setting: Setting, counts: Integers) -> Rates:
@@ -129,9 +123,8 @@ def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
                 batches = [batch_of(view, run, mission, plan.identifier) for view in views]
                 found = acquire_many(BatchColumns.of(batches), mission, sky)
                 for row, view in enumerate(views):
-                    counts[place] += _counted(
-                        found.acquisition(row).trackers[0].identification, view
-                    )
+                    identified = found.acquisition(row).trackers[0].identification
+                    counts[place] += counts_of(identified, view.star)
     return counts
 
 
@@ -177,28 +170,10 @@ def _run(errors: Errors) -> Run:
     )
 
 
-def _counted(found: Identification, view: View) -> Integers:
-    unique = found.outcome == Outcome.UNIQUE
-    counts = np.zeros(4, np.int64)
-    counts[AMBIGUOUS] = np.count_nonzero(found.outcome == Outcome.AMBIGUOUS)
-    counts[UNMATCHED] = np.count_nonzero(found.outcome == Outcome.UNMATCHED)
-    counts[CORRECT] = np.count_nonzero(unique & (found.star == view.star))
-    counts[MISIDENTIFIED] = np.count_nonzero(unique & (found.star != view.star))
-    return counts
+def _zone_counts(plan: Plan, catalog: Path | None, number: int) -> Integers:
+    return zone_counts(plan, number, _sky(catalog))
 
 
-def _open(catalog: Path | None) -> SkyModel:
+@cache
+def _sky(catalog: Path | None) -> SkyModel:
     return SkyModel(open_catalog(catalog), LruCache(CACHE_BYTES))
-
-
-_sky: SkyModel
-
-
-def _start(catalog: Path | None) -> None:
-    global _sky
-    exit_after_parent()
-    _sky = _open(catalog)
-
-
-def _in_worker(plan: Plan, number: int) -> Integers:
-    return zone_counts(plan, number, _sky)

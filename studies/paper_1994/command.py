@@ -1,7 +1,5 @@
 """`acquire simulate paper`: every table of the paper, theirs beside ours."""
 
-import json
-import os.path
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,25 +8,22 @@ from typing import TextIO
 from service.errors import BadInput, Fault
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Identifier
+from studies.documents import json_rows, links
+from studies.paper_1994 import tables, time_tables
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.plots import PICTURES, PLACES, draw
 from studies.paper_1994.printed import the_paper
-from studies.paper_1994.report import (
-    PAPER_IDENTIFIER,
-    PROPORTIONS,
-    TIMES,
-    measured,
-    report,
-)
-from studies.paper_1994.tables import TITLES
 from studies.paper_1994.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHED, Tally
-from studies.paper_1994.time_tables import Row
+from studies.paper_1994.time_tables import Row, measure
 
 ZONE_IDENTIFIERS: tuple[Identifier, ...] = tuple(
     name for name, entry in IDENTIFIERS.items() if entry.searches_zone
 )
 """The identifiers that search a zone, as the paper's does."""
 DEFAULT_STARS = 20_000
+
+PAPER_IDENTIFIER: Identifier = "starid"
+TIMES, PROPORTIONS = (11, 12), (13, 14)
 
 
 def run_paper(
@@ -65,7 +60,7 @@ def run_paper(
     times = {name: measured(asked[name], seeds[0], name) for name in timed if name in identifiers}
     rows = rows_of(tallies) + [row for of_one in times.values() for row in of_one]
     if json_path is not None:
-        write_json(rows, json_path)
+        json_path.write_text(json_rows(rows), encoding="utf-8")
     if plots is not None:
         draw([tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER], plots)
     if report_path is not None:
@@ -84,7 +79,7 @@ def _checked(
     table: int | None, stars: int, seeds: Sequence[int], identifiers: Sequence[Identifier]
 ) -> Sequence[int]:
     faults = []
-    if table is not None and table not in TITLES:
+    if table is not None and table not in tables.TITLES:
         faults.append(Fault("table", "must be from 2 to 14", str(table)))
     if stars < 1:
         faults.append(Fault("stars", "must be at least 1", str(stars)))
@@ -98,7 +93,7 @@ def _checked(
     ]
     if faults:
         raise BadInput(faults)
-    return list(TITLES) if table is None else [table]
+    return list(tables.TITLES) if table is None else [table]
 
 
 def rows_of(tallies: Sequence[Tally]) -> list[Row]:
@@ -118,10 +113,52 @@ def rows_of(tallies: Sequence[Tally]) -> list[Row]:
     ]
 
 
-def write_json(rows: Sequence[Row], path: Path) -> None:
-    """Write rows as a JSON array, one a line."""
-    lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
-    path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")
+def measured(wanted: Sequence[int], seed: int, identifier: Identifier) -> list[Row]:
+    """The rows of Tables 11 to 14, measured here and now; those of 13 and 14 without times."""
+    rows: list[Row] = []
+    for number, shares in zip(TIMES, PROPORTIONS, strict=True):
+        if not {number, shares} & set(wanted):
+            continue
+        # Tables 13 and 14 are of the zones of 11 and 12, measured once for both.
+        cases = [each for each in the_paper().times if each.table == str(number)]
+        zones = [(case, measure(case, seed, identifier)) for case in cases]
+        if number in wanted:
+            rows += [time_tables.time_row(*each, identifier) for each in zones]
+        if shares in wanted:
+            rows += [row for each in zones for row in time_tables.proportion_rows(shares, *each)]
+    return rows
+
+
+def report(
+    tallies: Sequence[Tally],
+    identifier: Identifier,
+    wanted: Sequence[int],
+    time_rows: Sequence[Row] = (),
+) -> str:
+    """The tables of one identifier as Markdown; `time_rows` are those of `measured`."""
+    mine = [tally for tally in tallies if tally.identifier == identifier]
+    parts = [f"## Tables of Fink & Shoup 1994 by the identifier `{identifier}`"]
+    is_paper = identifier == PAPER_IDENTIFIER
+    if mine and is_paper:
+        parts.append(
+            "Not identified: ambiguous or unmatched. A printed run is inside when distance² "
+            "<= 5.99. `!`: other than the reference."
+        )
+    for number in wanted:
+        chosen = [tally for tally in mine if tally.run.number == number]
+        if chosen:
+            shown = tables.rates(chosen) if is_paper else tables.improvements(chosen)
+            parts += [tables.heading(number), shown]
+    if mine:
+        parts.append(tables.summary(mine) if is_paper else tables.improvement_summary(mine))
+    for number in wanted:
+        rows = [row for row in time_rows if row["table"] == number]
+        if rows and number in TIMES:
+            parts += [tables.heading(number), time_tables.times(rows), time_tables.limit(rows)]
+        elif rows:
+            note = "`!`: the zone holds more pairs than the approximation bounds."
+            parts += [tables.heading(number), time_tables.proportions(rows), note]
+    return "\n\n".join(parts) + "\n"
 
 
 _RATE_TABLES = range(2, 11)
@@ -191,17 +228,18 @@ def document(
     if not mine:
         return _beyond(tallies, seeds)
     # The report's own heading would stand where the section's does.
-    tables = report(mine, PAPER_IDENTIFIER, list(TITLES), time_rows).split("\n", 2)[2]
-    links = [
-        f"![Rates against errors]({os.path.relpath(path, file.parent)})"
-        for path in (plots / f"{name}.svg" for name in (*PICTURES, PLACES))
-        if path.exists()
+    whole = report(mine, PAPER_IDENTIFIER, list(tables.TITLES), time_rows)
+    without_heading = whole.split("\n", 2)[2]
+    shown = [
+        link
+        for name in (*PICTURES, PLACES)
+        for link in links("Rates against errors", plots / f"{name}.svg", file)
     ]
     written = (
         "For astronomers who know the paper: its tables beside those that this service gives.\n"
         f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
     )
-    parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *links, tables]
+    parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *shown, without_heading]
     if mine:
         parts.append(_OUTSIDE)
     parts += [report(tallies, name, _RATE_TABLES) for name in _others(tallies)]

@@ -4,27 +4,23 @@ The zones, views and errors of an experiment depend on the seed, the world and
 the experiment's number alone, not on how the work is shared out.
 """
 
-import multiprocessing
-import os
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
 
 from service.acquire import BatchColumns, acquire_many
-from service.acquire.kernel_build import exit_after_parent
-from service.identify.identification import Outcome
 from service.missions.mission import Identifier
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from studies.paper_1994.printed import Run, World, the_paper
-from studies.paper_1994.tally import Integers, Tally
+from studies.paper_1994.tally import Integers, Tally, counts_of
 from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
+from studies.workers import mapping
 
 SHELF_BYTES = 64 << 20
 
@@ -58,7 +54,7 @@ def run_experiments(
         by_world[run.world].append(run)
     done: dict[tuple[str, int], list[Integers]] = defaultdict(list)
     paper = the_paper()
-    with _workers(processes) as workers, tqdm(unit="star", unit_scale=True, disable=None) as bar:
+    with mapping(processes) as mapped, tqdm(unit="star", unit_scale=True, disable=None) as bar:
         while True:
             tasks = [
                 Task(world, seed, number, tuple(its_runs), tuple(identifiers))
@@ -70,7 +66,7 @@ def run_experiments(
                 break
             bar.total = bar.n + sum(_stars_expected(task) for task in tasks)
             # In order, so that a result belongs to its task.
-            for task, counts in zip(tasks, workers.map(tasks), strict=True):
+            for task, counts in zip(tasks, mapped(_perform, tasks), strict=True):
                 done[task.world, task.seed].append(counts)
                 bar.update(int(counts.sum()))
     tallies = {
@@ -97,9 +93,9 @@ def _stars_expected(task: Task) -> int:
     return world.zones * world.views * 5 * len(task.runs) * len(task.identifiers)
 
 
-def perform(task: Task, sky: SkyModel) -> Integers:
+def _perform(task: Task) -> Integers:
     """The counts (identifiers, runs, zones, 4) of one experiment."""
-    world = the_paper().worlds[task.world]
+    sky, world = _sky(), the_paper().worlds[task.world]
     worlds = list(the_paper().worlds)
     rng = np.random.default_rng([task.seed, worlds.index(task.world), task.number])
     mission = paper_mission(world.mission)
@@ -115,21 +111,8 @@ def perform(task: Task, sky: SkyModel) -> Integers:
                 columns = acquire_many(BatchColumns.of(batches), mission, sky)
                 for row, view in enumerate(views):
                     found = columns.acquisition(row).trackers[0].identification
-                    counts[i, j, zone] += _counted(found.outcome, found.star, view.star)
+                    counts[i, j, zone] += counts_of(found, view.star)
     return counts
-
-
-def _counted(outcome: Integers, star: Integers, truth: npt.NDArray[np.intp]) -> Integers:
-    unique = outcome == Outcome.UNIQUE
-    correct = int(np.count_nonzero(unique & (star == truth)))
-    return np.array(
-        [
-            np.count_nonzero(outcome == Outcome.AMBIGUOUS),
-            np.count_nonzero(outcome == Outcome.UNMATCHED),
-            correct,
-            np.count_nonzero(unique) - correct,
-        ]
-    )
 
 
 def open_sky() -> SkyModel:
@@ -137,45 +120,6 @@ def open_sky() -> SkyModel:
     return SkyModel(load_embedded(), LruCache(SHELF_BYTES))
 
 
-class _Here:
-    """Works in this process."""
-
-    def map(self, tasks: Iterable[Task]) -> Iterator[Integers]:
-        sky = open_sky()
-        return (perform(task, sky) for task in tasks)
-
-    def __enter__(self) -> "_Here":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return None
-
-
-class _Elsewhere(ProcessPoolExecutor):
-    """Works in processes, each with a sky of its own."""
-
-    def __init__(self, processes: int) -> None:
-        super().__init__(
-            processes, mp_context=multiprocessing.get_context("spawn"), initializer=_open
-        )
-
-    def map(self, tasks: Iterable[Task]) -> Iterator[Integers]:  # type: ignore[override]
-        return super().map(_perform_elsewhere, tasks)
-
-
-_sky: SkyModel
-
-
-def _open() -> None:
-    global _sky
-    exit_after_parent()
-    _sky = open_sky()
-
-
-def _perform_elsewhere(task: Task) -> Integers:
-    return perform(task, _sky)
-
-
-def _workers(processes: int | None) -> _Here | _Elsewhere:
-    count = processes or len(os.sched_getaffinity(0))
-    return _Here() if count == 1 else _Elsewhere(count)
+@cache
+def _sky() -> SkyModel:
+    return open_sky()

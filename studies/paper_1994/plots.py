@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from service.simulate.drawing import pictures_in
+from studies.documents import pictures_in
 from studies.paper_1994.printed import Run
 from studies.paper_1994.region import spread
 from studies.paper_1994.tally import Tally

@@ -4,12 +4,12 @@ Beside each run stands what an independent implementation of the same reading
 got from 40 experiments of the paper's size: the reference.
 """
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
+
+import msgspec
 
 REFERENCE_EXPERIMENTS = 40
 _FILE = Path(__file__).with_name("printed.json")
@@ -134,23 +134,6 @@ class Paper:
 @cache
 def the_paper() -> Paper:
     """The numbers that the paper prints, read once."""
-    data = json.loads(_FILE.read_text(encoding="utf-8"))
-    return Paper(
-        worlds={name: World(name, **_tuples(world)) for name, world in data["worlds"].items()},
-        runs=tuple(
-            Run(
-                **{
-                    **_tuples(run),
-                    "printed": PrintedCounts(**run["printed"]),
-                    "reference": Reference(**run["reference"]),
-                }
-            )
-            for run in data["runs"]
-        ),
-        times=tuple(Times(**_tuples(row)) for row in data["times"]),
-        proportions=tuple(Proportion(**row) for row in data["proportions"]),
-    )
-
-
-def _tuples(row: dict[str, Any]) -> dict[str, Any]:
-    return {key: tuple(v) if isinstance(v, list) else v for key, v in row.items()}
+    data = msgspec.json.decode(_FILE.read_bytes())
+    worlds = {name: {"name": name, **world} for name, world in data["worlds"].items()}
+    return msgspec.convert({**data, "worlds": worlds}, Paper)

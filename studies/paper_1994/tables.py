@@ -1,7 +1,8 @@
 """The tables as Markdown that reads well in a terminal too: the paper's numbers beside ours."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
+from studies.documents import markdown
 from studies.paper_1994.printed import Run
 from studies.paper_1994.region import (
     Difference,
@@ -32,20 +33,6 @@ TITLES: Mapping[int, str] = {
 def heading(table: int) -> str:
     """A table's heading."""
     return f"### Table {table}. {TITLES[table]}"
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns, the first to the left and the others to the right."""
-    table = [list(header), *(list(row) for row in rows)]
-    widths = [max(len(row[k]) for row in table) for k in range(len(header))]
-    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-
-    def line(cells: Sequence[str]) -> str:
-        first = cells[0].ljust(widths[0])
-        others = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
-        return "| " + " | ".join([first, *others]) + " |"
-
-    return "\n".join([line(table[0]), line(rule), *map(line, table[1:])])
 
 
 def improvements(tallies: Sequence[Tally]) -> str:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from service.identify.identification import Identification, Outcome
 from service.missions.mission import Identifier
 from studies.paper_1994.printed import Run, World, the_paper
 
@@ -34,3 +35,14 @@ class Tally:
     def world(self) -> World:
         """The run's world."""
         return the_paper().worlds[self.run.world]
+
+
+def counts_of(found: Identification, truth: npt.NDArray[np.intp]) -> Integers:
+    """The stars by outcome (4,), given the catalog rows that are the truth."""
+    counts = np.zeros(4, np.int64)
+    is_right = found.star == truth
+    counts[AMBIGUOUS] = np.count_nonzero(found.outcome == Outcome.AMBIGUOUS)
+    counts[UNMATCHED] = np.count_nonzero(found.outcome == Outcome.UNMATCHED)
+    counts[CORRECT] = np.count_nonzero(found.unique & is_right)
+    counts[MISIDENTIFIED] = np.count_nonzero(found.unique & ~is_right)
+    return counts

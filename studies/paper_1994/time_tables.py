@@ -16,9 +16,9 @@ from service.missions.mission import Band, Identifier, Mission
 from service.sky.geometry.pairs import PAIRS_PER_BIN, build_pairs
 from service.sky.model import SkyModel
 from service.sky.zones import build_zone
+from studies.documents import markdown
 from studies.paper_1994.experiments import open_sky
 from studies.paper_1994.printed import Times, World, the_paper
-from studies.paper_1994.tables import markdown
 from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone, paper_mission
 
 BYTES_PER_PAIR = 8 + 4 + 4 + 4 / PAIRS_PER_BIN

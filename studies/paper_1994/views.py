@@ -13,21 +13,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import ndtr, ndtri
 
+from service import vectors
 from service.missions.mission import Band, Identifier, Mission, load_missions
 from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
-from service.simulate.motion import pointed, random_axis
+from service.simulate.motion import across, pointed, random_axis
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_direction
 from service.times import parse_utc
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    coordinate_rotation,
-    from_ra_dec,
-    quaternion_from_matrix,
-    unit,
-)
 from studies.paper_1994.printed import Run, World
 
 MOST_STARS = 5
@@ -56,37 +48,40 @@ class View:
     `share` are uniform over the circle and over the unit interval.
     """
 
-    axis: Vector
-    attitude: Matrix
+    axis: vectors.Vector
+    attitude: vectors.Matrix
     star: npt.NDArray[np.intp]
-    direction: Vector
-    magnitude_mag: Vector
-    radius: Vector
-    bearing_rad: Vector
-    share: Vector
+    direction: vectors.Vector
+    magnitude_mag: vectors.Vector
+    radius: vectors.Vector
+    bearing_rad: vectors.Vector
+    share: vectors.Vector
 
-    def seen(self, run: Run) -> tuple[Vector, Vector]:
+    def seen(self, run: Run) -> tuple[vectors.Vector, vectors.Vector]:
         """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, with errors."""
-        radius = run.sigma_arcsec / ARCSEC_PER_RADIAN * self.radius[:, None]
-        aside = unit(np.cross(self.direction, _least_axis(self.direction)))
-        above = np.cross(self.direction, aside)
+        radius = run.sigma_arcsec / vectors.ARCSEC_PER_RADIAN * self.radius[:, None]
+        aside, above = across(self.direction)
         bearing = self.bearing_rad[:, None]
         sideways = np.cos(bearing) * aside + np.sin(bearing) * above
         moved = np.cos(radius) * self.direction + np.sin(radius) * sideways
         # v' = A^T R A v
         return moved @ self.attitude.T @ rotation(run).T @ self.attitude, self._magnitudes(run)
 
-    def _magnitudes(self, run: Run) -> Vector:
+    def _magnitudes(self, run: Run) -> vectors.Vector:
         # A Gaussian error drawn again while it lies beyond the bound is one cut off there.
         tail = ndtr(-run.bound_mag / run.sigma_mag)
         error = ndtri(tail + (1.0 - 2.0 * tail) * self.share)
         return np.asarray(self.magnitude_mag + run.sigma_mag * error)
 
 
-def rotation(run: Run) -> Matrix:
+def rotation(run: Run) -> vectors.Matrix:
     """The error of the attitude, R1(psi) R2(theta) R3(phi): phi about Z first, psi about X last."""
     phi, theta, psi = (arcsec / 3600.0 for arcsec in run.rotation_arcsec)
-    return coordinate_rotation(0, psi) @ coordinate_rotation(1, theta) @ coordinate_rotation(2, phi)
+    return (
+        vectors.coordinate_rotation(0, psi)
+        @ vectors.coordinate_rotation(1, theta)
+        @ vectors.coordinate_rotation(2, phi)
+    )
 
 
 def draw_zone(
@@ -103,9 +98,9 @@ def draw_zone(
         yield _view(world, axis, mission, catalog, rng, most_stars)
 
 
-def _axis(world: World, number: int, rng: np.random.Generator) -> Vector:
+def _axis(world: World, number: int, rng: np.random.Generator) -> vectors.Vector:
     if world.axis_deg is not None:
-        return from_ra_dec(*world.axis_deg)
+        return vectors.from_ra_dec(*world.axis_deg)
     if world.sun_dates:
         date = world.sun_dates[number % len(world.sun_dates)]
         return sun_direction(parse_utc(f"{date}T00:00:00Z"), None)
@@ -114,7 +109,7 @@ def _axis(world: World, number: int, rng: np.random.Generator) -> Vector:
 
 def _view(
     world: World,
-    axis: Vector,
+    axis: vectors.Vector,
     mission: Mission,
     catalog: RunCatalog,
     rng: np.random.Generator,
@@ -140,22 +135,15 @@ def _view(
     )
 
 
-def _within(axis: Vector, radius_rad: float, rng: np.random.Generator) -> Vector:
+def _within(axis: vectors.Vector, radius_rad: float, rng: np.random.Generator) -> vectors.Vector:
     """A direction drawn evenly over the cap about an axis."""
     # 1 - cos, so that small caps lose no digits.
     height = rng.uniform(0.0, 2.0 * math.sin(radius_rad / 2.0) ** 2)
-    across = math.sqrt(height * (2.0 - height))
+    sine = math.sqrt(height * (2.0 - height))
     bearing = rng.uniform(0.0, math.tau)
-    aside = unit(np.cross(axis, _least_axis(axis)))
-    above = np.cross(axis, aside)
-    return unit(
-        (1.0 - height) * axis + across * (math.cos(bearing) * aside + math.sin(bearing) * above)
-    )
-
-
-def _least_axis(direction: Vector) -> Vector:
-    """The coordinate axis to which each direction leans least."""
-    return np.asarray(np.eye(3)[np.argmin(np.abs(direction), axis=-1)])
+    aside, above = across(axis)
+    sideways = math.cos(bearing) * aside + math.sin(bearing) * above
+    return vectors.unit((1.0 - height) * axis + sine * sideways)
 
 
 def batch_of(view: View, run: Run, mission: Mission, identifier: Identifier) -> ObservationBatch:
@@ -177,7 +165,7 @@ def batch_of(view: View, run: Run, mission: Mission, identifier: Identifier) -> 
         batch=f"{run.table} {run.run}",
         run="paper",
         time=EPOCH,
-        a_priori=QuaternionPrior(quaternion_from_matrix(prior)),
+        a_priori=QuaternionPrior(vectors.quaternion_from_matrix(prior)),
         body_rates_deg_per_s=np.zeros(3),
         velocity_km_per_s=None,
         aberration="ignore",

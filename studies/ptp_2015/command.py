@@ -1,7 +1,5 @@
 """`acquire simulate paper --table ptp-5` and its like: Zhou & Ye 2015 beside ours."""
 
-import json
-import os.path
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,17 +12,8 @@ from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles
-from studies.paper_1994.tables import markdown
-from studies.ptp_2015 import tables
-from studies.ptp_2015.comparison import (
-    COMPARED,
-    OF_THE_PAPER,
-    all_projections,
-    compare,
-    databases,
-    false_fields,
-    stars_in_fields,
-)
+from studies.documents import json_rows, links, markdown
+from studies.ptp_2015 import comparison, tables
 from studies.ptp_2015.plots import draw
 from studies.ptp_2015.printed import the_ptp_paper
 from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, Measurements, section
@@ -42,12 +31,13 @@ CASES: Mapping[str, Sequence[Case]] = {
     "figure-6": [],
     "figure-7": [],
     "ptp-5": [Case("ptp-5", SLAVES, 0.0)],
-    "ptp-6": [Case("ptp-6", COMPARED, 1.0, 0.5, adds=adds) for adds in (False, True)],
+    "ptp-6": [Case("ptp-6", comparison.COMPARED, 1.0, 0.5, adds=adds) for adds in (False, True)],
     "figure-10": [],
-    "figure-11": [Case("figure-11", COMPARED, 0.5, fewest=3)],
-    "figure-12": [Case("figure-12", COMPARED, px) for px in (0.0, 0.5, 1.0, 1.5, 2.0)],
+    "figure-11": [Case("figure-11", comparison.COMPARED, 0.5, fewest=3)],
+    "figure-12": [Case("figure-12", comparison.COMPARED, px) for px in (0.0, 0.5, 1.0, 1.5, 2.0)],
     "figure-13": [
-        Case("figure-13", OF_THE_PAPER, 0.0, mag) for mag in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
+        Case("figure-13", comparison.OF_THE_PAPER, 0.0, mag)
+        for mag in (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
     ],
     "ptp-false": [],
 }
@@ -73,7 +63,7 @@ def run_ptp(
     out = out or sys.stdout
     found = measured(wanted, scenes, seed, processes)
     if json_path is not None:
-        write_json(found, json_path)
+        json_path.write_text(json_rows(rows_of(found)), encoding="utf-8")
     if plots is not None:
         draw(found.drawn, plots)
     if report_path is not None:
@@ -102,16 +92,16 @@ def measured(
 ) -> Measurements:
     """Everything that some tables and figures show."""
     cases = [case for name in wanted for case in CASES[name]]
-    tallies = compare(cases, scenes, seed, processes) if cases else []
+    tallies = comparison.compare(cases, scenes, seed, processes) if cases else []
     names = dict.fromkeys(t.algorithm for t in tallies if t.case.name.startswith("ptp-"))
     return Measurements(
         scenes,
         seed,
         {name: [tally for tally in tallies if tally.case.name == name] for name in wanted},
-        stars_in_fields(scenes, seed) if "figure-10" in wanted else None,
-        databases(list(names)),
-        false_fields(scenes, seed) if "ptp-false" in wanted else (),
-        all_projections() if any(name in OF_PROJECTIONS for name in wanted) else None,
+        comparison.stars_in_fields(scenes, seed) if "figure-10" in wanted else None,
+        comparison.databases(list(names)),
+        comparison.false_fields(scenes, seed) if "ptp-false" in wanted else (),
+        comparison.all_projections() if any(name in OF_PROJECTIONS for name in wanted) else None,
     )
 
 
@@ -136,12 +126,6 @@ def rows_of(found: Measurements) -> list[dict[str, Any]]:
         for name in OF_PROJECTIONS:
             rows += found.projections.rows(name) if name in found.tallies else []
     return rows
-
-
-def write_json(found: Measurements, path: Path) -> None:
-    """Write the rows as a JSON array, one a line."""
-    lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows_of(found))
-    path.write_text(f"[\n{lines}\n]\n" if lines else "[]\n", encoding="utf-8")
 
 
 _INTRODUCTION = """\
@@ -242,10 +226,8 @@ def document(found: Measurements, plots: Path, file: Path) -> str:
     ]
     for name in tables.TITLES:
         if name in found.tallies:
-            picture = plots / f"ptp-{name}.svg"
-            link = os.path.relpath(picture, file.parent)
             parts.append(tables.section(found, name))
-            parts += [f"![{tables.TITLES[name]}]({link})"] if picture.exists() else []
+            parts += links(tables.TITLES[name], plots / f"ptp-{name}.svg", file)
     return "\n\n".join(part.strip() for part in parts) + "\n"
 
 

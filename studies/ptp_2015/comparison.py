@@ -4,10 +4,7 @@ Every algorithm sees the same fields.  Each is asked twice: for its own answer,
 and for what is left of its proposals after the service's attitude check.
 """
 
-import multiprocessing
-import os
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from time import perf_counter, perf_counter_ns
@@ -16,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from service.acquire.kernel_build import exit_after_parent
 from service.identify.triangles.ptp import explained
 from service.simulate.scenes import Conditions, Scene, SceneSky, draw_scenes
 from service.sky.geometry.triangles import REACH_DEG
@@ -29,6 +25,7 @@ from studies.ptp_2015.rivals.proposed import Algorithm, Build
 from studies.ptp_2015.rivals.ptp import build_ptp
 from studies.ptp_2015.rivals.pyramid import build_pyramid
 from studies.ptp_2015.tally import COLUMNS, LIMIT_MAG, Case, Tally
+from studies.workers import mapping
 
 ALGORITHMS: Mapping[str, Build] = {
     "PTP": build_ptp,
@@ -77,8 +74,11 @@ def compare(
         for first in range(0, scenes, SCENES_A_TASK)
     ]
     results: dict[Case, list[npt.NDArray[np.int64]]] = {case: [] for case in cases}
-    with tqdm(total=len(cases) * scenes, unit="scene", disable=None) as bar:
-        for task, counted in zip(tasks, _performed(tasks, processes), strict=True):
+    with (
+        tqdm(total=len(cases) * scenes, unit="scene", disable=None) as bar,
+        mapping(processes) as mapped,
+    ):
+        for task, counted in zip(tasks, mapped(_perform, tasks), strict=True):
             results[task.case].append(counted)
             bar.update(task.count)
     return [
@@ -86,16 +86,6 @@ def compare(
         for case in cases
         for k, algorithm in enumerate(case.algorithms)
     ]
-
-
-def _performed(tasks: Sequence[_Task], processes: int | None) -> Iterable[npt.NDArray[np.int64]]:
-    count = processes or len(os.sched_getaffinity(0))
-    if count == 1:
-        yield from map(_perform, tasks)
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, context, exit_after_parent) as workers:
-        yield from workers.map(_perform, tasks)
 
 
 def _perform(task: _Task) -> npt.NDArray[np.int64]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.simulate.drawing import pictures_in
+from studies.documents import pictures_in
 from studies.ptp_2015.printed import Ends, the_ptp_paper
 from studies.ptp_2015.projections import Projections, draw_figure_6, draw_figure_7
 from studies.ptp_2015.tally import FieldShare, Tally

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from studies.paper_1994.tables import markdown
+from studies.documents import markdown
 from studies.ptp_2015 import projections
 from studies.ptp_2015.comparison import Database
 from studies.ptp_2015.plots import PlottedSeries
@@ -117,10 +117,7 @@ def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
                 f"{database.nbytes / MB:.3f}",
                 f"{database.entries:,}",
                 f"{printed.rate_pct:.2f}",
-                str(tally.strict),
-                str(tally.loose),
-                str(tally.checked),
-                str(tally.wrong),
+                *map(str, tally.rates),
                 f"{printed.time_ms:.2f}",
                 tally.times,
             )
@@ -148,10 +145,7 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
                 tally.algorithm,
                 "lost and added" if tally.case.adds else "lost alone",
                 f"{of_paper.rate_pct:.2f}" if of_paper else "",
-                str(tally.strict),
-                str(tally.loose),
-                str(tally.checked),
-                str(tally.wrong),
+                *map(str, tally.rates),
                 f"{of_paper.time_ms:.2f}" if of_paper else "",
                 tally.times,
                 f"{of_paper.memory_mb:g}" if of_paper else "",
@@ -233,10 +227,7 @@ def line_table(tallies: Sequence[Tally], axis: str, unit: str, printed: Ends) ->
                 f"{value:g} {unit}",
                 tally.algorithm,
                 of_paper,
-                str(tally.strict),
-                str(tally.loose),
-                str(tally.checked),
-                str(tally.wrong),
+                *map(str, tally.rates),
                 tally.times,
                 f"{len(tally.rows):,}",
             )

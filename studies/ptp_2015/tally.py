@@ -114,6 +114,11 @@ class Tally:
         """The share of fields in which a star is misnamed after the attitude check."""
         return self._rate(self._column("unique_right") < self._column("unique"))
 
+    @property
+    def rates(self) -> tuple[FieldShare, ...]:
+        """Strict, loose, checked and wrong."""
+        return self.strict, self.loose, self.checked, self.wrong
+
     @cached_property
     def median_ms(self) -> tuple[float, float]:
         """Median milliseconds of a field: of the algorithm itself, and with the check."""

@@ -1,7 +1,5 @@
 """`acquire simulate imaging`: every claim of the star image detection report beside ours."""
 
-import json
-import os.path
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -10,7 +8,7 @@ from typing import TextIO
 from tqdm import tqdm
 
 from service.errors import BadInput, Fault
-from service.simulate.drawing import pictures_in
+from studies.documents import json_rows, links, pictures_in
 from studies.star_image_report import estimating, locating, mesh, optics, recognising, scanning
 from studies.star_image_report.claims import Claim, Row, Study
 
@@ -152,32 +150,26 @@ def document(rows: Sequence[Row], seed: int, folder: Path, file: Path) -> str:
     for row in rows:
         parts.append(table(row))
         for name, picture in row.pictures.items():
-            path = folder / f"{name}.svg"
-            if path.exists():
-                link = os.path.relpath(path, file.parent)
-                parts += [f"![{row.title}]({link})", picture.caption]
+            if link := links(row.title, folder / f"{name}.svg", file):
+                parts += [*link, picture.caption]
     return "\n\n".join(parts) + "\n"
 
 
 def as_json(rows: Sequence[Row]) -> str:
     """One claim a line, with its figures."""
-    lines = [
-        json.dumps(
-            {
-                "row": row.name,
-                "section": claim.section,
-                "report": claim.says,
-                "here": claim.ours,
-                "verdict": claim.verdict,
-                "holds": bool(claim.holds),
-                "figures": claim.figures,
-            },
-            ensure_ascii=False,
-        )
+    return json_rows(
+        {
+            "row": row.name,
+            "section": claim.section,
+            "report": claim.says,
+            "here": claim.ours,
+            "verdict": claim.verdict,
+            "holds": bool(claim.holds),
+            "figures": claim.figures,
+        }
         for row in rows
         for claim in row.claims
-    ]
-    return "[\n" + ",\n".join(lines) + "\n]\n"
+    )
 
 
 def draw(rows: Sequence[Row], folder: Path) -> list[Path]:

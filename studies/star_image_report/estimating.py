@@ -6,8 +6,8 @@ import numpy as np
 
 from service.imaging.centroids.sequential import StateEstimate, batch, diffuse, least_norm
 from service.imaging.centroids.window import Array
+from studies.star_image_report import measurements
 from studies.star_image_report.claims import Claim, Picture, Row, Study
-from studies.star_image_report.further import measurements
 from studies.star_image_report.quadratic_peak import Hump, StopRule, hump_of, recentred
 
 ROUND = Hump(peak=1.0, M=-1.0, L=-1.3, J=0.2)

@@ -10,17 +10,8 @@ from service.imaging.centroids.window import Array
 from service.imaging.detection.star_image import AIRY_OVER_SIGMA
 from service.imaging.optics import behind_wires, disc, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
+from studies.star_image_report import correlate, rotation, sun_acquisition
 from studies.star_image_report.claims import Claim, Picture, Row, Study
-from studies.star_image_report.correlate import (
-    displacement_by_derivative,
-    displacement_by_peak,
-    light_through,
-    locate,
-    negative,
-    overlap,
-    search_by_axes,
-)
-from studies.star_image_report.further import rotation, sun_acquisition
 from studies.star_image_report.mesh import THICK_M, THIN_M
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
 from studies.star_image_report.sun_tracker import SunTracker
@@ -46,10 +37,11 @@ def correlation(study: Study) -> Row:
     lines = []
     for shift in rng.uniform(-20, 20, 50):
         f, g = (np.exp(-0.5 * ((x - 64.0 - s) / 3.0) ** 2) for s in (0.0, float(shift)))
-        lines.append((displacement_by_peak(g, f) - shift, displacement_by_derivative(g, f) - shift))
+        by_both = correlate.displacement_by_peak(g, f), correlate.displacement_by_derivative(g, f)
+        lines.append([each - shift for each in by_both])
     worst = np.abs(np.array(lines)).max(axis=0).tolist()
     far = {
-        name: overlap(np.roll(shape, (25, 20), axis=(0, 1)), np.roll(shape, 20, axis=1))
+        name: correlate.overlap(np.roll(shape, (25, 20), axis=(0, 1)), np.roll(shape, 20, axis=1))
         for name, shape in (("star", _hump(0, 0)), ("cross", _cross()))
     }
     found = _searches(rng, study.trials(2000) // 10)
@@ -125,7 +117,7 @@ def _searches(rng: np.random.Generator, number: int) -> float:
     for _ in range(max(number, 20)):
         u, v = rng.uniform(-25, 25, 2)
         seen = _cross(u, v) + rng.normal(0.0, 0.02, (len(GRID), len(GRID)))
-        at = search_by_axes(seen, _cross())
+        at = correlate.search_by_axes(seen, _cross())
         worst = max(worst, abs(at[0] - u), abs(at[1] - v))
     return float(worst)
 
@@ -158,7 +150,7 @@ def _location(rng: np.random.Generator, trials: int) -> tuple[float, float, floa
     for _ in range(trials):
         u, v = rng.uniform(-5, 5, 2)
         image = 1000.0 * psf.pixel(place[None, :] - u, place[:, None] - v)
-        at = locate(image + rng.normal(0, 2, image.shape), pattern, noise_sigma=2.0)
+        at = correlate.locate(image + rng.normal(0, 2, image.shape), pattern, noise_sigma=2.0)
         errors += [at.u_px - u, at.v_px - v]
         sigmas.append(at.sigma_u_px)
     return float(np.std(errors)), float(np.mean(sigmas)), abs(float(np.mean(errors)))
@@ -172,7 +164,7 @@ def _draw_search(figure: Any) -> None:
         ("star", _hump(0, 0), "#b45309"),
     ):
         seen = np.roll(shape, (12, 0), axis=(0, 1))
-        light = [overlap(np.roll(seen, int(s), axis=1), shape) for s in shifts]
+        light = [correlate.overlap(np.roll(seen, int(s), axis=1), shape) for s in shifts]
         axis.plot(shifts, light, color=color, label=name)
     axis.set(xlabel="along u (px)", ylabel="correlation")
     axis.legend(fontsize=7)
@@ -249,10 +241,11 @@ def fifteen_arcsec(study: Study) -> Row:
     cells = 300 if study.quick else 500
     pupil = filtered(DIAMETER_M, wires, wires, cells, width=LASER_M / step / DIAMETER_M)
     image = image_by_fft(pupil, LASER_M)
-    film = negative(image.intensity, full_at=0.01)
+    film = correlate.negative(image.intensity, full_at=0.01)
     arcsec = image.step_rad * ARCSEC_PER_RADIAN
     through = [
-        light_through(image.intensity, film, round(x / arcsec), 0) for x in (0.0, 15.0, 60.0, 240.0)
+        correlate.light_through(image.intensity, film, round(x / arcsec), 0)
+        for x in (0.0, 15.0, 60.0, 240.0)
     ]
     inch = 0.001 / (350.0 / 25.4) * ARCSEC_PER_RADIAN
     airy = LASER_M / DIAMETER_M * ARCSEC_PER_RADIAN
@@ -260,7 +253,7 @@ def fifteen_arcsec(study: Study) -> Row:
     def draw(figure: Any) -> None:
         axis = figure.subplots()
         moved = np.arange(-60, 61)
-        light = [light_through(image.intensity, film, int(m), 0) for m in moved]
+        light = [correlate.light_through(image.intensity, film, int(m), 0) for m in moved]
         axis.plot(moved * arcsec, light, color="#0b5394")
         axis.plot([15, 60, 240], through[1:], "o", mfc="none", color="#b45309")
         axis.set(xlabel="off along a tail (″)", ylabel="light through the negative", ylim=(0, None))

@@ -13,8 +13,8 @@ from service.imaging.optics import (
     image_by_fft,
     thermal,
 )
+from studies.star_image_report import wires_and_lines
 from studies.star_image_report.claims import Claim, Picture, Row, Study
-from studies.star_image_report.further import wires_and_lines
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
 from studies.star_image_report.wires import (
     INCH_M,

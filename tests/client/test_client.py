@@ -30,8 +30,10 @@ from acquire_client import (
     Unauthenticated,
     UnexpectedAnswer,
     errors,
+    operations,
+    spacecraft,
 )
-from acquire_client._sync import alarms, batches, gyro, pages, replays, spacecraft
+from acquire_client._sync import batches, connection, replays
 from acquire_client._sync import client as whole
 from acquire_client.encoding import json_of
 from acquire_client.errors import problem_of
@@ -64,7 +66,7 @@ def test_the_examples_of_the_methods_give_what_they_show(client, example, tmp_pa
     (tmp_path / "pass.ndjson").write_text(json.dumps(example) + '\n{"cut": \n', "utf-8")
     monkeypatch.chdir(tmp_path)
     tried = 0
-    for module in (batches, spacecraft, alarms, replays, whole, gyro):
+    for module in (batches, spacecraft, operations, replays, whole):
         found = doctest.testmod(
             module, extraglobs={"client": client, "batch": example, "block": GYRO}
         )
@@ -147,7 +149,7 @@ def test_the_asynchronous_client_gives_the_same(address, client, drawn):
 
 
 def test_pages_are_read_as_they_are_needed(client, drawn, monkeypatch):
-    monkeypatch.setattr(pages, "ITEMS_A_PAGE", 7)
+    monkeypatch.setattr(connection, "ITEMS_A_PAGE", 7)
     sent = drawn(30, "paged")
     for each in client.submit_many(sent):
         assert each.problem is None

@@ -13,8 +13,8 @@ from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
 from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
-from studies.star_image_report.windows import draw_window
 from tests.chance import assert_chi_square
+from tests.reference.star_windows import draw_window
 
 
 @pytest.fixture(scope="module")

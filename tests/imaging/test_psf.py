@@ -8,8 +8,8 @@ from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import GaussianPsf, SampledPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Detector
 from studies.star_image_report.optics import airy
-from studies.star_image_report.windows import draw_stars
 from tests.imaging.optics import DIAMETER_M, LASER_M, MESH
+from tests.reference.star_windows import draw_stars
 
 WIRES = [
     (turn, place / DIAMETER_M, width / DIAMETER_M)

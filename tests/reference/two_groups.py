@@ -9,8 +9,8 @@ import numpy as np
 from service.acquire import Acquisition, acquire
 from service.attitude.solution import AttitudeSolution
 from service.observations.batch import ObservationBatch, QuaternionPrior
-from service.simulate.two_groups import Group, Rows, Views
 from service.vectors import Matrix, attitude_error_arcsec
+from tests.reference.two_group_views import Group, Rows, Views
 
 SAME_ATTITUDE_DEG = 0.03
 """An attitude nearer to another than this is taken for the same: the least shift is .05 deg."""

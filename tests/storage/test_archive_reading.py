@@ -114,7 +114,7 @@ def test_lists_are_the_same_before_and_after_archiving(filled, place, monkeypatc
     assert state.nbytes <= 200_000
     assert state.evictions > 0
     # A page that looks into few row groups is short, and goes on at its cursor.
-    monkeypatch.setattr("service.storage.queries.results.MOST_OPENED", 1)
+    monkeypatch.setattr("service.storage.queries.with_archive.MOST_OPENED", 1)
     after = [pages_of(filled, 3, **selected) for selected in FILTERS]
     assert [without_mark(each) for each in after] == before
 

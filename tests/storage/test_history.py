@@ -9,7 +9,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from service.alarms.quantities import QUANTITIES, Rate, trend_names
-from service.storage.queries import time_buckets, trends
+from service.storage.queries import time_buckets
 from service.times import parse_utc, shifted, unix_seconds, utc_of_unix
 from tests.storage.bulk import put, result_row
 
@@ -82,7 +82,7 @@ def test_thinning_out_keeps_the_least_and_greatest_of_every_bucket(
     start = shifted(START, begin_s)
     end = shifted(start, length_s)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trends, "MAX_BATCHES_SUMMED", at_most)
+        patch.setattr(time_buckets, "MAX_BATCHES_SUMMED", at_most)
         shown = app.spacecraft.history("XTE", run=run, start=start, end=end, size=size)
     assert len(shown.unix_s) <= size or shown.bucket_s == 3600
     for name in trend_names():

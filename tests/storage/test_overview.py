@@ -35,7 +35,7 @@ def test_the_day_is_the_same_from_hours_as_from_batches(app, monkeypatch):
     rows = [result_row(app, shifted(START, 317.0 * k), ambiguous=k % 4) for k in range(400)]
     put(app, rows)
     from_batches = item(app).last_day
-    monkeypatch.setattr("service.storage.queries.fleet.MAX_BATCHES_SUMMED", 0)
+    monkeypatch.setattr("service.storage.queries.time_buckets.MAX_BATCHES_SUMMED", 0)
     assert item(app).last_day == from_batches
 
 

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from service.errors import BadInput
 from service.observations.schema import OptionsIn
-from service.storage.projections import rollups
+from service.storage.queries import time_buckets
 from service.times import parse_utc
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import KINDS
@@ -116,9 +116,9 @@ def test_a_range_takes_the_buckets_it_touches(app, make, start, end, hours):
 def test_a_stretch_with_more_buckets_than_an_answer_holds_is_refused(app, make, monkeypatch):
     for hour in range(3):
         app.submissions.submit(make(f"b{hour}", after_s=3600 * hour))
-    monkeypatch.setattr(rollups, "MAX_RATES", 3)
+    monkeypatch.setattr(time_buckets, "MAX_RATES", 3)
     assert len(app.spacecraft.rates("XTE")) == 3
-    monkeypatch.setattr(rollups, "MAX_RATES", 2)
+    monkeypatch.setattr(time_buckets, "MAX_RATES", 2)
     with pytest.raises(BadInput, match=r"start: .* more than 2 hours hold batches: .* or for days"):
         app.spacecraft.rates("XTE")
     assert len(app.spacecraft.rates("XTE", start=parse_utc("1996-01-10T13:00:00Z"))) == 2

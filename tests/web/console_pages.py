@@ -1,7 +1,7 @@
 """The addresses of the console's pages, from the registry."""
 
 from service.web.console import pages as pages
-from service.web.console.registry import PAGES
+from service.web.console.page import PAGES
 
 WITHOUT_CONTENT = ("latest_batch", "sign_in_page")
 """A redirect, and the page before there is a reader."""

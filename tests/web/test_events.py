@@ -1,5 +1,6 @@
 """Live events over HTTP: nothing is lost, whoever wrote it and however long one was away."""
 
+import asyncio
 import json
 import threading
 from contextlib import contextmanager
@@ -7,8 +8,10 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
+from service.access.tokens import OPEN_CALLER
 from service.app.factory import open_app
 from service.storage.recording import events as records
+from service.times import parse_utc
 from service.web import event_stream as live
 from service.web.app import create_app
 from tests.waiting import wait_until
@@ -122,6 +125,29 @@ def test_who_was_away_is_told_of_everything_in_between_and_of_nothing_twice(data
     with service(database) as address:
         returned = Listener(address, last_event_id=last)
         assert told_batches(returned.wait_for(6)) == [each["batch"] for each in others]
+
+
+def test_a_new_listener_hears_of_what_is_recorded_after_the_head_of_its_answer(database):
+    """The head is sent once the stream is there, and its lines are read after that."""
+
+    async def first_events(app):
+        stream = live.Live(app)
+        await stream.start()
+        lines = await stream.stream(live.Listener(OPEN_CALLER), None, None, None)
+        entry = app.access.entry("me", "add_annotation", "/api/v1/annotations", None, 201)
+        time = parse_utc("1996-01-10T12:00:00Z")
+        app.annotations.add("slew", start=time, end=None, spacecraft=None, who="me", entry=entry)
+        heard = [await asyncio.wait_for(anext(lines), 20) for _ in range(2)]
+        await stream.close()
+        return b"".join(heard).decode().split("\n\n")
+
+    app = open_app(in_process_settings(database))
+    try:
+        _, hello, told, _ = asyncio.run(first_events(app))
+    finally:
+        app.close()
+    assert hello == 'id: 0\nevent: hello\ndata: {"last":0}'
+    assert told.startswith("id: 1\nevent: annotation\n")
 
 
 def test_what_another_process_writes_is_told_of_too(postgresql_schemas, drawn):

@@ -15,8 +15,8 @@ from service.missions.mission import load_missions
 from service.times import parse_utc, shifted
 from service.vectors import matrix_from_quaternion
 from service.web.app import create_app
-from service.web.console.charts.grade_panels import TimeAxis
 from service.web.console.charts.grades import direction_chart, grade_charts
+from service.web.console.charts.panels import TimeAxis
 from tests.filtering.simulated import ARCSEC, attitudes_of, gyro_of, slews, truth_of
 from tests.fresh_databases import sqlite_at
 from tests.grades.passes import GYRO, MODEL, NOON, mission_with, recorded_of

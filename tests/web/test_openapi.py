@@ -13,7 +13,7 @@ from service.storage.models.events import EVENT_DATA
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml
-from service.web.openapi.document import examples
+from service.web.openapi import examples
 from tests.web.conformance import FILE, reference, validator
 from tests.web.examples import fresh_walk
 

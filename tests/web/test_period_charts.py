@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from service.sky.zones import SearchRegion
-from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
+from service.storage.queries.period import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
 from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix
 from service.web.console.charts.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer

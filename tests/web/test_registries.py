@@ -11,9 +11,7 @@ from service.app.factory import open_app
 from service.cli import main
 from service.products.formats import OUTPUT_FORMATS, OutputFormat, table_formats
 from service.web.app import bare_app, create_app
-from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.registry import PAGES, console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import PAGES, ContextDep, PageQuery, console_page
 from service.web.requests.access import POLICIES, Policy
 from service.web.requests.problem_types import ProblemType
 from tests.fresh_databases import sqlite_at
@@ -44,7 +42,7 @@ def passes_page():
     @console_page("/passes", "Passes", Policy("read", "nothing"), position=35)
     def passes_page(query: Annotated[PageQuery, InQuery()], context: ContextDep):
         shown = {"kind": ProblemType(200, "Passes"), "problem": {"detail": "no pass is planned"}}
-        return rendered("error.html.jinja", context.layout(query.run), **shown)
+        return context.rendered("error.html.jinja", query.run, **shown)
 
     yield
     for registry, before in ((POLICIES, policies), (PAGES, pages)):

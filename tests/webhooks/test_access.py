@@ -10,7 +10,7 @@ from sqlalchemy import select
 from service.access import tokens as sessions
 from service.storage.recording.ids import Ulids
 from service.storage.sql.access_tables import audit, webhooks
-from service.storage.webhooks.deliveries import read_sender
+from service.storage.webhooks import read_sender
 from tests.waiting import wait_until
 from tests.web.conformance import check
 from tests.web.test_access import Guarded, shown

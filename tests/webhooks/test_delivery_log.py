@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from service.storage.webhooks.registered import Registered
+from service.storage.webhooks import Registered
 from service.webhooks.messages import DeliveryLog
 
 HOOK = Registered(

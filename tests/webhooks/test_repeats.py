@@ -9,8 +9,8 @@ from functools import partial
 import pytest
 
 from service.errors import Busy
+from service.storage import webhooks
 from service.storage.recording import events
-from service.storage.webhooks import deliveries
 from service.webhooks import posts
 from tests.waiting import wait_until
 from tests.webhooks.conftest import HERE, LOOPBACK, receiving, serving
@@ -49,7 +49,7 @@ def test_what_was_taken_is_not_sent_again_while_it_cannot_be_noted(service, rece
     change, refused = writer.change, []
 
     def full_at_first(asked):
-        if isinstance(asked, partial) and asked.func is deliveries.settle and len(refused) < 3:
+        if isinstance(asked, partial) and asked.func is webhooks.settle and len(refused) < 3:
             refused.append(asked)
             raise Busy("10000 records are waiting to be written")
         return change(asked)

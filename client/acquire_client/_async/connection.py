@@ -1,19 +1,29 @@
-"""Sending requests: again where that may help, and only where it is safe."""
+"""Sending requests, again where that may help and is safe; lists, read page by page."""
 
 import ssl
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import httpx
+import msgspec
 
+from ..base import Page
+from ..calls import Call, Listing
 from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
+from ..tables import pandas_of, table_of
 from .backend import sleep
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
 T = TypeVar("T")
+Row = TypeVar("Row", bound=msgspec.Struct)
+
+ITEMS_A_PAGE = 500
 
 CONNECT_S = 5.0
 JSON = {"Content-Type": "application/json"}
@@ -47,12 +57,7 @@ class AsyncConnection:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.aclose()
 
     async def aclose(self) -> None:
@@ -127,14 +132,55 @@ class AsyncConnection:
                 raise problem_of(response)
             yield response.aiter_bytes()
 
+    async def _carry_out(self, call: Call[T]) -> T:
+        """Send a request, and read its answer."""
+        asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
+        response = await self.request(call.method, call.path, repeat=call.repeat, **asked)
+        return call.read(response)
+
+    def _listed(self, listing: Listing[Row]) -> "AsyncItems[Row]":
+        """The items of a long list."""
+        return AsyncItems(self, listing)
+
     async def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
         """The answer to a GET as a model."""
-        found: T = decoded(await self.request("GET", path, query=query), kind)
-        return found
+        return decoded(await self.request("GET", path, query=query), kind)
 
     async def post(
         self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED
     ) -> T:
         """The answer to a POST of JSON as a model."""
-        found: T = decoded(await self.request("POST", path, body=body, repeat=repeat), kind)
-        return found
+        return decoded(await self.request("POST", path, body=body, repeat=repeat), kind)
+
+
+class AsyncItems(Generic[Row]):
+    """The items of a list: iterate over it, more than once if you like.
+
+    What is recorded meanwhile neither repeats nor hides items.
+    """
+
+    def __init__(self, connection: AsyncConnection, listing: Listing[Row]) -> None:
+        self._connection, self._listing = connection, listing
+
+    async def __aiter__(self) -> AsyncIterator[Row]:
+        page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
+        query = {"limit": ITEMS_A_PAGE, **self._listing.query}
+        while True:
+            page = await self._connection.get(page_kind, self._listing.path, query)
+            for item in page.items:
+                yield item
+            if page.next_cursor is None:
+                return
+            query["cursor"] = page.next_cursor
+
+    async def all(self) -> list[Row]:
+        """Every item."""
+        return [item async for item in self]
+
+    async def to_arrow(self) -> "pa.Table":
+        """A table with a row for each item; raises `PackageMissing` without pyarrow."""
+        return table_of(await self.all(), self._listing.kind)
+
+    async def to_pandas(self) -> "pd.DataFrame":
+        """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""
+        return pandas_of(await self.to_arrow())

@@ -4,10 +4,9 @@ import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 
-from ..base import Page
+from .. import models
 from ..encoding import decoded, path_of, pieces_of
 from ..errors import ReplayEnded
-from ..models import Replay, Run, RunState
 from ..retrying import Repeat
 from .backend import Source, iterated, sleep
 from .connection import AsyncConnection
@@ -23,17 +22,6 @@ corrects that with its next lines, which a busy machine may take a while for."""
 class AsyncReplays(AsyncConnection):
     """The part of the client that is about runs and replays."""
 
-    async def runs(self) -> list[Run]:
-        """Every run with batches."""
-        page = await self.get(Page[Run], path_of("runs"))
-        return page.items
-
-    async def watch_run(self, run: str, *, alarms: bool = True) -> RunState:
-        """Switch the alarms of a run on or off; creates the run if it does not exist."""
-        response = await self.request("PUT", path_of("runs", run), body={"alarms": alarms})
-        found: RunState = decoded(response, RunState)
-        return found
-
     async def replay(
         self,
         lines: Path | bytes | Source[bytes],
@@ -42,8 +30,8 @@ class AsyncReplays(AsyncConnection):
         alarms: bool = False,
         packets: bool = False,
         spacecraft: str | None = None,
-        progress: Callable[[Replay], object] = lambda replay: None,
-    ) -> Replay:
+        progress: Callable[[models.Replay], object] = lambda replay: None,
+    ) -> models.Replay:
         """Send a telemetry file as one replay and follow it to its end.
 
         `progress` is called with each state.  A file that is sent twice is recorded once.  Raises
@@ -72,7 +60,7 @@ class AsyncReplays(AsyncConnection):
         alarms: bool = False,
         packets: bool = False,
         spacecraft: str | None = None,
-    ) -> Replay:
+    ) -> models.Replay:
         """Send a telemetry file as one replay, which the service works on in the background.
 
         `lines` is a file, or its bytes in one or many pieces: NDJSON, or with `packets` a tar
@@ -89,30 +77,21 @@ class AsyncReplays(AsyncConnection):
             # Pieces can be read once only, and a second replay would do the same work.
             repeat=Repeat.NEVER,
         )
-        found: Replay = decoded(response, Replay)
-        return found
+        return decoded(response, models.Replay)
 
-    async def follow_replay(self, id: str, *, every_s: float = POLL_S) -> AsyncIterator[Replay]:
+    async def follow_replay(
+        self, id: str, *, every_s: float = POLL_S
+    ) -> AsyncIterator[models.Replay]:
         """The states of a replay until it ends; the last one tells how.
 
         A restart of the service in between is waited for.
         """
         running_s = time.monotonic()
         while True:
-            state = await self.get(Replay, path_of("replays", id))
+            state = await self.get(models.Replay, path_of("replays", id))
             yield state
             if state.state in ("running", "waiting"):
                 running_s = time.monotonic()
             elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
                 return
             await sleep(every_s)
-
-    async def replays(self) -> list[Replay]:
-        """The latest hundred replays, newest first."""
-        page = await self.get(Page[Replay], path_of("replays"))
-        return page.items
-
-    async def cancel_replay(self, id: str) -> Replay:
-        """Cancel a replay; what it recorded stays.  Raises `WrongState` where it has ended."""
-        found: Replay = decoded(await self.request("DELETE", path_of("replays", id)), Replay)
-        return found

@@ -1,48 +1,19 @@
-"""Batches: submit them, read their results, try other options."""
+"""Batches: submit many of them, try other options."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, Literal, overload
 
-from ..base import Outcome, Status
-from ..encoding import Batch, Time, decoded, path_of
+from .. import models
+from ..encoding import Batch, path_of
 from ..errors import Problem
-from ..models import Answer, Picture, Result, Summary, WhatIf
-from ..outcomes import BatchOutcome, RecordedAnswer
+from ..operations import BatchOutcome, Results
 from ..retrying import Repeat
 from .backend import Source, bounded_map
 from .connection import Connection
-from .pages import Items
 
 
-class Batches(Connection):
-    """The part of the client that is about batches."""
-
-    def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> Answer:
-        """Identify the stars of a batch, solve for the attitude, and record both.
-
-        Spacecraft, run and batch id identify the batch: to send it again is harmless, and gives
-        the first answer.  Raises `BadInput` naming each field, `Conflict` where another body has
-        this batch id.
-
-        >>> answer = client.submit(batch)
-        >>> answer.counts.unique, answer.attitude.status
-        (4, 'good')
-        """
-        recorded = self.submit_json(batch, idempotency_key=idempotency_key)
-        return recorded.answer
-
-    def submit_json(self, batch: Batch, *, idempotency_key: str | None = None) -> RecordedAnswer:
-        """The same, with the answer as it is recorded, and whether it was recorded before.
-
-        >>> recorded = client.submit_json(batch)
-        >>> recorded.replayed
-        True
-        """
-        headers = {} if idempotency_key is None else {"Idempotency-Key": idempotency_key}
-        response = self.request(
-            "POST", path_of("batches"), body=batch, headers=headers, repeat=Repeat.ALWAYS
-        )
-        return RecordedAnswer(response.content, response.headers.get("Replayed") == "true")
+class Batches(Results, Connection):
+    """The part of the client that is about many batches, and what-ifs."""
 
     def submit_many(self, batches: Source[Batch], *, at_once: int = 8) -> Iterator[BatchOutcome]:
         """Submit batches as they are taken from `batches`, at most `at_once` at a time.
@@ -63,62 +34,24 @@ class Batches(Connection):
             return BatchOutcome(batch, None, problem)
         return BatchOutcome(batch, recorded, None)
 
-    def batches(
-        self,
-        spacecraft: str | None = None,
-        *,
-        run: str = "live",
-        start: Time | None = None,
-        end: Time | None = None,
-        outcome: Outcome | None = None,
-        status: Status | Literal["no_attitude"] | None = None,
-        batch: str | None = None,
-    ) -> Items[Summary]:
-        """The current results of recorded batches, newest first by batch time.
-
-        `run` is `*` for all runs; `end` is excluded; `outcome` asks for at least one such star.
-
-        >>> [found.batch for found in client.batches("XTE")]
-        ['1996-010-0110']
-        """
-        query = {
-            "spacecraft": spacecraft,
-            "run": run,
-            "start": start,
-            "end": end,
-            "outcome": outcome,
-            "status": status,
-            "batch": batch,
-        }
-        return Items(self, Summary, path_of("batches"), query)
-
-    def batch(self, id: str) -> Result:
-        """One recorded result with its batch; raises `NotFound`."""
-        return self.get(Result, path_of("batches", id))
-
-    def latest(self, spacecraft: str, *, run: str = "live") -> Result:
-        """The newest result of a spacecraft by batch time; raises `NotFound` without a batch.
-
-        >>> latest = client.latest("XTE")
-        >>> latest.answer.attitude.status
-        'good'
-        """
-        return self.get(Result, path_of("spacecraft", spacecraft, "latest"), {"run": run})
-
     @overload
-    def what_if(self, id: str, options: Mapping[str, Any], *, record: Literal[True]) -> Answer: ...
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[True]
+    ) -> models.Answer: ...
 
     @overload
     def what_if(
         self, id: str, options: Mapping[str, Any], *, record: Literal[False] = False
-    ) -> WhatIf: ...
+    ) -> models.WhatIf: ...
 
     @overload
-    def what_if(self, id: str, options: Mapping[str, Any], *, record: bool) -> Answer | WhatIf: ...
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool
+    ) -> models.Answer | models.WhatIf: ...
 
     def what_if(
         self, id: str, options: Mapping[str, Any], *, record: bool = False
-    ) -> Answer | WhatIf:
+    ) -> models.Answer | models.WhatIf:
         """Process a recorded batch again with other options; `record` keeps the result beside it.
 
         >>> latest = client.latest("XTE")
@@ -129,39 +62,5 @@ class Batches(Connection):
         body = {"options": dict(options), "record": record}
         path = path_of("batches", id, "what-if")
         if record:
-            return self.post(Answer, path, body)
-        return self.post(WhatIf, path, body, Repeat.ALWAYS)
-
-    def adopt(self, id: str, options: Mapping[str, Any]) -> Answer:
-        """Process a recorded batch again, and let the result stand for the batch.
-
-        >>> latest = client.latest("XTE")
-        >>> adopted = client.adopt(latest.answer.id, {"identifier": "verified"})
-        >>> found = client.batch(adopted.id)
-        >>> found.current
-        True
-        """
-        body = {"options": dict(options), "adopt": True}
-        return self.post(Answer, path_of("batches", id, "what-if"), body)
-
-    def solve_picture(
-        self,
-        picture: bytes,
-        *,
-        spacecraft: str | None = None,
-        field_of_view_deg: float | None = None,
-    ) -> Picture:
-        """Find the attitude, the lens and the stars of a picture of any camera; records nothing.
-
-        `picture` is the content of its file; a `spacecraft` is the one whose camera took it.
-        """
-        response = self.request(
-            "POST",
-            path_of("pictures"),
-            query={"spacecraft": spacecraft, "field_of_view_deg": field_of_view_deg},
-            content=picture,
-            headers={"Content-Type": "application/octet-stream"},
-            repeat=Repeat.ALWAYS,
-        )
-        found: Picture = decoded(response, Picture)
-        return found
+            return self.post(models.Answer, path, body)
+        return self.post(models.WhatIf, path, body, Repeat.ALWAYS)

@@ -1,19 +1,29 @@
-"""Sending requests: again where that may help, and only where it is safe."""
+"""Sending requests, again where that may help and is safe; lists, read page by page."""
 
 import ssl
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Self, TypeVar
 
 import httpx
+import msgspec
 
+from ..base import Page
+from ..calls import Call, Listing
 from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
+from ..tables import pandas_of, table_of
 from .backend import sleep
 
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
 T = TypeVar("T")
+Row = TypeVar("Row", bound=msgspec.Struct)
+
+ITEMS_A_PAGE = 500
 
 CONNECT_S = 5.0
 JSON = {"Content-Type": "application/json"}
@@ -47,12 +57,7 @@ class Connection:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -127,12 +132,52 @@ class Connection:
                 raise problem_of(response)
             yield response.iter_bytes()
 
+    def _carry_out(self, call: Call[T]) -> T:
+        """Send a request, and read its answer."""
+        asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
+        response = self.request(call.method, call.path, repeat=call.repeat, **asked)
+        return call.read(response)
+
+    def _listed(self, listing: Listing[Row]) -> "Items[Row]":
+        """The items of a long list."""
+        return Items(self, listing)
+
     def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
         """The answer to a GET as a model."""
-        found: T = decoded(self.request("GET", path, query=query), kind)
-        return found
+        return decoded(self.request("GET", path, query=query), kind)
 
     def post(self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED) -> T:
         """The answer to a POST of JSON as a model."""
-        found: T = decoded(self.request("POST", path, body=body, repeat=repeat), kind)
-        return found
+        return decoded(self.request("POST", path, body=body, repeat=repeat), kind)
+
+
+class Items(Generic[Row]):
+    """The items of a list: iterate over it, more than once if you like.
+
+    What is recorded meanwhile neither repeats nor hides items.
+    """
+
+    def __init__(self, connection: Connection, listing: Listing[Row]) -> None:
+        self._connection, self._listing = connection, listing
+
+    def __iter__(self) -> Iterator[Row]:
+        page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
+        query = {"limit": ITEMS_A_PAGE, **self._listing.query}
+        while True:
+            page = self._connection.get(page_kind, self._listing.path, query)
+            yield from page.items
+            if page.next_cursor is None:
+                return
+            query["cursor"] = page.next_cursor
+
+    def all(self) -> list[Row]:
+        """Every item."""
+        return list(self)
+
+    def to_arrow(self) -> "pa.Table":
+        """A table with a row for each item; raises `PackageMissing` without pyarrow."""
+        return table_of(self.all(), self._listing.kind)
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""
+        return pandas_of(self.to_arrow())

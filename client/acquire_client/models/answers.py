@@ -1,4 +1,4 @@
-"""The answer to a batch, and recorded results.
+"""The answer to a batch, recorded results, pictures, and tracks of unexplained stars.
 
 Quaternions have the scalar last and transform inertial (EME2000) into body components.  Times
 are UTC in calendar form, as text: they may be in a leap second and have nanoseconds.
@@ -269,3 +269,121 @@ class Result(Model, frozen=True, kw_only=True):
     archived: bool
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None
+
+
+class PictureAttitude(Model, frozen=True, kw_only=True):
+    """The attitude of a picture; the quaternion turns ICRS into the camera's axes."""
+
+    status: str
+    quaternion: Sequence[float]
+    sigma_arcsec: Sequence[float]
+    ra_deg: float
+    dec_deg: float
+    roll_deg: float
+    aberration: str
+    log_odds: float
+
+
+class PictureLens(Model, frozen=True, kw_only=True):
+    """The lens that fits a picture; None: the sigma of a parameter that was not fitted."""
+
+    field_deg: Sequence[float]
+    focal_px: float
+    focal_sigma_px: float | None
+    distortion_corner: float
+    distortion_sigma: float | None
+    center_px: Sequence[float]
+    center_sigma_px: float | None
+
+
+class PictureStar(Model, frozen=True, kw_only=True):
+    """A star on a picture; the residual is its place less the expected one."""
+
+    id: str
+    name: str | None
+    v_mag: float
+    u_px: float
+    v_px: float
+    residual_px: Sequence[float]
+
+
+class Picture(Model, frozen=True, kw_only=True):
+    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
+
+    width_px: int
+    height_px: int
+    candidates: int
+    psf_sigma_px: float
+    noise_counts: float
+    attitude: PictureAttitude | None
+    orientation: str
+    remarks: Sequence[str]
+    time: str | None
+    exposure_s: float | None
+    lens: PictureLens | None
+    residual_rms_px: float | None
+    sigma_scale: float | None
+    shared_error_px: float | None
+    zero_point_mag: float | None
+    zero_point_sigma_mag: float | None
+    stars: Sequence[PictureStar]
+    overlay_png: str | None = None
+
+
+class TrackPoint(Model, frozen=True):
+    """A point of a track: the result, the tracker, and its place among the tracker's stars."""
+
+    id: str
+    tracker: str
+    star: int
+    time: str
+    ra_deg: float
+    dec_deg: float
+    magnitude: float | None
+
+
+class Track(Model, frozen=True, kw_only=True):
+    """Points that move together; direction and rate hold for `time`, the middle.
+
+    `kind` is moving, planet, fixed_on_sky, fixed_on_detector or fixed.  Components along right
+    ascension are on the sky: with the cosine of the declination.
+    """
+
+    kind: str
+    planet: str | None
+    planet_offset_arcsec: float | None
+    first: str
+    last: str
+    time: str
+    ra_deg: float
+    dec_deg: float
+    sigma_ra_arcsec: float
+    sigma_dec_arcsec: float
+    rate_ra_arcsec_per_s: float
+    rate_dec_arcsec_per_s: float
+    sigma_rate_ra_arcsec_per_s: float
+    sigma_rate_dec_arcsec_per_s: float
+    rate_arcsec_per_s: float
+    sigma_rate_arcsec_per_s: float
+    magnitude: float | None
+    sigma_magnitude: float | None
+    chi_square: float
+    degrees_of_freedom: int
+    log10_expected: float
+    points: list[TrackPoint]
+
+
+class TrackList(Model, frozen=True, kw_only=True):
+    """The tracks of a period, those of most points first.
+
+    `unexplained` counts the unmatched stars of batches with an attitude, `linked` those of them
+    that are points of a track.
+    """
+
+    spacecraft: str
+    run: str
+    batches: int
+    without_attitude: int
+    unexplained: int
+    linked: int
+    items: list[Track]

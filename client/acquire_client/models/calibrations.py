@@ -120,9 +120,7 @@ class CalibrationResult(Model, frozen=True, kw_only=True):
     mission_file: str
 
 
-class CalibrationSummary(Model, frozen=True, kw_only=True):
-    """A calibration without its covariance and residual maps."""
-
+class _CalibrationFields(Model, frozen=True, kw_only=True):
     id: str
     spacecraft: str
     version: int
@@ -135,6 +133,11 @@ class CalibrationSummary(Model, frozen=True, kw_only=True):
     total: int
     mission: str
     fault: str | None
+
+
+class CalibrationSummary(_CalibrationFields, frozen=True, kw_only=True):
+    """A calibration without its covariance and residual maps."""
+
     residual_over_sigma: float | None
     degree: int | None
     first: str | None
@@ -143,28 +146,16 @@ class CalibrationSummary(Model, frozen=True, kw_only=True):
     trackers: list[TrackerGeometry]
 
 
-class Calibration(Model, frozen=True, kw_only=True):
+class Calibration(_CalibrationFields, frozen=True, kw_only=True):
     """A calibration; `result` and `covariance` are None until it is done."""
 
-    id: str
-    spacecraft: str
-    version: int
-    run: str
-    state: str
-    who: str
-    created: str
-    ended: str | None
-    done: int
-    total: int
-    mission: str
     request: dict[str, Any]
-    fault: str | None
     result: CalibrationResult | None
     covariance: list[list[float]] | None
 
 
-class CalibrationAdoption(Model, frozen=True, kw_only=True):
-    """A change of the calibration in force; `calibration` is None for the mission file."""
+class CalibrationChange(Model, frozen=True, kw_only=True):
+    """A change of the calibration in force; `calibration` is None where it is the mission file."""
 
     id: str
     spacecraft: str
@@ -173,8 +164,13 @@ class CalibrationAdoption(Model, frozen=True, kw_only=True):
     note: str
     calibration: str | None
     version: int | None
-    file: str
     mission: str
+
+
+class CalibrationAdoption(CalibrationChange, frozen=True, kw_only=True):
+    """A change of the calibration in force, with the settings that it brought."""
+
+    file: str
     trackers: list[TrackerGeometry] | None
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 from ..base import Model, Status
 from .answers import StarCounts
-from .replays import ReplayCounts, ReplayLines
 
 
 class LatestBatch(Model, frozen=True, kw_only=True):
@@ -64,19 +63,6 @@ class AnnotationChange(Model, frozen=True, kw_only=True):
     deleted: bool
 
 
-class ReplayProgress(Model, frozen=True, kw_only=True):
-    """A replay and how far it is; see `Replay`."""
-
-    id: str
-    run: str
-    name: str
-    state: str
-    lines: ReplayLines
-    counts: ReplayCounts
-    started: str
-    finished: str | None
-
-
 class TrackingChange(Model, frozen=True, kw_only=True):
     """A change of the tracking state of a spacecraft at a batch; None: not tracked."""
 
@@ -87,16 +73,3 @@ class TrackingChange(Model, frozen=True, kw_only=True):
     time: str
     state: str | None
     before: str | None
-
-
-class CalibrationChange(Model, frozen=True, kw_only=True):
-    """A change of the calibration in force; `calibration` is None where it is the mission file."""
-
-    id: str
-    spacecraft: str
-    adopted: str
-    who: str
-    note: str
-    calibration: str | None
-    version: int | None
-    mission: str

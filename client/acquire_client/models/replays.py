@@ -100,13 +100,8 @@ class ReplayPackets(Model, frozen=True):
     without_attitude: int = 0
 
 
-class Replay(Model, frozen=True):
-    """A replay and its progress.
-
-    `state` is running, waiting, done, interrupted, failed or cancelled; one that is waiting goes
-    on by itself once the service is ready after a restart.  `errors` has the first thousand
-    refused lines; the last error of a failed replay is the reason.
-    """
+class ReplayProgress(Model, frozen=True):
+    """A replay and how far it is; see `Replay`."""
 
     id: str
     run: str
@@ -116,6 +111,16 @@ class Replay(Model, frozen=True):
     counts: ReplayCounts
     started: str
     finished: str | None
+
+
+class Replay(ReplayProgress, frozen=True):
+    """A replay and its progress.
+
+    `state` is running, waiting, done, interrupted, failed or cancelled; one that is waiting goes
+    on by itself once the service is ready after a restart.  `errors` has the first thousand
+    refused lines; the last error of a failed replay is the reason.
+    """
+
     packets: ReplayPackets | None
     errors: Sequence[RefusedLine]
 

@@ -1,19 +1,17 @@
 """`acquire archive`: old batches in Parquet files, verified before they leave the database."""
 
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    add_subcommands,
-    print_json,
+from service.cli import arguments
+from service.cli.configuration import (
+    period_of,
+    progress_bar,
+    settings_of,
+    settings_of_existing,
 )
-from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
 FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
@@ -21,62 +19,34 @@ FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "archive",
-        "Move the batches before a time to an archive: a folder of Parquet files.  Each file is "
-        "compared with the record before its batches are deleted.  Trends, and the recognition of "
-        "repeats, stay in the database; gyro blocks stay too.  After an interruption, run the "
-        "same command again to continue.  With SQLite, stop the service first.",
-        """
-        acquire archive --before 1996-01-01T00:00:00Z --to /archive
-        acquire archive verify --archive /archive
-        acquire archive restore --archive /archive --spacecraft XTE --start 1996-010T00:00:00Z
-        """,
-        archive,
-    )
+    parser = arguments.add_command(commands, "archive", archive)
     parser.add_argument("--before", metavar="UTC", help="archive batches before this batch time")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help=FOLDER)
-    add_json(parser, "the counts")
-    add_database(parser)
-    group = add_subcommands(parser)
-    verified = add_command(
-        group,
-        "verify",
-        "Read every file of an archive and report faults; exit code 1 if there is one.  With "
-        "--database, also report files that the database needs and the archive lacks.",
-        """
-        acquire archive verify --archive /archive
-        acquire archive verify --archive /archive --database sqlite:///acquire.db
-        """,
-        verify,
-    )
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
+    group = arguments.add_subcommands(parser)
+    verified = arguments.add_command(group, "verify", verify)
     verified.add_argument("--archive", dest="folder", type=Path, metavar="FOLDER", help=FOLDER)
-    add_json(verified, "the faults")
-    add_database(verified)
-    restored = add_command(
-        group,
-        "restore",
-        "Record archived batches again, also in another database, byte for byte.  Files that have "
-        "a batch of the period are restored whole; they stay in the archive.  With SQLite, stop "
-        "the service first.",
-        """
-        acquire archive restore --archive /archive --spacecraft XTE
-        acquire archive restore --archive /archive --database sqlite:///again.db
-        """,
-        restore,
-    )
+    arguments.add_json(verified, "the faults")
+    arguments.add_database(verified)
+    restored = arguments.add_command(group, "restore", restore)
     restored.add_argument("--archive", dest="folder", type=Path, metavar="FOLDER", help=FOLDER)
-    restored.add_argument("--spacecraft", metavar="NAME", help=MISSION)
-    add_period(restored, "only this run; default: all runs")
-    add_json(restored, "the counts")
-    add_database(restored)
+    restored.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(restored, "only this run; default: all runs")
+    arguments.add_json(restored, "the counts")
+    arguments.add_database(restored)
 
 
 def archive(parsed: Namespace) -> int:
-    """Move old batches to the archive."""
-    from tqdm import tqdm
+    """Move the batches before a time to an archive: a folder of Parquet files.  Each file is
+    compared with the record before its batches are deleted.  Trends, and the recognition of
+    repeats, stay in the database; gyro blocks stay too.  After an interruption, run the same
+    command again to continue.  With SQLite, stop the service first.
 
+    acquire archive --before 1996-01-01T00:00:00Z --to /archive
+    acquire archive verify --archive /archive
+    acquire archive restore --archive /archive --spacecraft XTE --start 1996-010T00:00:00Z
+    """
     from service.extras import require_extra
     from service.storage.store import Store
     from service.times import parse_utc, utc_now
@@ -91,24 +61,14 @@ def archive(parsed: Namespace) -> int:
     from service.storage.projections.projector import projected
     from service.storage.upkeep import archiving
 
-    settings = settings_of_existing(parsed)
-    store = Store(settings.database, create=False)
-    try:
+    with closing(Store(settings_of_existing(parsed).database, create=False)) as store:
         store.require_writing()
-        with (
-            projected(store),
-            tqdm(total=None, unit=" batches", desc="archiving", disable=None, leave=False) as b,
-        ):
-
-            def step(archived: archiving.Archived) -> None:
-                b.total = archived.total
-                b.update(archived.batches - b.n)
-
-            done = archiving.archive(store, folder, before, step=step)
-    finally:
-        store.close()
+        with projected(store), progress_bar("batches", "archiving") as bar:
+            done = archiving.archive(
+                store, folder, before, step=lambda done: bar(done.batches, done.total)
+            )
     if parsed.json:
-        print_json({"batches": done.batches, "files": done.parts, "bytes": done.bytes})
+        arguments.print_json({"batches": done.batches, "files": done.parts, "bytes": done.bytes})
     else:
         print(f"{done.batches} batches before {before.text} were archived")
         print(f"{done.parts} files, {done.bytes} bytes, in {folder}")
@@ -116,9 +76,12 @@ def archive(parsed: Namespace) -> int:
 
 
 def verify(parsed: Namespace) -> int:
-    """Tell what is wrong with an archive."""
-    from tqdm import tqdm
+    """Read every file of an archive and report faults; exit code 1 if there is one.  With
+    --database, also report files that the database needs and the archive lacks.
 
+    acquire archive verify --archive /archive
+    acquire archive verify --archive /archive --database sqlite:///acquire.db
+    """
     from service.extras import require_extra
 
     folder = _folder(parsed.folder, "--archive")
@@ -126,29 +89,26 @@ def verify(parsed: Namespace) -> int:
     from service.storage.upkeep.restoring import verify_archive
 
     needed = {} if parsed.database is None else _parts(parsed)
-    seen = 0
-    with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
-
-        def step(batches: int) -> None:
-            nonlocal seen
-            bar.update(batches - seen)
-            seen = batches
-
-        problems = list(verify_archive(folder, needed, step))
+    with progress_bar("batches", "reading") as bar:
+        problems = list(verify_archive(folder, needed, bar))
     if parsed.json:
-        print_json({"batches": seen, "faults": problems})
+        arguments.print_json({"batches": bar.done, "faults": problems})
         return 1 if problems else 0
     for problem in problems:
         print(problem)
     if not problems:
-        print(f"nothing is wrong with {seen} batches")
+        print(f"nothing is wrong with {bar.done} batches")
     return 1 if problems else 0
 
 
 def restore(parsed: Namespace) -> int:
-    """Record archived batches again."""
-    from tqdm import tqdm
+    """Record archived batches again, also in another database, byte for byte.  Files that have a
+    batch of the period are restored whole; they stay in the archive.  With SQLite, stop the
+    service first.
 
+    acquire archive restore --archive /archive --spacecraft XTE
+    acquire archive restore --archive /archive --database sqlite:///again.db
+    """
     from service.extras import require_extra
     from service.storage.store import Store
 
@@ -158,21 +118,14 @@ def restore(parsed: Namespace) -> int:
 
     start, end = period_of(parsed)
     selected = restoring.PartFilter(parsed.spacecraft, parsed.run, start, end)
-    settings = settings_of(parsed)
-    store = Store(settings.database)
-    try:
+    with closing(Store(settings_of(parsed).database)) as store:
         store.require_writing()
-        with tqdm(total=None, unit=" batches", desc="restoring", disable=None, leave=False) as b:
-
-            def step(restored: restoring.Restored) -> None:
-                b.total = restored.total
-                b.update(restored.batches - b.n)
-
-            done = restoring.restore(store, folder, selected, step=step)
-    finally:
-        store.close()
+        with progress_bar("batches", "restoring") as bar:
+            done = restoring.restore(
+                store, folder, selected, step=lambda done: bar(done.batches, done.total)
+            )
     if parsed.json:
-        print_json({"batches": done.batches, "restored": done.restored})
+        arguments.print_json({"batches": done.batches, "restored": done.restored})
     else:
         before = done.batches - done.restored
         print(f"{done.restored} batches were restored; {before} were recorded already")
@@ -195,9 +148,8 @@ def _parts(parsed: Namespace) -> dict[str, str]:
     from service.storage.archive.reading import archived_paths
     from service.storage.store import Readers
 
-    readers = Readers(settings_of_existing(parsed).database)
-    try:
-        with readers.reading() as connection:
-            return archived_paths(connection)
-    finally:
-        readers.close()
+    with (
+        closing(Readers(settings_of_existing(parsed).database)) as readers,
+        readers.reading() as connection,
+    ):
+        return archived_paths(connection)

@@ -1,19 +1,17 @@
 """`acquire calibrate`: alignment, distortion and clocks of trackers from recorded batches."""
 
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    count,
-    print_json,
+from service.cli import arguments
+from service.cli.configuration import (
+    period_of,
+    progress_bar,
+    settings_of,
+    settings_of_existing,
 )
-from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
@@ -25,24 +23,9 @@ RECORDED_BY = "acquire calibrate"
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "calibrate",
-        "Estimate, from the identified stars of recorded batches, the alignment between trackers, "
-        "and each tracker's scale, distortion, magnitudes and time tags, with sigmas.  Name the "
-        "unknowns that these stars cannot determine.  Write a mission file with the result, or "
-        "record it for the console, where an operator can adopt it.  Change nothing that is in "
-        "use.",
-        """
-        acquire calibrate TWOHEADS
-        acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
-        acquire calibrate TWOHEADS --record
-        acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
-        """,
-        run,
-    )
-    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
-    add_period(parser, "the run to use; default live")
+    parser = arguments.add_command(commands, "calibrate", run)
+    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
+    arguments.add_period(parser, "the run to use; default live")
     parser.add_argument(
         "--tracker",
         action="append",
@@ -64,7 +47,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--sample",
-        type=count,
+        type=arguments.count,
         default=2000,
         metavar="N",
         help="maximum number of batches to use, taken from the whole period; default 2000",
@@ -81,15 +64,22 @@ def add(commands: Any) -> None:
         action="store_true",
         help="record the result as the spacecraft's next version, to be tried and adopted",
     )
-    add_json(parser, "the result")
+    arguments.add_json(parser, "the result")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Estimate, print, and write the mission file if asked to."""
-    from tqdm import tqdm
+    """Estimate, from the identified stars of recorded batches, the alignment between trackers, and
+    each tracker's scale, distortion, magnitudes and time tags, with sigmas.  Name the unknowns
+    that these stars cannot determine.  Write a mission file with the result, or record it for
+    the console, where an operator can adopt it.  Change nothing that is in use.
 
+    acquire calibrate TWOHEADS
+    acquire calibrate TWOHEADS --run commissioning --output twoheads-new.toml
+    acquire calibrate TWOHEADS --record
+    acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
+    """
     from service.app.calibration_estimates import CalibrationRequest
     from service.app.factory import open_app
     from service.cli.texts import calibration_json, calibration_text
@@ -106,26 +96,17 @@ def run(parsed: Namespace) -> int:
         time_tag=parsed.time_tag,
         sample=parsed.sample,
     )
-    app = open_app(settings_of_existing(parsed), reads_only=not parsed.record)
     recorded = None
-    try:
-        mission = mission_named(app.missions, parsed.spacecraft)
-        wanted.require(mission, "--tracker")
-        with tqdm(
-            total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
-        ) as bar:
-
-            def step(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(1)
-
-            result = app.calibrations.of_spacecraft(wanted, step)
+    with closing(open_app(settings_of_existing(parsed), reads_only=not parsed.record)) as app:
+        wanted.require(mission_named(app.missions, parsed.spacecraft), "--tracker")
+        with progress_bar("batches", "running again", parsed.quiet, leave=True) as bar:
+            result = app.calibrations.of_spacecraft(
+                wanted, lambda done, total: bar(bar.done + 1, total)
+            )
         if parsed.record:
             recorded = app.calibrations.record(wanted, result, RECORDED_BY)
-    finally:
-        app.close()
     if parsed.json:
-        print_json(calibration_json(result))
+        arguments.print_json(calibration_json(result))
     else:
         print(calibration_text(result))
         if recorded is not None:
@@ -136,7 +117,6 @@ def run(parsed: Namespace) -> int:
 
 
 def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
-    """Write the spacecraft's mission file, changed by the calibration, to another file."""
     from service.calibration.mission_file import calibrated_mission_text
 
     source = _mission_file(parsed)

@@ -25,19 +25,7 @@ def add(commands: Any) -> None:
         "Cameras: from pictures of the sky to a mission file.",
         "acquire camera calibrate pictures/*.jpg -o missions/mycam.toml",
     )
-    parser = add_command(
-        group,
-        "calibrate",
-        "Fit focal length, optical centre and radial distortion to pictures of the sky, measure "
-        "star images, noise and zero point, and write the mission file of the camera.  A few "
-        "pictures of different fields are enough; no information about them is needed.  Residual "
-        "maps before and after are written beside the mission file.",
-        """
-        acquire camera calibrate pictures/*.jpg -o missions/mycam.toml
-        acquire camera calibrate a.png b.png c.png --fov 12 --name MYCAM -o mycam.toml
-        """,
-        run,
-    )
+    parser = add_command(group, "calibrate", run)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument(
         "-o", "--output", type=Path, required=True, metavar="CAMERA.toml", help="mission file"
@@ -53,7 +41,14 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Calibrate, write the files and print the result; 1 where a picture could not be used."""
+    """Fit focal length, optical centre and radial distortion to pictures of the sky, measure star
+    images, noise and zero point, and write the mission file of the camera.  A few pictures of
+    different fields are enough; no information about them is needed.  Residual maps before and
+    after are written beside the mission file.
+
+    acquire camera calibrate pictures/*.jpg -o missions/mycam.toml
+    acquire camera calibrate a.png b.png c.png --fov 12 --name MYCAM -o mycam.toml
+    """
     from service.acquire.camera_calibration import calibrate_camera
     from service.acquire.picture import blind_sky
     from service.sky.catalog.star_catalog import open_catalog

@@ -24,16 +24,7 @@ def add(commands: Any) -> None:
         acquire catalog export --spacecraft XTE --epoch 1996 xte-1996.csv
         """,
     )
-    parser = add_command(
-        group,
-        "build",
-        "Build the embedded catalog from its source packages (only in a checkout).",
-        """
-        acquire catalog build
-        acquire catalog build downloads/ stars.npz
-        """,
-        build,
-    )
+    parser = add_command(group, "build", build)
     parser.add_argument(
         "packages",
         type=Path,
@@ -42,19 +33,7 @@ def add(commands: Any) -> None:
         help="folder with the source packages; default: ./packages",
     )
     parser.add_argument("output", type=Path, nargs="?", help="default: the file in the checkout")
-    parser = add_command(
-        group,
-        "import",
-        "Check your own catalog and convert it for the service: CSV (id, ra_deg, dec_deg, "
-        "magnitude), or fixed-width records of SKYMAP's SKY2000 (CDS V/109), whose numbers "
-        "become the stars' ids.",
-        """
-        acquire catalog import skymap.csv
-        acquire catalog import sky2kv4.dat.gz skymap.npz
-        ACQUIRE_CATALOG=skymap.npz acquire serve
-        """,
-        import_catalog,
-    )
+    parser = add_command(group, "import", import_catalog)
     parser.add_argument("file", type=Path, metavar="FILE", help="SKY2000 may be compressed by gzip")
     parser.add_argument(
         "output", type=Path, nargs="?", metavar="OUT.npz", help="default: FILE's name with .npz"
@@ -62,27 +41,8 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--format", choices=("csv", "sky2000"), help="default: recognised from the first bytes"
     )
-    for name, function, summary, what in (
-        (
-            "export",
-            export,
-            "Write the run catalog of an epoch: exactly the stars that the identifier uses.",
-            "used",
-        ),
-        (
-            "rejected",
-            rejected,
-            "Write the stars that a run catalog rejects, with the reasons.",
-            "rejected",
-        ),
-    ):
-        parser = add_command(
-            group,
-            name,
-            summary,
-            f"acquire catalog {name} --spacecraft SOHO --epoch 1996 {what}.csv",
-            function,
-        )
+    for function in (export, rejected):
+        parser = add_command(group, function.__name__, function)
         parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
         parser.add_argument(
             "--epoch",
@@ -95,7 +55,11 @@ def add(commands: Any) -> None:
 
 
 def build(parsed: Namespace) -> int:
-    """Build the embedded catalog, where its build is at hand."""
+    """Build the embedded catalog from its source packages (only in a checkout).
+
+    acquire catalog build
+    acquire catalog build downloads/ stars.npz
+    """
     try:
         from catalogs.build import HERE
         from catalogs.build import build as build_catalog
@@ -113,7 +77,13 @@ def build(parsed: Namespace) -> int:
 
 
 def import_catalog(parsed: Namespace) -> int:
-    """Check a site's catalog and store it."""
+    """Check your own catalog and convert it for the service: CSV (id, ra_deg, dec_deg, magnitude),
+    or fixed-width records of SKYMAP's SKY2000 (CDS V/109), whose numbers become the stars' ids.
+
+    acquire catalog import skymap.csv
+    acquire catalog import sky2kv4.dat.gz skymap.npz
+    ACQUIRE_CATALOG=skymap.npz acquire serve
+    """
     from tqdm import tqdm
 
     from service.sky.catalog.star_catalog import catalog_format, import_csv, import_sky2000, save
@@ -137,7 +107,10 @@ def import_catalog(parsed: Namespace) -> int:
 
 
 def export(parsed: Namespace) -> int:
-    """Write a run catalog."""
+    """Write the run catalog of an epoch: exactly the stars that the identifier uses.
+
+    acquire catalog export --spacecraft SOHO --epoch 1996 used.csv
+    """
     from service.sky.catalog.run_catalog import export_csv
 
     run_catalog = _run_catalog(parsed)
@@ -147,7 +120,10 @@ def export(parsed: Namespace) -> int:
 
 
 def rejected(parsed: Namespace) -> int:
-    """Write what a run catalog leaves out."""
+    """Write the stars that a run catalog rejects, with the reasons.
+
+    acquire catalog rejected --spacecraft SOHO --epoch 1996 rejected.csv
+    """
     from service.sky.catalog.run_catalog import export_rejected_csv
 
     run_catalog = _run_catalog(parsed)

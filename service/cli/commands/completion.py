@@ -17,22 +17,16 @@ To have it in every shell from now on:
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "completion",
-        "Print a script with which a shell completes commands, options and their values.",
-        """
-        acquire completion bash
-        acquire completion zsh
-        """,
-        run,
-        NOTES,
-    )
+    parser = add_command(commands, "completion", run, notes=NOTES)
     parser.add_argument("shell", choices=SHELLS)
 
 
 def run(parsed: Namespace) -> int:
-    """Print the script of a shell."""
+    """Print a script with which a shell completes commands, options and their values.
+
+    acquire completion bash
+    acquire completion zsh
+    """
     import shtab
 
     from service.cli import build_parser

@@ -4,21 +4,14 @@ import getpass
 import json
 import sys
 from argparse import Namespace
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_group,
-    add_json,
-    print_json,
-)
-from service.cli.configuration import settings_of, settings_of_existing
+from service.cli import arguments
+from service.cli.configuration import progress_bar, settings_of, settings_of_existing
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -31,7 +24,7 @@ MAX_PROBLEMS = 100
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "database",
         "Maintain the database: schema, backup, verification, and deleting old batches.",
@@ -42,147 +35,62 @@ def add(commands: Any) -> None:
         acquire database verify
         """,
     )
-    parser = add_command(
-        group,
-        "upgrade",
-        "Create missing tables and migrate the schema to this version; all data are kept.",
-        "acquire database upgrade",
-        upgrade,
-    )
-    add_database(parser)
-    parser = add_command(
-        group,
-        "check",
-        "Compare the schema with the code; exit code 1 if they differ.",
-        """
-        acquire database check
-        acquire database check --fresh
-        """,
-        check,
-    )
+    parser = arguments.add_command(group, "upgrade", upgrade)
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "check", check)
     parser.add_argument(
         "--fresh", action="store_true", help="check the migrations on an empty database"
     )
-    add_json(parser, "the differences")
-    add_database(parser)
-    parser = add_command(
-        group,
-        "backup",
-        "Copy the whole database as it is now, also while the service is running: SQLite to a "
-        "database file, PostgreSQL to a file for pg_restore.",
-        """
-        acquire database backup night.db
-        acquire database backup night.dump --database postgresql://user@host/attitudes
-        """,
-        backup,
-    )
+    arguments.add_json(parser, "the differences")
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "backup", backup)
     parser.add_argument("output", type=Path, metavar="FILE", help="must not exist yet")
-    add_database(parser)
-    parser = add_command(
-        group,
-        "restore",
-        "Make a database from a backup: an SQLite file that does not exist yet, or an empty "
-        "PostgreSQL database.  It appears whole or not at all, with the schema of the backup.",
-        """
-        acquire database restore night.db --database sqlite:///acquire.db
-        acquire database restore night.dump --database postgresql://user@host/attitudes
-        """,
-        restore,
-    )
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "restore", restore)
     parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
-    add_database(parser)
-    _add_verify(group)
-    _add_copy(group)
-    _add_rebuild(group)
-    _add_split_trackers(group)
-    _add_prune(group)
-    add_forget(group)
-
-
-def _add_verify(group: Any) -> None:
-    parser = add_command(
-        group,
-        "verify",
-        "Read everything and report faults: the file, the schema, every batch with its results, "
-        "the trends, the gyro blocks, the filtered and smoothed attitudes.  Exit code 1 if there "
-        "is a fault.  Changes nothing.",
-        """
-        acquire database verify
-        acquire database verify --database sqlite:///night.db
-        """,
-        verify,
-    )
-    add_json(parser, "the faults")
-    add_database(parser)
-
-
-def _add_copy(group: Any) -> None:
-    parser = add_command(
-        group,
-        "copy",
-        "Copy the whole record to another database, SQLite to PostgreSQL or back, compare every "
-        "row of the two, and verify the copy.  Stop the services on both first.  FROM stays as it "
-        "is; TO must be empty, and an SQLite file is made if it is missing.  You can stop the "
-        "command at any time: it continues when you start it again.",
-        """
-        acquire database copy sqlite:///acquire.db postgresql://user@host/attitudes
-        acquire database copy postgresql://user@host/attitudes sqlite:///acquire.db
-        """,
-        copy,
-    )
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "verify", verify)
+    arguments.add_json(parser, "the faults")
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "copy", copy)
     parser.add_argument("source", metavar="FROM", help="URL of the database to copy")
     parser.add_argument("target", metavar="TO", help="URL of the empty database")
-
-
-def _add_rebuild(group: Any) -> None:
-    parser = add_command(
-        group,
-        "rebuild",
-        "Count the trends anew from the recorded batches.  They are kept up by themselves: this is "
-        "for a database whose `verify` reports wrong trends.  Alarms and events stay: they hold "
-        "what people did, and the limits of their time.  On SQLite no service may be running.",
-        "acquire database rebuild",
-        rebuild,
-    )
-    add_database(parser)
-
-
-def _add_split_trackers(group: Any) -> None:
-    parser = add_command(
-        group,
-        "split-trackers",
-        "Split the batches of earlier versions by tracker, for trends of each tracker of a "
-        "spacecraft with several.  The service does the same by itself, more slowly.  You can "
-        "stop the command at any time; it continues when you start it again.",
-        "acquire database split-trackers",
-        split_trackers,
-    )
-    add_database(parser)
-
-
-def _add_prune(group: Any) -> None:
-    parser = add_command(
-        group,
-        "prune",
-        "Delete the batches before a time, with their results and their part in the trends, and "
-        "the gyro blocks and days of filtered attitudes that end before it.  On SQLite no service "
-        "may be running.  This cannot be undone: make a backup first.",
-        """
-        acquire database prune --before 1996-01-01T00:00:00Z --dry-run
-        acquire database prune --before 1996-001T00:00:00Z --run pass-7
-        """,
-        prune,
-    )
+    parser = arguments.add_command(group, "rebuild", rebuild)
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "split-trackers", split_trackers)
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "prune", prune)
     parser.add_argument(
         "--before", required=True, metavar="UTC", help="delete batches before this batch time"
     )
     parser.add_argument("--run", metavar="NAME", help="only this run; default: all runs")
     parser.add_argument("--dry-run", action="store_true", help="only print the number of batches")
-    add_database(parser)
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "forget", forget)
+    parser.add_argument("--run", required=True, metavar="NAME", help="the run")
+    parser.add_argument("--spacecraft", metavar="NAME", help=arguments.MISSION)
+    parser.add_argument(
+        "--batch", nargs="+", default=[], metavar="BATCH", help="only these batches"
+    )
+    parser.add_argument(
+        "--gyro-block", nargs="+", default=[], metavar="BLOCK", help="only these gyro blocks"
+    )
+    parser.add_argument(
+        "--archive",
+        type=Path,
+        metavar="FOLDER",
+        help="the archive with batches of the run; default: ACQUIRE_ARCHIVE_FOLDER",
+    )
+    parser.add_argument("--yes", action="store_true", help="remove without asking")
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
 
 
 def upgrade(parsed: Namespace) -> int:
-    """Bring the schema up to date."""
+    """Create missing tables and migrate the schema to this version; all data are kept.
+
+    acquire database upgrade
+    """
     from service.storage.sql.migrations import upgrade as upgrade_schema
 
     upgrade_schema(settings_of(parsed).database)
@@ -191,13 +99,17 @@ def upgrade(parsed: Namespace) -> int:
 
 
 def check(parsed: Namespace) -> int:
-    """Tell how the schema differs from the code."""
+    """Compare the schema with the code; exit code 1 if they differ.
+
+    acquire database check
+    acquire database check --fresh
+    """
     from service.storage.sql.migrations import check as check_schema
     from service.storage.sql.migrations import check_fresh
 
     differences = check_fresh() if parsed.fresh else check_schema(settings_of(parsed).database)
     if parsed.json:
-        print_json({"differences": differences})
+        arguments.print_json({"differences": differences})
         return 1 if differences else 0
     for difference in differences:
         print(difference if len(difference) <= 120 else difference[:119] + "…")
@@ -207,67 +119,63 @@ def check(parsed: Namespace) -> int:
 
 
 def backup(parsed: Namespace) -> int:
-    """Copy the database."""
+    """Copy the whole database as it is now, also while the service is running: SQLite to a database
+    file, PostgreSQL to a file for pg_restore.
+
+    acquire database backup night.db
+    acquire database backup night.dump --database postgresql://user@host/attitudes
+    """
     from service.storage.upkeep.backup import back_up
 
-    with _pages("copying") as step:
-        back_up(settings_of(parsed).database, parsed.output, step)
+    with progress_bar("pages", "copying") as bar:
+        database = settings_of(parsed).database
+        back_up(database, parsed.output, lambda left, total: bar(total - left, total))
     print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
     return 0
 
 
 def restore(parsed: Namespace) -> int:
-    """Make a database from a backup."""
+    """Make a database from a backup: an SQLite file that does not exist yet, or an empty PostgreSQL
+    database.  It appears whole or not at all, with the schema of the backup.
+
+    acquire database restore night.db --database sqlite:///acquire.db
+    acquire database restore night.dump --database postgresql://user@host/attitudes
+    """
     from service.storage.sql.migrations import HEAD
     from service.storage.upkeep.backup import restore as restore_backup
 
-    with _pages("restoring") as step:
-        revision = restore_backup(settings_of(parsed).database, parsed.backup, step)
+    with progress_bar("pages", "restoring") as bar:
+        database = settings_of(parsed).database
+        revision = restore_backup(
+            database, parsed.backup, lambda left, total: bar(total - left, total)
+        )
     print(f"{parsed.backup}: restored; its schema is at {revision}")
     if revision != HEAD:
         print(f"this version needs {HEAD}: run `acquire database upgrade`")
     return 0
 
 
-@contextmanager
-def _pages(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar of a database's pages."""
-    from tqdm import tqdm
-
-    with tqdm(total=None, unit=" pages", desc=what, disable=None, leave=False) as bar:
-
-        def step(left: int, total: int) -> None:
-            bar.total = total
-            bar.update(total - left - bar.n)
-
-        yield step
-
-
 def verify(parsed: Namespace) -> int:
-    """Tell what is wrong with the database."""
-    from tqdm import tqdm
+    """Read everything and report faults: the file, the schema, every batch with its results, the
+    trends, the gyro blocks, the filtered and smoothed attitudes.  Exit code 1 if there is a
+    fault.  Changes nothing.
 
+    acquire database verify
+    acquire database verify --database sqlite:///night.db
+    """
     from service.storage.upkeep.verify import earlier_results
     from service.storage.upkeep.verify import verify as verify_records
 
     database = settings_of(parsed).database
-    seen = 0
-    with tqdm(total=None, unit=" batches", desc="reading", disable=None, leave=False) as bar:
-
-        def step(done: int, total: int) -> None:
-            nonlocal seen
-            bar.total = total
-            bar.update(done - seen)
-            seen = done
-
-        problems = verify_records(database, step)
+    with progress_bar("batches", "reading") as bar:
+        problems = verify_records(database, bar)
     if parsed.json:
-        print_json({"batches": seen, "faults": problems})
+        arguments.print_json({"batches": bar.done, "faults": problems})
         return 1 if problems else 0
     _print_problems(problems)
     if problems:
         return 1
-    print(f"nothing is wrong with {seen} batches")
+    print(f"nothing is wrong with {bar.done} batches")
     without, later = earlier_results(database)
     if later:
         print(f"{later} results got their digest at an upgrade: changes before it are not found")
@@ -284,7 +192,14 @@ def _print_problems(problems: Sequence[str]) -> None:
 
 
 def copy(parsed: Namespace) -> int:
-    """Copy the record to another database."""
+    """Copy the whole record to another database, SQLite to PostgreSQL or back, compare every row of
+    the two, and verify the copy.  Stop the services on both first.  FROM stays as it is; TO must
+    be empty, and an SQLite file is made if it is missing.  You can stop the command at any time:
+    it continues when you start it again.
+
+    acquire database copy sqlite:///acquire.db postgresql://user@host/attitudes
+    acquire database copy postgresql://user@host/attitudes sqlite:///acquire.db
+    """
     from tqdm import tqdm
 
     from service.storage.upkeep.copy import copy_record
@@ -306,74 +221,72 @@ def copy(parsed: Namespace) -> int:
 
 
 def rebuild(parsed: Namespace) -> int:
-    """Count the trends anew."""
-    from tqdm import tqdm
+    """Count the trends anew from the recorded batches.  They are kept up by themselves: this is for
+    a database whose `verify` reports wrong trends.  Alarms and events stay: they hold what
+    people did, and the limits of their time.  On SQLite no service may be running.
 
+    acquire database rebuild
+    """
     from service.storage.projections.projector import projected, rebuild_trends
     from service.storage.store import Store
 
-    store = Store(settings_of_existing(parsed).database, create=False)
-    try:
-        with (
-            projected(store),
-            tqdm(total=None, unit=" hours", desc="counting", disable=None, leave=False) as bar,
-        ):
-
-            def step(done: int, total: int) -> None:
-                bar.total = total
-                bar.update(done - bar.n)
-
-            hours = rebuild_trends(store, step)
-    finally:
-        store.close()
+    with (
+        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        projected(store),
+        progress_bar("hours", "counting") as bar,
+    ):
+        hours = rebuild_trends(store, bar)
     print(f"the trends of {hours} hours were counted anew")
     return 0
 
 
 def split_trackers(parsed: Namespace) -> int:
-    """Split older batches by tracker."""
-    from tqdm import tqdm
+    """Split the batches of earlier versions by tracker, for trends of each tracker of a spacecraft
+    with several.  The service does the same by itself, more slowly.  You can stop the command at
+    any time; it continues when you start it again.
 
+    acquire database split-trackers
+    """
     from service.app.factory import open_app
 
-    app = open_app(settings_of_existing(parsed))
-    try:
-        with tqdm(total=None, unit=" batches", desc="splitting", disable=None, leave=False) as bar:
-            done = app.upgrade.splitter.split(lambda done: bar.update(done - bar.n))
-    finally:
-        app.close()
+    with (
+        closing(open_app(settings_of_existing(parsed))) as app,
+        progress_bar("batches", "splitting") as bar,
+    ):
+        done = app.upgrade.splitter.split(bar)
     print(f"{done} batches were looked at; every batch is split by tracker")
     return 0
 
 
 def prune(parsed: Namespace) -> int:
-    """Delete old batches."""
-    from tqdm import tqdm
+    """Delete the batches before a time, with their results and their part in the trends, and the
+    gyro blocks and days of filtered attitudes that end before it.  On SQLite no service may be
+    running.  This cannot be undone: make a backup first.
 
+    acquire database prune --before 1996-01-01T00:00:00Z --dry-run
+    acquire database prune --before 1996-001T00:00:00Z --run pass-7
+    """
     from service.storage.projections.projector import projected
     from service.storage.store import Store
-    from service.storage.upkeep.prune import Pruned
     from service.storage.upkeep.prune import prune as prune_records
     from service.times import parse_utc
 
     before = parse_utc(parsed.before, "--before")
-    store = Store(settings_of_existing(parsed).database, create=False)
-    try:
-        with (
-            projected(store),
-            tqdm(total=None, unit=" batches", desc="deleting", disable=None, leave=False) as bar,
-        ):
-
-            def step(pruned: Pruned) -> None:
-                bar.total = pruned.total
-                bar.update(pruned.batches - bar.n)
-
-            if not parsed.dry_run:
-                asked = {"before": before.text, "run": parsed.run}
-                store.writer.change(partial(note, action="prune", about="database", asked=asked))
-            pruned = prune_records(store, before, parsed.run, dry_run=parsed.dry_run, step=step)
-    finally:
-        store.close()
+    with (
+        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        projected(store),
+        progress_bar("batches", "deleting") as bar,
+    ):
+        if not parsed.dry_run:
+            asked = {"before": before.text, "run": parsed.run}
+            store.writer.change(partial(note, action="prune", about="database", asked=asked))
+        pruned = prune_records(
+            store,
+            before,
+            parsed.run,
+            dry_run=parsed.dry_run,
+            step=lambda pruned: bar(pruned.batches, pruned.total),
+        )
     if parsed.dry_run:
         more = _beside(pruned.total_gyro_blocks, pruned.total_graded_days)
         print(f"{pruned.total} batches{more} are before {before.text}; nothing was deleted")
@@ -390,46 +303,17 @@ def _beside(gyro_blocks: int, graded_days: int) -> str:
     return "".join(f" and {each}" for each in counts)
 
 
-def add_forget(group: Any) -> None:
-    """Declare the command."""
-    parser = add_command(
-        group,
-        "forget",
-        "Remove what was recorded wrongly: a run, or some of its batches and gyro blocks, with "
-        "their results, their part in the trends, the filtered attitudes that were computed with "
-        "them, and what is archived of them.  Afterwards the right file can be replayed.  The "
-        "command shows what it will remove and asks; the audit list says who did it.  This cannot "
-        "be undone: make a backup first.  With SQLite, stop the service first, or use its API.",
-        """
-        acquire database forget --run pass-7
-        acquire database forget --run live --spacecraft XTE --batch 1996-010-0001 1996-010-0002
-        acquire database forget --run pass-7 --gyro-block g1 --yes
-        """,
-        forget,
-    )
-    parser.add_argument("--run", required=True, metavar="NAME", help="the run")
-    parser.add_argument("--spacecraft", metavar="NAME", help=MISSION)
-    parser.add_argument(
-        "--batch", nargs="+", default=[], metavar="BATCH", help="only these batches"
-    )
-    parser.add_argument(
-        "--gyro-block", nargs="+", default=[], metavar="BLOCK", help="only these gyro blocks"
-    )
-    parser.add_argument(
-        "--archive",
-        type=Path,
-        metavar="FOLDER",
-        help="the archive with batches of the run; default: ACQUIRE_ARCHIVE_FOLDER",
-    )
-    parser.add_argument("--yes", action="store_true", help="remove without asking")
-    add_json(parser, "the counts")
-    add_database(parser)
-
-
 def forget(parsed: Namespace) -> int:
-    """Show what is removed, ask, and remove it."""
-    from tqdm import tqdm
+    """Remove what was recorded wrongly: a run, or some of its batches and gyro blocks, with their
+    results, their part in the trends, the filtered attitudes that were computed with them, and
+    what is archived of them.  Afterwards the right file can be replayed.  The command shows what
+    it will remove and asks; the audit list says who did it.  This cannot be undone: make a
+    backup first.  With SQLite, stop the service first, or use its API.
 
+    acquire database forget --run pass-7
+    acquire database forget --run live --spacecraft XTE --batch 1996-010-0001 1996-010-0002
+    acquire database forget --run pass-7 --gyro-block g1 --yes
+    """
     from service.storage.store import Store
     from service.storage.upkeep import forget as forgetting
 
@@ -438,27 +322,23 @@ def forget(parsed: Namespace) -> int:
         parsed.run, parsed.spacecraft, tuple(parsed.batch), tuple(parsed.gyro_block)
     )
     folder = parsed.archive or settings.archive_folder
-    store = Store(settings.database, create=False)
-    try:
+    with closing(Store(settings.database, create=False)) as store:
         with store.reading() as connection:
             total = forgetting.found(connection, selected)
         print(_removal_text(total), file=sys.stderr if parsed.json else sys.stdout)
         if not parsed.yes and not _is_confirmed(parsed.run):
             print("nothing was removed", file=sys.stderr)
             return 1
-        with tqdm(total=None, unit=" batches", desc="removing", disable=None, leave=False) as b:
+        with progress_bar("batches", "removing") as bar:
 
             def step(done: int, whole: "Forgotten") -> None:
-                b.total = whole.batches + whole.archived_batches
-                b.update(done - b.n)
+                bar(done, whole.batches + whole.archived_batches)
 
             forgetting.forget(store, selected, folder, note=_note(parsed), step=step)
-    finally:
-        store.close()
     if parsed.json:
         from msgspec import to_builtins
 
-        print_json(to_builtins(total))
+        arguments.print_json(to_builtins(total))
     else:
         print("it was removed")
     return 0
@@ -484,7 +364,6 @@ def _is_confirmed(run: str) -> bool:
 
 
 def _note(parsed: Namespace) -> Any:
-    """A function that adds the entry of the audit list."""
     asked = {
         "spacecraft": parsed.spacecraft,
         "batches": parsed.batch,

@@ -10,17 +10,7 @@ from service.cli.configuration import settings_of
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "demo",
-        "Start the service, replay sample passes of XTE, SWAS and SOHO over HTTP, print the "
-        "identification rates, and keep serving.",
-        """
-        acquire demo
-        acquire demo --batches 1000 --seed 3 --port 8100 --once
-        """,
-        run,
-    )
+    parser = add_command(commands, "demo", run)
     parser.add_argument("--host", help="loopback address; default 127.0.0.1")
     parser.add_argument("--port", type=int, help="default 8000")
     parser.add_argument(
@@ -38,7 +28,12 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Serve and replay sample passes."""
+    """Start the service, replay sample passes of XTE, SWAS and SOHO over HTTP, print the
+    identification rates, and keep serving.
+
+    acquire demo
+    acquire demo --batches 1000 --seed 3 --port 8100 --once
+    """
     from service.demo import run_demo
 
     return run_demo(

@@ -4,18 +4,7 @@ from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_grade,
-    add_group,
-    add_output,
-    add_period,
-    positive,
-    print_json,
-    written_to,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of_existing
 from service.products.formats import attitude_formats, table_formats, write_attitudes, write_table
 
@@ -31,7 +20,7 @@ TABLES = {
 
 def add(commands: Any) -> None:
     """Declare the group with its commands."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "export",
         "Write recorded data to files that other programs read.",
@@ -44,21 +33,11 @@ def add(commands: Any) -> None:
 
 
 def _add_attitude(commands: Any) -> None:
-    parser = add_command(
-        commands,
-        "attitude",
-        "Write the attitudes of a spacecraft in any of the formats.",
-        """
-        acquire export attitude --spacecraft XTE --format aem --output xte.aem
-        acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
-        acquire export attitude --spacecraft XTE --grade smoothed --format acm --output xte.acm
-        """,
-        _write_attitude,
-    )
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    add_period(parser, "the run that is read; default live")
+    parser = arguments.add_command(commands, "attitude", _write_attitude)
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")
-    add_grade(parser)
+    arguments.add_grade(parser)
     _add_status(parser)
     parser.add_argument(
         "--order",
@@ -76,8 +55,8 @@ def _add_attitude(commands: Any) -> None:
         metavar="ID",
         help="NAIF's id of the spacecraft; default: the mission's",
     )
-    add_output(parser)
-    add_database(parser)
+    arguments.add_output(parser)
+    arguments.add_database(parser)
 
 
 def _add_status(parser: ArgumentParser) -> None:
@@ -89,18 +68,23 @@ def _add_status(parser: ArgumentParser) -> None:
 def _add_largest_gap(parser: ArgumentParser) -> None:
     parser.add_argument(
         "--largest-gap",
-        type=positive,
+        type=arguments.positive,
         metavar="SECONDS",
         help="attitudes farther apart belong to two stretches; default: the mission's",
     )
 
 
 def _write_attitude(parsed: Namespace) -> int:
-    """Write the attitudes, as they are read."""
+    """Write the attitudes of a spacecraft in any of the formats.
+
+    acquire export attitude --spacecraft XTE --format aem --output xte.aem
+    acquire export attitude --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+    acquire export attitude --spacecraft XTE --grade smoothed --format acm --output xte.acm
+    """
     from service.app.products import open_products
 
     start, end = period_of(parsed)
-    arguments = {
+    overrides = {
         name: value
         for name, value in (
             ("largest_gap_s", parsed.largest_gap),
@@ -119,26 +103,16 @@ def _write_attitude(parsed: Namespace) -> int:
             grade=parsed.grade,
             order=parsed.order,
             most_batches=attitude_formats()[parsed.format].most_batches,
-            **arguments,
+            **overrides,
         )
-        written_to(parsed.output, write_attitudes(parsed.format, series))
+        arguments.written_to(parsed.output, write_attitudes(parsed.format, series))
     return 0
 
 
 def _add_attitude_at(commands: Any) -> None:
-    parser = add_command(
-        commands,
-        "attitude-at",
-        "Print the attitude of a spacecraft at a given time as JSON, with its covariance.",
-        """
-        acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
-        acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
-        acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --grade smoothed
-        """,
-        _print_attitude_at,
-    )
+    parser = arguments.add_command(commands, "attitude-at", _print_attitude_at)
     parser.add_argument("time", metavar="UTC", help="the time")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     parser.add_argument("--run", metavar="NAME", help="the run that is read; default live")
     parser.add_argument(
         "--method",
@@ -146,14 +120,19 @@ def _add_attitude_at(commands: Any) -> None:
         default="interpolated",
         help="the nearest attitude, or one interpolated within a stretch; default interpolated",
     )
-    add_grade(parser)
+    arguments.add_grade(parser)
     _add_status(parser)
     _add_largest_gap(parser)
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def _print_attitude_at(parsed: Namespace) -> int:
-    """Print the attitude."""
+    """Print the attitude of a spacecraft at a given time as JSON, with its covariance.
+
+    acquire export attitude-at 1996-01-10T12:00:00.5Z --spacecraft XTE
+    acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --method nearest
+    acquire export attitude-at 1996-010T12:00:00Z --spacecraft XTE --grade smoothed
+    """
     from service.app.products import open_products
     from service.times import parse_utc
 
@@ -168,28 +147,29 @@ def _print_attitude_at(parsed: Namespace) -> int:
             grade=parsed.grade,
             largest_gap_s=parsed.largest_gap,
         )
-    print_json(asdict(found))
+    arguments.print_json(asdict(found))
     return 0
 
 
 def _add_table(commands: Any, kind: str, summary: str) -> None:
     """Declare `acquire export KIND`; see `app.products.table`."""
-    parser = add_command(
+    parser = arguments.add_command(
         commands,
         kind,
-        f"{summary} Oldest first; units and descriptions are in the metadata of Parquet files.",
-        f"""
+        _write_table,
+        summary=f"{summary} Oldest first; units and descriptions are in the metadata of Parquet "
+        "files.",
+        examples=f"""
         acquire export {kind} --spacecraft XTE --format parquet --output {kind}.parquet
         acquire export {kind} --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
         """,
-        _write_table,
     )
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    add_period(parser, "the run that is read; default live")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(table_formats()), default="csv")
-    add_output(parser)
+    arguments.add_output(parser)
     parser.set_defaults(kind=kind)
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def _write_table(parsed: Namespace) -> int:
@@ -205,5 +185,5 @@ def _write_table(parsed: Namespace) -> int:
             end=end,
             most_batches=table_formats()[parsed.format].most_batches,
         )
-        written_to(parsed.output, write_table(parsed.format, table))
+        arguments.written_to(parsed.output, write_table(parsed.format, table))
     return 0

@@ -19,18 +19,7 @@ SCHEMES = ("nats", "tls")
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "follow",
-        "Send the messages of a NATS stream to the service: each is a batch or a gyro block, and "
-        "is acknowledged once it is recorded.  Several followers of one consumer share the work.",
-        """
-        acquire follow nats://127.0.0.1:4222/TELEMETRY --consumer acquire
-        acquire follow tls://bus.example/TELEMETRY --consumer acquire --credentials acquire.creds
-        acquire follow nats://127.0.0.1/TELEMETRY --consumer acquire --answers attitudes
-        """,
-        run,
-    )
+    parser = add_command(commands, "follow", run)
     parser.add_argument("source", metavar="nats://HOST/STREAM", help="or tls://HOST/STREAM")
     parser.add_argument(
         "--consumer",
@@ -68,7 +57,13 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Follow until a signal, and print what became of the messages."""
+    """Send the messages of a NATS stream to the service: each is a batch or a gyro block, and is
+    acknowledged once it is recorded.  Several followers of one consumer share the work.
+
+    acquire follow nats://127.0.0.1:4222/TELEMETRY --consumer acquire
+    acquire follow tls://bus.example/TELEMETRY --consumer acquire --credentials acquire.creds
+    acquire follow nats://127.0.0.1/TELEMETRY --consumer acquire --answers attitudes
+    """
     import asyncio
     import signal
 

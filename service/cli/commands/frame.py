@@ -5,7 +5,7 @@ import math
 import sys
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,7 +17,7 @@ from service.cli.arguments import (
     degrees,
     positive,
 )
-from service.cli.configuration import service_url, settings_of
+from service.cli.configuration import http_client, refusal_of, service_url, settings_of
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
 
@@ -29,23 +29,7 @@ FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "frame",
-        "Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy), "
-        "identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that "
-        "is sent again returns the first answer.  Without a spacecraft a picture may be from any "
-        "camera: its lens is fitted with the attitude, and nothing is recorded.",
-        """
-        acquire frame holiday.jpg                    any camera, any lens
-        acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
-        acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
-        acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
-        acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
-        """,
-        run,
-        SIDECAR,
-    )
+    parser = add_command(commands, "frame", run, notes=SIDECAR)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument("--spacecraft", metavar="NAME", help=f"{CAMERA_MISSION}; none: any camera")
     _add_lens(parser)
@@ -105,7 +89,17 @@ def _add_lens(parser: ArgumentParser) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Send every file and print its result; 1 where one was refused."""
+    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy),
+    identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
+    sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
+    its lens is fitted with the attitude, and nothing is recorded.
+
+    acquire frame holiday.jpg                    any camera, any lens
+    acquire frame holiday.jpg --focal-mm 50 --pixel-um 4.8 --overlay stars.png
+    acquire frame frames/*.fits --spacecraft IMAGER --overlay pictures/
+    acquire frame one.fits --spacecraft IMAGER --in-process --overlay one.png
+    acquire frame one.png --spacecraft IMAGER --time 2026-03-01T00:00:00Z --json
+    """
     if parsed.spacecraft is None:
         from service.cli.pictures import solve_pictures
 
@@ -216,20 +210,11 @@ def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubm
     if parsed.in_process:
         from service.app.factory import open_app
 
-        app = open_app(settings)
-        try:
+        with closing(open_app(settings)) as app:
             app.service.ready()
             yield _InProcess(app)
-        finally:
-            app.close()
     else:
-        import httpx
-
-        headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
-        # The service may listen to this machine alone, where no proxy reaches it.
-        with httpx.Client(
-            base_url=service_url(parsed), timeout=TIMEOUT_S, trust_env=False, headers=headers
-        ) as client:
+        with http_client(settings, service_url(parsed), TIMEOUT_S) as client:
             yield _OverHttp(client)
 
 
@@ -269,11 +254,11 @@ class _OverHttp:
     def overlay(self, id: str) -> bytes:
         return self._request("GET", f"/api/v1/batches/{id}/overlay")
 
-    def _request(self, method: str, url: str, **arguments: Any) -> bytes:
+    def _request(self, method: str, url: str, **request: Any) -> bytes:
         import httpx
 
         try:
-            response = self._client.request(method, url, **arguments)
+            response = self._client.request(method, url, **request)
         except (httpx.TransportError, httpx.InvalidURL) as error:
             raise Busy(
                 f"no service answers at {self._client.base_url} ({error}); "
@@ -283,8 +268,4 @@ class _OverHttp:
             return bytes(response.content)
         if response.status_code == 401:
             raise Unauthenticated("the service asks for a token: set ACQUIRE_TOKEN")
-        try:
-            detail = str(response.json()["detail"])
-        except (ValueError, KeyError, TypeError):
-            detail = f"HTTP {response.status_code}: {response.text[:200]}"
-        raise FrameRefused(detail)
+        raise FrameRefused(refusal_of(response))

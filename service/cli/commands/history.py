@@ -3,16 +3,10 @@
 import json
 from argparse import Namespace
 from collections.abc import Iterator
+from contextlib import closing
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_output,
-    add_period,
-    written_to,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of_existing
 from service.products.formats import table_formats, write_table
 from service.products.tables import Table
@@ -20,45 +14,36 @@ from service.products.tables import Table
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "history",
-        "Write the quantities of every recorded batch of a spacecraft, one row per batch.",
-        """
-        acquire history --spacecraft XTE --format csv
-        acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
-        """,
-        run,
-    )
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    add_period(parser, "the run that is read; default live")
+    parser = arguments.add_command(commands, "history", run)
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
     way.add_argument("--json", action="store_true", help="write one JSON object per line")
-    add_output(parser)
-    add_database(parser)
+    arguments.add_output(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Write the table, page by page."""
+    """Write the quantities of every recorded batch of a spacecraft, one row per batch.
+
+    acquire history --spacecraft XTE --format csv
+    acquire history --spacecraft XTE --run pass-7 --start 1996-010T00:00:00Z
+    """
     from service.app.factory import open_app
     from service.app.spacecraft import batch_table
 
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed), reads_only=True)
-    try:
+    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         pages = app.spacecraft.every_batch(parsed.spacecraft, run=parsed.run, start=start, end=end)
         table = batch_table(pages)
-        written_to(
+        arguments.written_to(
             parsed.output, _lines(table) if parsed.json else write_table(parsed.format, table)
         )
-    finally:
-        app.close()
     return 0
 
 
 def _lines(table: Table) -> Iterator[bytes]:
-    """Every row as a JSON object."""
     for page in table.pages:
         for row in zip(*page, strict=True):
             yield f"{json.dumps(dict(zip(table.names, row, strict=True)))}\n".encode()

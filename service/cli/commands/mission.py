@@ -27,19 +27,7 @@ def add(commands: Any) -> None:
         "Mission files: check one before the service uses it, and estimate its zones.",
         "acquire mission check missions/mine.toml",
     )
-    parser = add_command(
-        group,
-        "check",
-        "Tell what is wrong with a mission file and what is unusual, and draw its zones with "
-        "the number of their stars and pairs.",
-        """
-        acquire mission check mine.toml
-        acquire mission check mine.toml --picture zones.svg
-        acquire mission check mine.toml --epoch 2030 --json
-        """,
-        check,
-        NOTES,
-    )
+    parser = add_command(group, "check", check, notes=NOTES)
     parser.add_argument("file", type=Path, metavar="FILE.toml")
     parser.add_argument(
         "--epoch", type=float, metavar="YEAR", help="of the run catalog; default: this year"
@@ -52,7 +40,13 @@ def add(commands: Any) -> None:
 
 
 def check(parsed: Namespace) -> int:
-    """Print what is wrong and unusual, and the zones; 1 where something is wrong."""
+    """Tell what is wrong with a mission file and what is unusual, and draw its zones with the
+    number of their stars and pairs.
+
+    acquire mission check mine.toml
+    acquire mission check mine.toml --picture zones.svg
+    acquire mission check mine.toml --epoch 2030 --json
+    """
     from service.cli.charts import zones_picture
     from service.cli.mission_report import examined, refusals, report_json, report_text
     from service.missions.mission import read_mission
@@ -94,19 +88,7 @@ Memory is that of the largest zone as the service caches it, grown by the zone's
 
 def add_estimate(group: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        group,
-        "estimate",
-        "Predict the stars, pairs and memory of a mission's zones over the whole sky before one "
-        "is built, for one or more sizes, largest separations and limits of magnitude.",
-        """
-        acquire mission estimate mine.toml
-        acquire mission estimate XTE --size 6 8 10.66 15
-        acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
-        """,
-        estimate,
-        ESTIMATE_NOTES,
-    )
+    parser = add_command(group, "estimate", estimate, notes=ESTIMATE_NOTES)
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
     )
@@ -138,7 +120,13 @@ def add_estimate(group: Any) -> None:
 
 
 def estimate(parsed: Namespace) -> int:
-    """Print the estimates."""
+    """Predict the stars, pairs and memory of a mission's zones over the whole sky before one is
+    built, for one or more sizes, largest separations and limits of magnitude.
+
+    acquire mission estimate mine.toml
+    acquire mission estimate XTE --size 6 8 10.66 15
+    acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
+    """
     from service.advice.zone_estimate import neighbours_of, zone_estimates
     from service.cli.configuration import mission_of_file_or_name
     from service.cli.mission_report import epoch_of
@@ -200,7 +188,7 @@ def _changed(mission: "Mission", table: str, key: str, value: float, option: str
 
 def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") -> str:
     from service.sky.geometry.pairs import MAX_PAIRS
-    from studies.paper_1994.tables import markdown
+    from studies.documents import markdown
 
     header = (
         *("zone", "HMAX", "to mag", "NCAP least", "median", "most", "NTOT least", "median"),

@@ -9,16 +9,7 @@ from service.cli.arguments import add_command
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "openapi",
-        "Print the description of the API (OpenAPI 3.1, YAML).",
-        """
-        acquire openapi --output openapi.yaml
-        acquire openapi --check                        compare with ./openapi.yaml
-        """,
-        run,
-    )
+    parser = add_command(commands, "openapi", run)
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--output", type=Path, metavar="FILE")
     way.add_argument(
@@ -32,7 +23,11 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Print, write or check the API's description."""
+    """Print the description of the API (OpenAPI 3.1, YAML).
+
+    acquire openapi --output openapi.yaml
+    acquire openapi --check                        compare with ./openapi.yaml
+    """
     from service.web.app import openapi_yaml
 
     checked = None if parsed.check is None else parsed.check.read_text(encoding="utf-8")

@@ -1,24 +1,19 @@
 """`acquire replay`: send files of batches through the service."""
 
 from argparse import ArgumentParser, Namespace
+from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    add_command,
-    add_database,
-    add_json,
-    add_url_or_in_process,
-    count,
-    print_json,
-    speed,
-)
+from service.cli import arguments
 from service.cli.configuration import service_url, settings_of
 from service.errors import BadFile, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.packets.reader import PacketReader
     from service.replay.from_file import FromFile
+    from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
 CSV_HELP = """\
@@ -42,29 +37,12 @@ times of a scan) or a measured attitude."""
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "replay",
-        "Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) "
-        "to the service.  You can send a file twice: nothing is recorded twice.",
-        """
-        acquire replay pass.ndjson
-        acquire replay pass.csv --in-process --run trial --results answers.ndjson
-        acquire replay pass.ndjson --alarms            and raise alarms for the run
-        acquire replay pass.ndjson --speed 60          one minute of telemetry per second
-        acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
-        acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
-        acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
-        acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
-        """,
-        run,
-        CSV_HELP,
-    )
+    parser = arguments.add_command(commands, "replay", run, notes=CSV_HELP)
     parser.add_argument(
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
     )
     _add_packets(parser)
-    add_url_or_in_process(parser)
+    arguments.add_url_or_in_process(parser)
     parser.add_argument(
         "--run", help="the run for every batch; default: the first file's name without its ending"
     )
@@ -77,14 +55,14 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--speed",
-        type=speed,
+        type=arguments.speed,
         default=None,
         metavar="FACTOR|max",
         help="multiple of real time, by the batch times; default max",
     )
     parser.add_argument(
         "--concurrency",
-        type=count,
+        type=arguments.count,
         metavar="N",
         help="post batch by batch, N at a time; --results (default 4) and --speed also post "
         "batch by batch. Without these options the service receives whole files, which is "
@@ -94,12 +72,11 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--progress", action="store_true", help="show the progress bar even without a terminal"
     )
-    add_json(parser, "the counts")
-    add_database(parser)
+    arguments.add_json(parser, "the counts")
+    arguments.add_database(parser)
 
 
 def _add_knowledge(parser: ArgumentParser) -> None:
-    """Declare the arguments that add something to each batch."""
     source = parser.add_mutually_exclusive_group()
     source.add_argument(
         "--a-priori",
@@ -124,7 +101,6 @@ def _add_knowledge(parser: ArgumentParser) -> None:
 
 
 def _add_packets(parser: ArgumentParser) -> None:
-    """Declare the arguments of space packets."""
     parser.add_argument(
         "--packets",
         nargs="+",
@@ -145,7 +121,18 @@ def _add_packets(parser: ArgumentParser) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Send files through the service and print what became of them."""
+    """Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) to
+    the service.  You can send a file twice: nothing is recorded twice.
+
+    acquire replay pass.ndjson
+    acquire replay pass.csv --in-process --run trial --results answers.ndjson
+    acquire replay pass.ndjson --alarms            and raise alarms for the run
+    acquire replay pass.ndjson --speed 60          one minute of telemetry per second
+    acquire replay pass.ndjson --carry-attitude    use each attitude as the next a priori
+    acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
+    acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
+    acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
+    """
     from msgspec import to_builtins
 
     from service.replay.from_file import AttitudeCarrier
@@ -168,15 +155,12 @@ def run(parsed: Namespace) -> int:
         from service.app.factory import open_app
         from service.replay.in_process import replay_in_process
 
-        app = open_app(settings_of(parsed))
-        try:
+        with closing(open_app(settings_of(parsed))) as app:
             app.service.ready()
             if parsed.alarms:
                 app.runs.watch(run)
             with ReplaySummary(sized, parsed.results, progress) as summary:
                 replay_in_process(app, items, summary.add, pace, carrier)
-        finally:
-            app.close()
     else:
         from service.replay.over_http import replay_in_bulk, replay_over_http
 
@@ -211,19 +195,24 @@ def run(parsed: Namespace) -> int:
                 )
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
-    if parsed.json:
-        supplied = {source.key: source.supplied for source in sources}
-        print_json({"run": run, **summary.counts(), **supplied})
-    else:
-        print(f"{'run':<20}{run}")
-        print(summary.table())
-        for source in sources:
-            print(f"{source.title:<20}{source.supplied:,} batches")
+    _print_counts(run, summary, sources, parsed.json)
     return 1 if summary.refused else 0
 
 
+def _print_counts(
+    run: str, summary: "ReplaySummary", sources: Sequence["FromFile"], as_json: bool
+) -> None:
+    if as_json:
+        supplied = {source.key: source.supplied for source in sources}
+        arguments.print_json({"run": run, **summary.counts(), **supplied})
+        return
+    print(f"{'run':<20}{run}")
+    print(summary.table())
+    for source in sources:
+        print(f"{source.title:<20}{source.supplied:,} batches")
+
+
 def _sources(parsed: Namespace) -> list["FromFile"]:
-    """The files that add something to each batch."""
     from service.products.reading.files import read_attitudes, read_ephemeris
     from service.replay.from_file import FileEphemeris, FilePrior
 

@@ -2,20 +2,16 @@
 
 import sys
 from argparse import Namespace
-from contextlib import ExitStack
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import (
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    count,
-    print_json,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
+
+if TYPE_CHECKING:
+    from service.missions.mission import Mission
 
 SCHEDULER = """\
 A Dask scheduler runs whatever code it is sent: use tls://, with the certificates that Dask's own
@@ -24,27 +20,10 @@ settings name, and tcp:// only in a network that you trust.  The extra `dask` ha
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "reprocess",
-        "Process recorded batches again, on all cores, with the present settings or with a "
-        "mission file, and record the results in a separate run; then compare both runs.  With "
-        "--archive, process archived batches too, and write the results to the archive: one file "
-        "for each file of the archive and for each day of batches in the database.  After an "
-        "interruption, run the same command again to continue.  With SQLite, stop the service "
-        "first.",
-        """
-        acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
-        acquire reprocess --mission wider.toml --run wider
-        acquire reprocess --spacecraft XTE --run xte-tracked --track
-        acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
-        acquire reprocess --mission wider.toml --run wider --archive /archive
-        acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
-        """,
-        run,
-        notes=SCHEDULER,
+    parser = arguments.add_command(commands, "reprocess", run, notes=SCHEDULER)
+    arguments.add_period(
+        parser, "the run for the results; default: a name derived from the settings"
     )
-    add_period(parser, "the run for the results; default: a name derived from the settings")
     parser.add_argument(
         "--source", metavar="NAME", default="live", help="the run to read; default live"
     )
@@ -58,7 +37,9 @@ def add(commands: Any) -> None:
         help="use this mission file in place of the mission of the same name, and process only "
         "its batches",
     )
-    parser.add_argument("--processes", type=count, metavar="N", help="default: one per core")
+    parser.add_argument(
+        "--processes", type=arguments.count, metavar="N", help="default: one per core"
+    )
     parser.add_argument(
         "--archive",
         type=Path,
@@ -77,13 +58,25 @@ def add(commands: Any) -> None:
         "the results, one batch after another",
     )
     parser.add_argument("--no-comparison", action="store_true", help="do not compare both runs")
-    add_json(parser, "the comparison")
+    arguments.add_json(parser, "the comparison")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Run recorded batches again into another run, and print how both compare."""
+    """Process recorded batches again, on all cores, with the present settings or with a mission
+    file, and record the results in a separate run; then compare both runs.  With --archive,
+    process archived batches too, and write the results to the archive: one file for each file of
+    the archive and for each day of batches in the database.  After an interruption, run the same
+    command again to continue.  With SQLite, stop the service first.
+
+    acquire reprocess --start 1996-010T00:00:00Z --end 1996-020T00:00:00Z
+    acquire reprocess --mission wider.toml --run wider
+    acquire reprocess --spacecraft XTE --run xte-tracked --track
+    acquire reprocess --source pass-7 --spacecraft XTE --run pass-7-again --json
+    acquire reprocess --mission wider.toml --run wider --archive /archive
+    acquire reprocess --run again --archive /archive --scheduler tls://10.0.0.1:8786
+    """
     import dataclasses
 
     import msgspec
@@ -93,18 +86,9 @@ def run(parsed: Namespace) -> int:
     from service.app.factory import open_app
     from service.cli.texts import comparison_text, progress_text
     from service.ingest.reprocess import ReprocessProgress, require_other_run
-    from service.missions.mission import load_missions, mission_named, read_mission
 
     start, end = period_of(parsed)
-    mission = None if parsed.mission is None else read_mission(parsed.mission)
-    spacecraft = parsed.spacecraft
-    if mission is not None:
-        spacecraft = spacecraft or mission.name
-        if spacecraft != mission.name:
-            message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
-            raise BadInput(Fault("--mission", message, str(parsed.mission)))
-    elif spacecraft is not None:
-        mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+    mission, spacecraft = _chosen(parsed)
     if parsed.run is not None:
         require_other_run(checked_run_name(parsed.run), parsed.source)
     _check_track(parsed)
@@ -112,9 +96,7 @@ def run(parsed: Namespace) -> int:
     settings = settings_of_existing(parsed)
     if parsed.archive is not None:
         settings = dataclasses.replace(settings, archive_folder=parsed.archive)
-    with ExitStack() as held:
-        app = open_app(settings, mission)
-        held.callback(app.close)
+    with closing(open_app(settings, mission)) as app:
         with tqdm(
             total=None, unit=" batches", desc="running again", disable=parsed.quiet or None
         ) as bar:
@@ -151,12 +133,28 @@ def run(parsed: Namespace) -> int:
         counts = {
             name: getattr(progress, name) for name in ("total", "before", "recorded", "refused")
         }
-        print_json(counts | ({} if compared is None else msgspec.to_builtins(compared)))
+        arguments.print_json(counts | ({} if compared is None else msgspec.to_builtins(compared)))
     else:
         print(progress_text(progress))
         if compared is not None:
             print(comparison_text(compared))
     return 1 if progress.refused else 0
+
+
+def _chosen(parsed: Namespace) -> "tuple[Mission | None, str | None]":
+    """The mission of `--mission`, and the spacecraft whose batches are asked for."""
+    from service.missions.mission import load_missions, mission_named, read_mission
+
+    spacecraft: str | None = parsed.spacecraft
+    if parsed.mission is None:
+        if spacecraft is not None:
+            mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+        return None, spacecraft
+    mission = read_mission(parsed.mission)
+    if spacecraft not in (None, mission.name):
+        message = f"is of {mission.name}, and only batches of {spacecraft} are asked for"
+        raise BadInput(Fault("--mission", message, str(parsed.mission)))
+    return mission, mission.name
 
 
 def _check_track(parsed: Namespace) -> None:

@@ -1,17 +1,11 @@
 """`acquire score`: recorded attitudes held against the truth of a file."""
 
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    print_json,
-)
+from service.cli import arguments
 from service.cli.configuration import period_of, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
@@ -20,32 +14,31 @@ _BAR = 48
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
+    parser = arguments.add_command(
         commands,
         "score",
-        "Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints "
-        "the errors about each body axis, and whether the covariances fit them.",
-        """
-        acquire score truth.aem --spacecraft XTE --run pass-7
-        acquire score truth.bc --spacecraft XTE --plot errors.svg --json
-        """,
         run,
-        "Between two records of the truth the body is taken to turn at a constant rate. "
+        notes="Between two records of the truth the body is taken to turn at a constant rate. "
         "Attitudes\noutside its segments are counted and left out.",
     )
     parser.add_argument("truth", type=Path, metavar="FILE", help="the true attitudes")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    add_period(parser, "the run that is read; default live")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument(
         "--status", choices=("good", "suspect", "all"), default="good", help="default good"
     )
     parser.add_argument("--plot", type=Path, metavar="OUT.svg", help="draw the errors as SVG")
-    add_json(parser, "the statistics and the histogram")
-    add_database(parser)
+    arguments.add_json(parser, "the statistics and the histogram")
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Score the attitudes and print the statistics."""
+    """Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints the
+    errors about each body axis, and whether the covariances fit them.
+
+    acquire score truth.aem --spacecraft XTE --run pass-7
+    acquire score truth.bc --spacecraft XTE --plot errors.svg --json
+    """
     from service.app.factory import open_app
     from service.cli.arguments import written_to
     from service.cli.charts import errors_picture
@@ -54,14 +47,11 @@ def run(parsed: Namespace) -> int:
 
     start, end = period_of(parsed)
     truth = read_attitudes(parsed.truth, "FILE")
-    app = open_app(settings_of_existing(parsed), reads_only=True)
-    try:
+    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         series = app.products.attitudes(
             parsed.spacecraft, run=parsed.run, start=start, end=end, status=parsed.status
         )
         errors = errors_of(series.blocks, truth)
-    finally:
-        app.close()
     if not len(errors.time_ns):
         asked = f"{errors.outside} {series.about.described()}"
         message = f"has no attitude for the time of any of {asked}"
@@ -70,14 +60,13 @@ def run(parsed: Namespace) -> int:
     if parsed.plot is not None:
         written_to(parsed.plot, iter([errors_picture(errors, series.about.described()).encode()]))
     if parsed.json:
-        print_json({"truth": str(parsed.truth), "spacecraft": parsed.spacecraft, **found})
+        arguments.print_json({"truth": str(parsed.truth), "spacecraft": parsed.spacecraft, **found})
     else:
         print(_table(found))
     return 0
 
 
 def _table(found: dict[str, Any]) -> str:
-    """The statistics for people."""
     names = ("mean", "std", "rms", "predicted_rms", "median", "p95", "p99", "max")
     rows = {**{f"about {axis}": each for axis, each in found["axes"].items()}}
     rows["total"] = found["total"]

@@ -16,16 +16,7 @@ if the files cannot be written: the service works without them, but each start t
 
 def add(commands: Any) -> None:
     """Declare the commands."""
-    parser = add_command(
-        commands,
-        "serve",
-        "Serve the API and the console.  Creates and migrates an SQLite file if needed.",
-        """
-        acquire serve
-        acquire serve --port 8100 --database sqlite:///night.db
-        """,
-        run,
-    )
+    parser = add_command(commands, "serve", run)
     parser.add_argument(
         "--host",
         help="address to listen on; one that is not loopback requires a token; default: "
@@ -33,25 +24,18 @@ def add(commands: Any) -> None:
     )
     parser.add_argument("--port", type=int, help="default: ACQUIRE_PORT, else 8000")
     add_database(parser)
-    parser = add_command(
-        commands,
-        "prepare",
-        "Compile the kernels and build the files of the sky (run catalogs, indexes of the whole "
-        "sky), unless they are there.",
-        """
-        acquire prepare
-        acquire prepare --time 1999-03-01T00:00:00Z
-        """,
-        prepare,
-        NOTES,
-    )
+    parser = add_command(commands, "prepare", prepare, notes=NOTES)
     parser.add_argument(
         "--time", metavar="UTC", help="of the batches that the sky is for; default: now"
     )
 
 
 def run(parsed: Namespace) -> int:
-    """Serve until told to stop."""
+    """Serve the API and the console.  Creates and migrates an SQLite file if needed.
+
+    acquire serve
+    acquire serve --port 8100 --database sqlite:///night.db
+    """
     # Nearly everything loaded at the start stays: looking for garbage takes a sixth of the
     # start.  `ready` enables collection again.
     gc.disable()
@@ -71,7 +55,12 @@ def run(parsed: Namespace) -> int:
 
 
 def prepare(parsed: Namespace) -> int:
-    """Compile, build, and print what was done."""
+    """Compile the kernels and build the files of the sky (run catalogs, indexes of the whole sky),
+    unless they are there.
+
+    acquire prepare
+    acquire prepare --time 1999-03-01T00:00:00Z
+    """
     import logging
     import time
 

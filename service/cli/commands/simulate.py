@@ -5,16 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from service.cli.arguments import (
-    CAMERA_MISSION,
-    MISSION,
-    STANDARD_OUTPUT,
-    add_command,
-    add_group,
-    add_json_file,
-    count,
-    positive,
-)
+from service.cli import arguments
 from service.cli.configuration import mission_and_catalog
 from service.cli.simulated_rates import add_mission, add_paper
 from service.errors import BadInput, Fault, shown_value
@@ -27,7 +18,7 @@ if TYPE_CHECKING:
 
 def add(commands: Any) -> None:
     """Declare the group with its commands."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "simulate",
         "Simulate telemetry and frames with known truth, and repeat published experiments.",
@@ -41,21 +32,12 @@ def add(commands: Any) -> None:
 
 
 def _add_frames(group: Any) -> None:
-    parser = add_command(
-        group,
-        "frames",
-        "Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds "
-        "the known data of FILE.fits; truth.ndjson holds the truth of all frames.",
-        """
-        acquire simulate frames --spacecraft IMAGER --frames 10 --seed 3 frames/
-        acquire simulate frames --spacecraft IMAGER --frames 5 --psf cross --lost frames/
-        acquire simulate frames --spacecraft IMAGER --frames 5 --rates 0.5 --cosmic-rays 50 frames/
-        """,
-        _run_frames,
-    )
+    parser = arguments.add_command(group, "frames", _run_frames)
     parser.add_argument("output", type=Path, metavar="OUTDIR")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=CAMERA_MISSION)
-    parser.add_argument("--frames", required=True, type=count, metavar="N")
+    parser.add_argument(
+        "--spacecraft", required=True, metavar="NAME", help=arguments.CAMERA_MISSION
+    )
+    parser.add_argument("--frames", required=True, type=arguments.count, metavar="N")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--tracker", metavar="NAME", help="default: the first tracker with a camera"
@@ -110,7 +92,13 @@ def _add_frames(group: Any) -> None:
 
 
 def _run_frames(parsed: Namespace) -> int:
-    """Draw frames into a folder, with a progress bar."""
+    """Simulate frames of a star tracker with the real sky and all noise.  FILE.json holds the known
+    data of FILE.fits; truth.ndjson holds the truth of all frames.
+
+    acquire simulate frames --spacecraft IMAGER --frames 10 --seed 3 frames/
+    acquire simulate frames --spacecraft IMAGER --frames 5 --psf cross --lost frames/
+    acquire simulate frames --spacecraft IMAGER --frames 5 --rates 0.5 --cosmic-rays 50 frames/
+    """
     from tqdm import tqdm
 
     from service.simulate.frames import (
@@ -139,30 +127,19 @@ def _run_frames(parsed: Namespace) -> int:
     )
     drawn = draw_frames(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
     bar = tqdm(drawn, total=wanted.frames, unit="frame", disable=None)
-    count = write_frames(bar, parsed.output, parsed.format)
-    print(f"{parsed.output}: {count} frames of {mission.name}; truth: {parsed.output / TRUTH}")
+    written = write_frames(bar, parsed.output, parsed.format)
+    print(f"{parsed.output}: {written} frames of {mission.name}; truth: {parsed.output / TRUTH}")
     return 0
 
 
 def _add_imaging(group: Any) -> None:
-    parser = add_command(
-        group,
-        "imaging",
-        "Compare every claim of the star image detection report with a measurement: crosses of "
-        "wire meshes, correlation, estimation, scans and their noise, pattern constants.",
-        """
-        acquire simulate imaging --row IM-4
-        acquire simulate imaging --seed 7 --json claims.json
-        acquire simulate imaging --plots docs/plots --report docs/imaging.md
-        """,
-        _run_imaging,
-    )
+    parser = arguments.add_command(group, "imaging", _run_imaging)
     parser.add_argument(
         "--row", nargs="+", default=[], metavar="IM-N", help="IM-1 to IM-11; default all"
     )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
-    add_json_file(parser, "the claims with their figures")
+    arguments.add_json_file(parser, "the claims with their figures")
     parser.add_argument(
         "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
     )
@@ -175,10 +152,16 @@ def _add_imaging(group: Any) -> None:
 
 
 def _run_imaging(parsed: Namespace) -> int:
-    """Hold the star image detection report beside what is measured; 1 where a claim is off."""
+    """Compare every claim of the star image detection report with a measurement: crosses of wire
+    meshes, correlation, estimation, scans and their noise, pattern constants.
+
+    acquire simulate imaging --row IM-4
+    acquire simulate imaging --seed 7 --json claims.json
+    acquire simulate imaging --plots docs/plots --report docs/imaging.md
+    """
     from studies.star_image_report.command import as_json, run_imaging
 
-    prints_json = parsed.json == STANDARD_OUTPUT
+    prints_json = parsed.json == arguments.STANDARD_OUTPUT
     rows = run_imaging(
         parsed.row,
         parsed.seed,
@@ -203,23 +186,10 @@ _SERIOUS_SHARE = 0.1
 
 
 def _add_telemetry(group: Any) -> None:
-    parser = add_command(
-        group,
-        "telemetry",
-        "Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the "
-        "truth in OUT.truth.ndjson.  The same arguments always give the same pass.",
-        """
-        acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
-        acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
-        acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
-        acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
-        acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
-        """,
-        _run_telemetry,
-    )
+    parser = arguments.add_command(group, "telemetry", _run_telemetry)
     parser.add_argument("output", type=Path, metavar="OUT.ndjson")
-    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
-    parser.add_argument("--batches", required=True, type=count, metavar="N")
+    parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
+    parser.add_argument("--batches", required=True, type=arguments.count, metavar="N")
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--start",
@@ -231,7 +201,7 @@ def _add_telemetry(group: Any) -> None:
     )
     parser.add_argument(
         "--stars",
-        type=count,
+        type=arguments.count,
         default=5,
         metavar="N",
         help="maximum number of stars per tracker; default 5",
@@ -274,7 +244,7 @@ def _add_telemetry(group: Any) -> None:
     ):
         name = f"--{flag}-share"
         serious.add_argument(name, type=float, metavar="SHARE", help=f"{text}; default {share}")
-        kind: Any = count if unit == "N" else float
+        kind: Any = arguments.count if unit == "N" else float
         name = f"--{flag}-{'stars' if unit == 'N' else unit.lower()}"
         serious.add_argument(name, type=kind, metavar=unit, help=f"default {size}")
 
@@ -285,7 +255,7 @@ def _add_gyro(parser: Any) -> None:
     )
     gyro.add_argument(
         "--gyro",
-        type=positive,
+        type=arguments.positive,
         metavar="S",
         help="seconds between samples; the noise is that of the mission's table [gyro]",
     )
@@ -302,7 +272,15 @@ def _add_gyro(parser: Any) -> None:
 
 
 def _run_telemetry(parsed: Namespace) -> int:
-    """Draw a pass and write it with its truth."""
+    """Simulate a pass with the real sky: NDJSON (or CSV if the name ends in .csv), with the truth
+    in OUT.truth.ndjson.  The same arguments always give the same pass.
+
+    acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson
+    acquire simulate telemetry --spacecraft SOHO --batches 300 --seed 1 --nominal soho.csv
+    acquire simulate telemetry --spacecraft SWAS --batches 500 --seed 2 --serious swas.ndjson
+    acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
+    acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
+    """
     from service.simulate.gyro import with_gyro
     from service.simulate.telemetry import draw_pass, truth_path, write_pass
     from service.sky.cache import LruCache
@@ -315,13 +293,14 @@ def _run_telemetry(parsed: Namespace) -> int:
     if gyro is not None:
         duration_s = (wanted.batches - 1) * wanted.cadence_of(mission)
         drawn = with_gyro(drawn, mission, gyro, duration_s, wanted.seed)
-    count = write_pass(drawn, parsed.output)
-    print(f"{parsed.output}: {count} batches of {mission.name}; truth: {truth_path(parsed.output)}")
+    written = write_pass(drawn, parsed.output)
+    print(
+        f"{parsed.output}: {written} batches of {mission.name}; truth: {truth_path(parsed.output)}"
+    )
     return 0
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
-    """The gyro that the arguments describe, if any."""
     from service.observations.readers.telemetry import telemetry_format
     from service.simulate.gyro import GyroWanted
 

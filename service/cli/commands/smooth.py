@@ -1,71 +1,55 @@
 """`acquire smooth`: filter and smooth recorded attitudes, and record both grades."""
 
 from argparse import Namespace
-from contextlib import ExitStack
+from contextlib import closing
 from typing import Any
 
-from service.cli.arguments import (
-    MISSION,
-    add_command,
-    add_database,
-    add_json,
-    add_period,
-    print_json,
-)
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli import arguments
+from service.cli.configuration import period_of, progress_bar, settings_of_existing
 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "smooth",
-        "Filter and smooth the recorded attitudes of a spacecraft with its gyro, or with a "
-        "constant-rate model where no gyro runs, and record both grades, UTC day by UTC day.  A "
-        "day whose record has not changed is left as it is; one with later batches gets a new "
-        "revision.  With SQLite, stop the service first.",
-        """
-        acquire smooth XTE
-        acquire smooth XTE --start 1999-060T00:00:00Z --end 1999-067T00:00:00Z
-        acquire smooth XTE --run pass-7 --json
-        """,
-        run,
-    )
-    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
-    add_period(parser, "the run that is read; default live")
-    add_json(parser, "the days")
+    parser = arguments.add_command(commands, "smooth", run)
+    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
+    arguments.add_period(parser, "the run that is read; default live")
+    arguments.add_json(parser, "the days")
     parser.add_argument("--quiet", action="store_true", help="no progress bar")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
-    """Smooth a period and print what became of each day."""
+    """Filter and smooth the recorded attitudes of a spacecraft with its gyro, or with a
+    constant-rate model where no gyro runs, and record both grades, UTC day by UTC day.  A day
+    whose record has not changed is left as it is; one with later batches gets a new
+    revision.  With SQLite, stop the service first.
+
+    acquire smooth XTE
+    acquire smooth XTE --start 1999-060T00:00:00Z --end 1999-067T00:00:00Z
+    acquire smooth XTE --run pass-7 --json
+    """
     import msgspec
-    from tqdm import tqdm
 
     from service.app.factory import open_app
-    from service.app.grades import SmoothProgress
 
     start, end = period_of(parsed)
-    settings = settings_of_existing(parsed)
-    with ExitStack() as held:
-        app = open_app(settings)
-        held.callback(app.close)
-        with tqdm(total=None, unit=" days", desc="smoothing", disable=parsed.quiet or None) as bar:
-
-            def step(progress: SmoothProgress) -> None:
-                bar.total = progress.total
-                bar.update(progress.done - bar.n)
-
-            progress = app.grades.smooth(
-                parsed.spacecraft, run=parsed.run, start=start, end=end, step=step
-            )
+    with (
+        closing(open_app(settings_of_existing(parsed))) as app,
+        progress_bar("days", "smoothing", parsed.quiet, leave=True) as bar,
+    ):
+        progress = app.grades.smooth(
+            parsed.spacecraft,
+            run=parsed.run,
+            start=start,
+            end=end,
+            step=lambda progress: bar(progress.done, progress.total),
+        )
     if parsed.json:
         days = [
             {**msgspec.to_builtins(day), "new": day.id in progress.new} for day in progress.days
         ]
         counts = {"empty": progress.empty, "archived": progress.archived}
-        print_json({"days_with_batches": progress.total, **counts, "days": days})
+        arguments.print_json({"days_with_batches": progress.total, **counts, "days": days})
     else:
         print(_text(progress))
     return 0

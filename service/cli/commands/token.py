@@ -7,7 +7,7 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from service.cli.arguments import SERVICE, add_command, add_database, add_group, add_json, count
-from service.cli.configuration import service_url, settings_of, settings_of_existing
+from service.cli.configuration import service_url, settings_of_existing
 
 
 def add(commands: Any) -> None:
@@ -25,18 +25,7 @@ def add(commands: Any) -> None:
         acquire token revoke pipeline
         """,
     )
-    parser = add_command(
-        group,
-        "create",
-        "Create a token and print it once: the database keeps only its digest.  The audit list "
-        "records changes under the token's name.",
-        """
-        acquire token create pipeline --scope submit --spacecraft XTE
-        ACQUIRE_TOKEN=acq_... acquire replay pass.ndjson
-        curl -H "Authorization: Bearer acq_..." http://127.0.0.1:8000/api/v1/spacecraft
-        """,
-        create,
-    )
+    parser = add_command(group, "create", create)
     parser.add_argument("name", metavar="NAME", help="name of a program or a person")
     parser.add_argument(
         "--scope",
@@ -66,18 +55,10 @@ def add(commands: Any) -> None:
         help="maximum number of requests per second; default: no limit",
     )
     add_service(parser)
-    parser = add_command(
-        group, "list", "Show every token, without its secret.", "acquire token list", show
-    )
+    parser = add_command(group, "list", show)
     add_json(parser, "the tokens")
     add_database(parser)
-    parser = add_command(
-        group,
-        "revoke",
-        "End a token and its browser sessions, within a second.",
-        "acquire token revoke pipeline",
-        revoke,
-    )
+    parser = add_command(group, "revoke", revoke)
     parser.add_argument("name", metavar="NAME")
     add_service(parser)
 
@@ -92,29 +73,36 @@ def add_service(parser: ArgumentParser) -> None:
 
 
 def create(parsed: Namespace) -> int:
-    """Make a token and print it."""
-    from service.cli import tokens
+    """Create a token and print it once: the database keeps only its digest.  The audit list records
+    changes under the token's name.
 
-    return tokens.create(
-        settings_of(parsed),
-        service_url(parsed),
-        parsed.name,
-        parsed.scope,
-        parsed.spacecraft,
-        parsed.days,
-        parsed.rate,
-    )
+    acquire token create pipeline --scope submit --spacecraft XTE
+    ACQUIRE_TOKEN=acq_... acquire replay pass.ndjson
+    curl -H "Authorization: Bearer acq_..." http://127.0.0.1:8000/api/v1/spacecraft
+    """
+    from service.cli.tokens import create_token
+
+    return create_token(parsed)
 
 
 def show(parsed: Namespace) -> int:
-    """Print every token."""
-    from service.cli import tokens
+    """Show every token, without its secret.
 
-    return tokens.show(settings_of_existing(parsed), as_json=parsed.json)
+    acquire token list
+    """
+    from service.cli.tokens import print_tokens
+
+    return print_tokens(settings_of_existing(parsed), parsed.json)
 
 
 def revoke(parsed: Namespace) -> int:
-    """End a token."""
-    from service.cli import tokens
+    """End a token and its browser sessions, within a second.
 
-    return tokens.revoke(settings_of_existing(parsed), service_url(parsed), parsed.name)
+    acquire token revoke pipeline
+    """
+    from service.cli.tokens import opened_tokens
+
+    with opened_tokens(settings_of_existing(parsed), service_url(parsed)) as tokens:
+        tokens.revoke(parsed.name)
+    print(f"{parsed.name} is revoked; a running service heeds that within a second")
+    return 0

@@ -1,6 +1,7 @@
 """`acquire tracks`: moving points, planets and hot pixels among the unmatched stars of a record."""
 
 from argparse import Namespace
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,17 +12,7 @@ from service.errors import BadInput, Fault
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(
-        commands,
-        "tracks",
-        "Link the unmatched stars of recorded batches to tracks: objects that move on the sky, "
-        "planets, and hot pixels, which keep their place on the detector.  Changes nothing.",
-        """
-        acquire tracks XTE --start 1999-060T00:00:00Z --end 1999-060T01:00:00Z
-        acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
-        """,
-        run,
-    )
+    parser = add_command(commands, "tracks", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
     add_period(parser, "the run to use; default live")
     parser.add_argument(
@@ -37,7 +28,12 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Link, and print or write."""
+    """Link the unmatched stars of recorded batches to tracks: objects that move on the sky,
+    planets, and hot pixels, which keep their place on the detector.  Changes nothing.
+
+    acquire tracks XTE --start 1999-060T00:00:00Z --end 1999-060T01:00:00Z
+    acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
+    """
     from service.app.factory import open_app
     from service.cli.arguments import written_to
     from service.cli.texts import tracks_text
@@ -45,8 +41,7 @@ def run(parsed: Namespace) -> int:
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))
     start, end = period_of(parsed)
-    app = open_app(settings_of_existing(parsed), reads_only=True)
-    try:
+    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
             written_to(parsed.output, app.tracks.tdm(found))
@@ -54,6 +49,4 @@ def run(parsed: Namespace) -> int:
             print_json(found)
         else:
             print(tracks_text(found))
-    finally:
-        app.close()
     return 0

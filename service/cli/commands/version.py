@@ -9,10 +9,13 @@ from service.cli.arguments import add_command
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    add_command(commands, "version", "Print the version.", "acquire version", run)
+    add_command(commands, "version", run)
 
 
 def run(parsed: Namespace) -> int:
-    """Print the version."""
+    """Print the version.
+
+    acquire version
+    """
     print(f"acquire {__version__}")
     return 0

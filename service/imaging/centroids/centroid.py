@@ -13,25 +13,10 @@ from collections.abc import Sequence
 from typing import Literal
 
 from service.errors import BadInput, Fault
+from service.imaging.centroids import record, shape_fit
 from service.imaging.centroids.moments import by_moments, is_blended
 from service.imaging.centroids.psf import Psf
-from service.imaging.centroids.record import (
-    CentroidRecord,
-    Flag,
-    refusal,
-    too_faint,
-)
 from service.imaging.centroids.sequential import diffuse
-from service.imaging.centroids.shape_fit import (
-    ENOUGH_SIGMAS,
-    Fit,
-    first_flux,
-    fit,
-    linearised,
-    region_after_step,
-    stepped,
-    with_level_error,
-)
 from service.imaging.centroids.window import Window, brightest_pixel, square_about
 from service.observations.scans.profile import BREAKDOWN_RATIO
 
@@ -47,7 +32,7 @@ def centroid(
     start: tuple[float, float] | None = None,
     half_width_px: int = DEFAULT_HALF_WIDTH_PX,
     recentre: bool = True,
-) -> CentroidRecord:
+) -> record.CentroidRecord:
     """The place of the star in a window, with predicted sigmas and flags.
 
     `start` is (u, v) in pixels of the frame, by default the brightest 3 x 3 pixels.
@@ -70,7 +55,7 @@ def centroid(
         return by_moments(window, method, psf, middle, half_width_px, recentre)
     if psf is None:
         raise BadInput(Fault("psf", f"is needed by the method {method}"))
-    way = fit if method == "matched" else recursive_fit
+    way = shape_fit.fit if method == "matched" else recursive_fit
     found = way(window, psf, (column, row), half_width_px, recentre)
     return record_of(method, found, psf, half_width_px, window)
 
@@ -84,21 +69,23 @@ def _start(window: Window, start: tuple[float, float] | None) -> tuple[float, fl
 
 
 def record_of(
-    method: str, found: Fit | None, psf: Psf, half_width_px: int, window: Window
-) -> CentroidRecord:
+    method: str, found: shape_fit.Fit | None, psf: Psf, half_width_px: int, window: Window
+) -> record.CentroidRecord:
     """The record of a fit, or its refusal in words."""
     if found is None:
-        return refusal(method, "the shape fits no light of this window", (Flag.OUTSIDE,))
+        return record.refusal(
+            method, "the shape fits no light of this window", (record.Flag.OUTSIDE,)
+        )
     flags = found.region.flags(half_width_px)
     flux, sigma = found.flux_counts, math.sqrt(found.covariance[2, 2])
     if not found.signal_ratio >= BREAKDOWN_RATIO:
-        return too_faint(method, flux, sigma, flags)
+        return record.too_faint(method, flux, sigma, flags)
     if not found.converged:
-        flags = (*flags, Flag.NOT_CONVERGED)
+        flags = (*flags, record.Flag.NOT_CONVERGED)
     if is_blended(found, psf):
-        flags = (*flags, Flag.BLENDED)
+        flags = (*flags, record.Flag.BLENDED)
     sigma_u, sigma_v = math.sqrt(found.covariance[0, 0]), math.sqrt(found.covariance[1, 1])
-    return CentroidRecord(
+    return record.CentroidRecord(
         method=method,
         u_px=window.corner_u_px + found.u_px,
         v_px=window.corner_v_px + found.v_px,
@@ -120,7 +107,7 @@ VAGUE = 100.0
 
 def recursive_fit(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
-) -> Fit | None:
+) -> shape_fit.Fit | None:
     """Passes over the pixels, each one point at a time, until the place stays; None without light.
 
     With `recentre` false there is one pass: the report's own form.
@@ -129,19 +116,21 @@ def recursive_fit(
     region = square_about(window, round(u), round(v), half_width_px)
     if region is None:
         return None
-    flux = first_flux(region, psf, u, v)
+    flux = shape_fit.first_flux(region, psf, u, v)
     passes, converged = 0, False
     while not converged and passes < MOST_PASSES:
         passes += 1
-        seen = linearised(region, psf, u, v, flux)
+        seen = shape_fit.linearised(region, psf, u, v, flux)
         vague = VAGUE * half_width_px
         start_of_pass = diffuse((vague, vague, VAGUE * flux))
         estimate = start_of_pass.replayed(seen.rows, seen.left, seen.variance)
-        converged = not recentre or seen.sigmas_of(estimate.state) < ENOUGH_SIGMAS
-        u, v, flux = stepped(u, v, flux, estimate.state)
-        moved = region_after_step(window, region, (u, v), start, half_width_px, recentre)
+        converged = not recentre or seen.sigmas_of(estimate.state) < shape_fit.ENOUGH_SIGMAS
+        u, v, flux = shape_fit.stepped(u, v, flux, estimate.state)
+        moved = shape_fit.region_after_step(window, region, (u, v), start, half_width_px, recentre)
         if moved is None:
             return None
         region = moved
-    covariance = with_level_error(estimate.covariance, seen, window.background_sigma_counts)
-    return Fit(u, v, flux, covariance, region, passes, converged)
+    covariance = shape_fit.with_level_error(
+        estimate.covariance, seen, window.background_sigma_counts
+    )
+    return shape_fit.Fit(u, v, flux, covariance, region, passes, converged)

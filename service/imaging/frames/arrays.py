@@ -2,6 +2,8 @@
 
 import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import IO, Any
 
 import numpy as np
@@ -57,6 +59,21 @@ def _colour_axis(shape: tuple[int, ...]) -> int | None:
         return 2 if shape[2] == COLOURS else 0
     message = "must have two dimensions, rows and columns, or a third of three colours"
     raise bad_frame(message, str(shape)[:80])
+
+
+@contextmanager
+def decoding(what: str) -> Iterator[None]:
+    """Turn whatever a decoder raises into `BadFile`: what it reads is no such file.
+
+    A decoder that stumbles over what it reads does so in many ways.
+    """
+    try:
+        yield
+    except BadFile:
+        raise
+    except Exception as error:
+        reason = str(error)[:200] or type(error).__name__
+        raise bad_frame(f"cannot be read as {what}: {reason}") from None
 
 
 def exactly(file: IO[bytes], count: int) -> bytes:

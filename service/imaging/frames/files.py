@@ -13,12 +13,12 @@ import tempfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from pkgutil import resolve_name
 from typing import IO
 
 import numpy as np
 
-from service.errors import BadFile
-from service.imaging.frames.arrays import as_counts
+from service.imaging.frames.arrays import as_counts, decoding
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 
 Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
@@ -94,41 +94,26 @@ def frame_digest(file: IO[bytes]) -> str:
     return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
-def _fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
-    from service.imaging.frames.fits import read_fits
+def _later(name: str, *arguments: str) -> Reader:
+    """The reader of a name, imported when it is called: the service's start loads none."""
 
-    return read_fits(file, limits, digest)
-
-
-def _tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
-    from service.imaging.frames.tiff import read_tiff
-
-    return read_tiff(file, limits, digest)
-
-
-def _pictures(file_format: str) -> Reader:
     def read(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
-        from service.imaging.frames.pictures import read_picture
-
-        return read_picture(file, file_format, limits, digest)
+        frame: Frame = resolve_name(f"service.imaging.frames.{name}")(
+            file, *arguments, limits, digest
+        )
+        return frame
 
     return read
 
 
-def _npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
-    from service.imaging.frames.arrays import read_npy
-
-    return read_npy(file, limits, digest)
-
-
 _READERS: Mapping[tuple[bytes, ...], Reader] = {
-    (b"SIMPLE  =",): _fits,
-    (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"): _tiff,
-    (b"\x89PNG\r\n\x1a\n",): _pictures("PNG"),
-    (b"\xff\xd8\xff",): _pictures("JPEG"),
-    (b"BM",): _pictures("BMP"),
-    (b"P2", b"P3", b"P5", b"P6"): _pictures("PGM"),
-    (b"\x93NUMPY",): _npy,
+    (b"SIMPLE  =",): _later("fits:read_fits"),
+    (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"): _later("tiff:read_tiff"),
+    (b"\x89PNG\r\n\x1a\n",): _later("pictures:read_picture", "PNG"),
+    (b"\xff\xd8\xff",): _later("pictures:read_picture", "JPEG"),
+    (b"BM",): _later("pictures:read_picture", "BMP"),
+    (b"P2", b"P3", b"P5", b"P6"): _later("pictures:read_picture", "PGM"),
+    (b"\x93NUMPY",): _later("arrays:read_npy"),
 }
 
 
@@ -177,28 +162,20 @@ def read_raw(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
         raise bad_frame(ABSENT)
     import rawpy
 
-    try:
-        with rawpy.imread(file) as raw:
-            sizes = raw.sizes
-            pattern = raw.raw_pattern
-            step = 1 if pattern is None else len(pattern)
-            if sizes.raw_width * sizes.raw_height > step**2 * limits.max_pixels:
-                limits.require(sizes.raw_width // step, sizes.raw_height // step)
-            limits.require(sizes.width // step, sizes.height // step)
-            values = raw.raw_image_visible
-            if values is None or values.ndim != 2:
-                raise bad_frame(
-                    "holds colours that are already mixed; convert it to TIFF of 16 bits"
-                )
-            rows, columns = (side // step for side in values.shape)
-            blocks = values[: rows * step, : columns * step].reshape(rows, step, columns, step)
-            counts = blocks.sum(axis=(1, 3), dtype=np.uint32)
-            full_scale = float(step**2 * raw.white_level)
-            shutter_s = float(getattr(raw.other, "shutter", 0.0) or 0.0)
-    except BadFile:
-        raise
-    except Exception as error:
-        # LibRaw knows some hundred ways in which a file is wrong.
-        raise bad_frame(f"cannot be read as a raw file: {str(error)[:200]}") from None
+    with decoding("a raw file"), rawpy.imread(file) as raw:
+        sizes = raw.sizes
+        pattern = raw.raw_pattern
+        step = 1 if pattern is None else len(pattern)
+        if sizes.raw_width * sizes.raw_height > step**2 * limits.max_pixels:
+            limits.require(sizes.raw_width // step, sizes.raw_height // step)
+        limits.require(sizes.width // step, sizes.height // step)
+        values = raw.raw_image_visible
+        if values is None or values.ndim != 2:
+            raise bad_frame("holds colours that are already mixed; convert it to TIFF of 16 bits")
+        rows, columns = (side // step for side in values.shape)
+        blocks = values[: rows * step, : columns * step].reshape(rows, step, columns, step)
+        counts = blocks.sum(axis=(1, 3), dtype=np.uint32)
+        full_scale = float(step**2 * raw.white_level)
+        shutter_s = float(getattr(raw.other, "shutter", 0.0) or 0.0)
     exposure_s = shutter_s if 0.0 < shutter_s <= 3600.0 else None
     return Frame(as_counts(counts), "RAW", digest, full_scale, None, exposure_s)

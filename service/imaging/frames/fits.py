@@ -10,16 +10,8 @@ from typing import IO, Any
 import numpy as np
 
 from service.errors import BadFile
-from service.imaging.frames.arrays import as_counts, exactly
-from service.imaging.frames.fits_header import (
-    BLOCK,
-    CARD,
-    TYPES,
-    Header,
-    Unit,
-    time_of_header,
-    units_of,
-)
+from service.imaging.frames import fits_header
+from service.imaging.frames.arrays import as_counts, decoding, exactly
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
 ABSENT = (
@@ -47,7 +39,7 @@ def read_fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     full_scale = _full_scale(header) * len(planes)
     if len(planes) > 1:
         remarks = (*remarks, "image: its three planes were summed as colours")
-    timing = time_of_header(header, primary)
+    timing = fits_header.time_of_header(header, primary)
     counts, orientation = _as_shown(counts, header.behind(primary))
     return Frame(
         *(counts, "FITS", digest, full_scale, timing.time, timing.exposure_s),
@@ -67,18 +59,20 @@ def write_fits(
         "SIMPLE": True, "BITPIX": 16, "NAXIS": 2, "NAXIS1": width_px, "NAXIS2": height_px,
         "BZERO": 32768, "BSCALE": 1, **cards,
     }  # fmt: skip
-    text = "".join(_card(key, value) for key, value in header.items()) + "END".ljust(CARD)
-    file.write(text.encode("ascii").ljust(-(-len(text) // BLOCK) * BLOCK))
+    text = "".join(_card(key, value) for key, value in header.items()) + "END".ljust(
+        fits_header.CARD
+    )
+    file.write(text.encode("ascii").ljust(-(-len(text) // fits_header.BLOCK) * fits_header.BLOCK))
     data = (counts.astype(np.int32) - 32768).astype(">i2").tobytes()
-    file.write(data.ljust(-(-len(data) // BLOCK) * BLOCK, b"\0"))
+    file.write(data.ljust(-(-len(data) // fits_header.BLOCK) * fits_header.BLOCK, b"\0"))
 
 
-def _images(file: IO[bytes]) -> tuple[list[Unit], Header]:
+def _images(file: IO[bytes]) -> tuple[list[fits_header.Unit], fits_header.Header]:
     """The units that hold images, and the primary header; raises `BadFile` where there is none."""
-    images: list[Unit] = []
-    primary: Header | None = None
+    images: list[fits_header.Unit] = []
+    primary: fits_header.Header | None = None
     try:
-        for unit in units_of(file):
+        for unit in fits_header.units_of(file):
             primary = primary or unit.header
             if unit.header.is_image:
                 images.append(unit)
@@ -91,7 +85,9 @@ def _images(file: IO[bytes]) -> tuple[list[Unit], Header]:
     return images, primary
 
 
-def _chosen(images: Sequence[Unit], choice: str | None) -> tuple[Unit, int | None, tuple[str, ...]]:
+def _chosen(
+    images: Sequence[fits_header.Unit], choice: str | None
+) -> tuple[fits_header.Unit, int | None, tuple[str, ...]]:
     """The unit that was chosen, its plane if one was, and remarks where there are others."""
     named = ", ".join(f"{each.number} {each.header.name}".strip() for each in images[:MAX_NAMED])
     if choice is None:
@@ -110,7 +106,7 @@ def _chosen(images: Sequence[Unit], choice: str | None) -> tuple[Unit, int | Non
     raise bad_frame(f"holds the images {named}; choose one of them", choice[:40])
 
 
-def _planes(header: Header, plane: int | None) -> tuple[list[int], bool]:
+def _planes(header: fits_header.Header, plane: int | None) -> tuple[list[int], bool]:
     """The planes of a unit to sum, from 0, and whether its colours stand pixel by pixel."""
     axes = header.image_axes
     count = 1
@@ -130,7 +126,7 @@ def _planes(header: Header, plane: int | None) -> tuple[list[int], bool]:
     raise bad_frame(message, " x ".join(str(length) for length in axes[:6]))
 
 
-def _scaling(header: Header) -> tuple[float, float]:
+def _scaling(header: fits_header.Header) -> tuple[float, float]:
     scale = header.number("BSCALE", 1.0)
     if scale == 0.0:
         raise bad_frame("has a FITS header with an impossible BSCALE", "0")
@@ -140,9 +136,9 @@ def _scaling(header: Header) -> tuple[float, float]:
 class _Plain:
     """The numbers of a unit that is not compressed."""
 
-    def __init__(self, file: IO[bytes], unit: Unit) -> None:
+    def __init__(self, file: IO[bytes], unit: fits_header.Unit) -> None:
         self._file, self._unit = file, unit
-        self._kind = np.dtype(TYPES[unit.header.bitpix])
+        self._kind = np.dtype(fits_header.TYPES[unit.header.bitpix])
         self._scaling = _scaling(unit.header)
 
     def plane(self, number: int) -> CountArray:
@@ -174,7 +170,7 @@ class _Plain:
 class _Compressed:
     """The numbers of an image that is compressed by tiles, through astropy."""
 
-    def __init__(self, file: IO[bytes], unit: Unit) -> None:
+    def __init__(self, file: IO[bytes], unit: fits_header.Unit) -> None:
         if find_spec("astropy") is None:
             raise bad_frame(ABSENT)
         self._file, self._unit = file, unit
@@ -206,7 +202,7 @@ class _Compressed:
 
         axes = self._unit.header.image_axes
         self._file.seek(0)
-        try:
+        with decoding("compressed FITS"):
             opened = fits.open(self._file, memmap=False, lazy_load_hdus=True)
             try:
                 section = opened[self._unit.number].section
@@ -216,14 +212,10 @@ class _Compressed:
                 values = section[(0,) * extra + tuple(int(each) for each in place)]
             finally:
                 opened.close(closed=False)
-        except Exception as error:
-            # A decoder that stumbles over what it reads does so in many ways.
-            reason = str(error)[:200] or type(error).__name__
-            raise bad_frame(f"cannot be read as compressed FITS: {reason}") from None
         return as_counts(np.asarray(values))
 
 
-def exactly_there(file: IO[bytes], unit: Unit) -> None:
+def exactly_there(file: IO[bytes], unit: fits_header.Unit) -> None:
     """Raise `BadFile` where a file ends before the data of a unit do."""
     left = file.seek(0, 2) - unit.start
     if unit.header.data_bytes > left:
@@ -231,16 +223,16 @@ def exactly_there(file: IO[bytes], unit: Unit) -> None:
         raise bad_frame("is cut off", declared)
 
 
-def _full_scale(header: Header) -> float:
+def _full_scale(header: fits_header.Header) -> float:
     """The largest count of a plane, infinite for floating numbers."""
-    kind = np.dtype(TYPES[header.bitpix])
+    kind = np.dtype(fits_header.TYPES[header.bitpix])
     if kind.kind not in "iu":
         return float(np.inf)
     scale, zero = _scaling(header)
     return max(float(np.iinfo(kind).max) * scale, float(np.iinfo(kind).min) * scale) + zero
 
 
-def _as_shown(counts: CountArray, header: Header) -> tuple[CountArray, str]:
+def _as_shown(counts: CountArray, header: fits_header.Header) -> tuple[CountArray, str]:
     """The rows from the top down, by ROWORDER, and what was done."""
     order = str(header.cards.get("ROWORDER") or "").strip().upper().replace("_", "-")
     if order != "BOTTOM-UP":
@@ -256,4 +248,4 @@ def _card(key: str, value: bool | int | float | str) -> str:
         shown = "'" + value.replace("'", "''").ljust(8) + "'"
     else:
         shown = f"{value!r:>20}".upper()
-    return f"{key:<8}= {shown}".ljust(CARD)[:CARD]
+    return f"{key:<8}= {shown}".ljust(fits_header.CARD)[: fits_header.CARD]

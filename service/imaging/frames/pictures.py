@@ -7,8 +7,7 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from service.errors import BadFile
-from service.imaging.frames.arrays import as_counts, exactly, full_scale_of
+from service.imaging.frames.arrays import as_counts, decoding, exactly, full_scale_of
 from service.imaging.frames.exif import TAG, as_shown, exif_of, exposure_of, require_small_exif
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
@@ -25,44 +24,43 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
 
     Of a colour picture the counts are the sums of red, green and blue.
     """
-    from PIL import Image, UnidentifiedImageError
-
     if limits.image not in (None, "1"):
         raise bad_frame("holds one image; there is none to choose", limits.image)
     if file_format == "JPEG":
         require_small_exif(file)
-    try:
-        with Image.open(file, formats=(_PILLOW_NAMES.get(file_format, file_format),)) as image:
-            limits.require_either_way(*image.size)
-            if file_format == "PNG" and getattr(image, "is_animated", False):
-                raise bad_frame("is a moving picture; send one picture of it")
-            # To look for EXIF may decode the picture, and takes the word of its depth away.
-            deep, grey, plain = is_deep(image), is_deep_grey(image), _is_plain(image)
-            tag = exif_of(image).get(TAG)
-            time, exposure_s = exposure_of(image)
-            values: npt.NDArray[Any]
-            if deep:
-                values, full_scale = deep_light(image, file, file_format), 3.0 * 65535.0
-            elif grey:
-                values, full_scale = deep_grey(file, file_format), 65535.0
-            elif plain:
-                values, full_scale = _plain_light(image, file)
-            else:
-                values, full_scale = _light(image)
-            if file_format == "JPEG":
-                file.seek(0)
-                require_whole(file.read(), limits.max_pixels)
-    except BadFile:
-        raise
-    except UnidentifiedImageError:
-        raise bad_frame(f"cannot be read as {file_format}: its header has no known form") from None
-    except Exception as error:
-        # A decoder that stumbles over what it reads does so in many ways.
-        reason = str(error)[:200] or type(error).__name__
-        raise bad_frame(f"cannot be read as {file_format}: {reason}") from None
+    with decoding(file_format), _opened(file, file_format) as image:
+        limits.require_either_way(*image.size)
+        if file_format == "PNG" and getattr(image, "is_animated", False):
+            raise bad_frame("is a moving picture; send one picture of it")
+        # To look for EXIF may decode the picture, and takes the word of its depth away.
+        deep, grey, plain = is_deep(image), is_deep_grey(image), _is_plain(image)
+        tag = exif_of(image).get(TAG)
+        time, exposure_s = exposure_of(image)
+        values: npt.NDArray[Any]
+        if deep:
+            values, full_scale = deep_light(image, file, file_format), 3.0 * 65535.0
+        elif grey:
+            values, full_scale = deep_grey(file, file_format), 65535.0
+        elif plain:
+            values, full_scale = _plain_light(image, file)
+        else:
+            values, full_scale = _light(image)
+        if file_format == "JPEG":
+            file.seek(0)
+            require_whole(file.read(), limits.max_pixels)
     counts, orientation = as_shown(as_counts(values), tag)
     limits.require(counts.shape[1], counts.shape[0])
     return Frame(counts, file_format, digest, full_scale, time, exposure_s, orientation=orientation)
+
+
+def _opened(file: IO[bytes], file_format: str) -> Any:
+    """A picture of a format, opened by Pillow and not decoded; raises `BadFile` for another one."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        return Image.open(file, formats=(_PILLOW_NAMES.get(file_format, file_format),))
+    except UnidentifiedImageError:
+        raise bad_frame(f"cannot be read as {file_format}: its header has no known form") from None
 
 
 def _is_plain(image: Any) -> bool:

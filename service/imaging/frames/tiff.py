@@ -15,8 +15,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.errors import BadFile
-from service.imaging.frames.arrays import as_counts, full_scale_of
+from service.imaging.frames.arrays import as_counts, decoding, full_scale_of
 from service.imaging.frames.exif import (
     MAX_EXIF_BYTES,
     TAG,
@@ -55,28 +54,24 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     from tifffile import TiffFile
 
     number, remarks = chosen_page(_subfiles(file), limits.image)
-    try:
-        file.seek(0)
-        with TiffFile(file, name="frame", _multifile=False, is_ndpi=False) as opened:
-            page: Any = opened.pages[number]
-            _require_readable(page, limits)
-            tag = page.tags.valueof(TAG)
-            time, exposure_s = _page_exposure(page)
-            if page.photometric in _BY_PILLOW or page.compression == _JPEG:
-                if page.compression == _JPEG:
-                    _require_whole_segments(page, file, limits)
-                # Pillow turns what it decodes by itself.
-                counts, full_scale = _by_pillow(file, number)
-                _, orientation = as_shown(np.zeros((1, 1)), tag)
-            else:
-                stored, full_scale = _light(page, file)
-                counts, orientation = as_shown(as_counts(stored), tag)
-    except BadFile:
-        raise
-    except Exception as error:
-        # A reader of tags that stumbles over what it reads does so in many ways.
-        reason = str(error)[:200] or type(error).__name__
-        raise bad_frame(f"cannot be read as TIFF: {reason}") from None
+    file.seek(0)
+    with (
+        decoding("TIFF"),
+        TiffFile(file, name="frame", _multifile=False, is_ndpi=False) as opened,
+    ):
+        page: Any = opened.pages[number]
+        _require_readable(page, limits)
+        tag = page.tags.valueof(TAG)
+        time, exposure_s = _page_exposure(page)
+        if page.photometric in _BY_PILLOW or page.compression == _JPEG:
+            if page.compression == _JPEG:
+                _require_whole_segments(page, file, limits)
+            # Pillow turns what it decodes by itself.
+            counts, full_scale = _by_pillow(file, number)
+            _, orientation = as_shown(np.zeros((1, 1)), tag)
+        else:
+            stored, full_scale = _light(page, file)
+            counts, orientation = as_shown(as_counts(stored), tag)
     limits.require(counts.shape[1], counts.shape[0])
     return Frame(
         *(counts, "TIFF", digest, full_scale, time, exposure_s),

@@ -12,16 +12,8 @@ from collections.abc import Iterable
 from typing import Any
 
 from service.errors import BadFile, Fault, shown_value
+from service.observations import schema
 from service.observations.readers.csv_table import CsvRow
-from service.observations.schema import (
-    BatchIn,
-    BoresightIn,
-    FromLastIn,
-    QuaternionIn,
-    StarIn,
-    SunPointedIn,
-    TrackerIn,
-)
 
 KEY = ("spacecraft", "run", "batch")
 REQUIRED = ("spacecraft", "batch", "time", "tracker")
@@ -220,14 +212,14 @@ def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
     return {column: repr(value) for column, value in cells}
 
 
-def list_cells(model: StarIn | TrackerIn | SunPointedIn) -> CsvRow:
+def list_cells(model: schema.StarIn | schema.TrackerIn | schema.SunPointedIn) -> CsvRow:
     """The cells of readings: of a star, of a tracker's raster, of the sun tracker."""
     names = *READINGS, *LINES, "sun_counts"
     lists = ((name, getattr(model, name, None)) for name in names)
     return {name: " ".join(map(repr, values)) for name, values in lists if values is not None}
 
 
-def batch_cells(batch: BatchIn) -> CsvRow:
+def batch_cells(batch: schema.BatchIn) -> CsvRow:
     """The cells of a checked batch that are the same in each of its rows."""
     prior = batch.a_priori
     cells: CsvRow = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
@@ -235,16 +227,16 @@ def batch_cells(batch: BatchIn) -> CsvRow:
     vectors: dict[str, tuple[float, ...] | None] = {
         name: getattr(batch, name, None) for name in VECTORS
     }
-    if isinstance(prior, FromLastIn):
+    if isinstance(prior, schema.FromLastIn):
         if not prior.by_default:
             cells["a_priori_from"] = prior.from_
     elif prior is not None:
         cells["frame"] = prior.frame
-    if isinstance(prior, QuaternionIn):
+    if isinstance(prior, schema.QuaternionIn):
         vectors["quaternion"] = prior.quaternion
-    elif isinstance(prior, BoresightIn):
+    elif isinstance(prior, schema.BoresightIn):
         vectors["boresight"] = (prior.boresight.ra_deg, prior.boresight.dec_deg)
-    elif isinstance(prior, SunPointedIn):
+    elif isinstance(prior, schema.SunPointedIn):
         cells["sun_pointed"] = "true"
         cells |= list_cells(prior)
         vectors["sun_vector"] = prior.sun_vector or batch.sun_vector

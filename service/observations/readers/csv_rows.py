@@ -14,24 +14,7 @@ from typing import Any, ClassVar, TextIO
 from service.csv_cells import neutralised
 from service.errors import Fault
 from service.observations.batch import MAX_STARS_PER_TRACKER, MAX_TRACKERS
-from service.observations.readers.csv_columns import (
-    BATCH_COLUMNS,
-    COLUMNS,
-    DIRECTION,
-    KEY,
-    STAR_COLUMNS,
-    STAR_NUMBERS,
-    TEXTS,
-    VERBATIM,
-    BadCell,
-    batch_cells,
-    batch_fields,
-    checked_header,
-    lines_of,
-    list_cells,
-    number_cells,
-    star_of,
-)
+from service.observations.readers import csv_columns
 from service.observations.readers.csv_table import CsvRow, Row, RowKind
 from service.observations.readers.decompress import Line
 from service.observations.schema import BatchIn
@@ -39,11 +22,11 @@ from service.observations.schema import BatchIn
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS
 BATCH_ROWS = RowKind(
     "batch",
-    KEY,
-    COLUMNS,
-    texts=frozenset((*TEXTS, "tracker", "options", "sun_pointed", "a_priori_from")),
-    verbatim=frozenset(VERBATIM),
-    check_header=checked_header,
+    csv_columns.KEY,
+    csv_columns.COLUMNS,
+    texts=frozenset((*csv_columns.TEXTS, "tracker", "options", "sun_pointed", "a_priori_from")),
+    verbatim=frozenset(csv_columns.VERBATIM),
+    check_header=csv_columns.checked_header,
     ordered_by_time=False,
 )
 
@@ -68,7 +51,7 @@ class JoinedRows(ABC):
         if self.fault is None:
             try:
                 self.take(row)
-            except BadCell as bad:
+            except csv_columns.BadCell as bad:
                 self.refuse(number, bad.fault(number))
 
     @abstractmethod
@@ -130,7 +113,7 @@ def joined_lines(rows: Iterator[Row], kind: type[JoinedRows]) -> Iterator[Line]:
 class BatchRows(JoinedRows):
     """The rows of one batch: its own fields once, then a star a row."""
 
-    key_columns = KEY
+    key_columns = csv_columns.KEY
     may_lack = "the batch may lack a star"
     refuses_faulty_rows = True
 
@@ -146,25 +129,29 @@ class BatchRows(JoinedRows):
         """Take the cells of a row; raises `BadCell`."""
         self.rows += 1
         if self.rows > MAX_ROWS:
-            raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
+            raise csv_columns.BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
         if self.rows == 1:
-            self.first, self.fields = row, batch_fields(row)
-        for column in BATCH_COLUMNS:
+            self.first, self.fields = row, csv_columns.batch_fields(row)
+        for column in csv_columns.BATCH_COLUMNS:
             if row.get(column, "") != self.first.get(column, ""):
                 message = f"differs from line {self.number}, the first of the batch"
-                raise BadCell(column, message, row[column])
+                raise csv_columns.BadCell(column, message, row[column])
         if "measurement" in self.fields:
             if self.rows > 1:
-                raise BadCell("batch", "has a second measured attitude", self.key[-1])
-            if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
-                raise BadCell("batch", "has stars beside a measured attitude", cell)
+                raise csv_columns.BadCell("batch", "has a second measured attitude", self.key[-1])
+            if cell := next(
+                (row[each] for each in csv_columns.STAR_COLUMNS[1:] if row.get(each)), None
+            ):
+                raise csv_columns.BadCell("batch", "has stars beside a measured attitude", cell)
             return
         stars = self.trackers.setdefault(row["tracker"], [])
-        if any(row.get(column) for column in STAR_COLUMNS[1:]):
-            stars.append(star_of(row))
-        if lines := lines_of(row):
+        if any(row.get(column) for column in csv_columns.STAR_COLUMNS[1:]):
+            stars.append(csv_columns.star_of(row))
+        if lines := csv_columns.lines_of(row):
             if row["tracker"] in self.rasters:
-                raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
+                raise csv_columns.BadCell(
+                    next(iter(lines)), "has lines of the tracker a second time"
+                )
             self.rasters[row["tracker"]] = lines
 
     def body(self) -> Mapping[str, Any]:
@@ -182,23 +169,29 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     A Sun vector or position inside an a priori attitude is written as the
     batch's own, which means the same.
     """
-    writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
+    writer = csv.DictWriter(stream, csv_columns.COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
     for batch in batches:
-        common = _neutralised(batch_cells(batch))
+        common = _neutralised(csv_columns.batch_cells(batch))
         if batch.measurement is not None:
             writer.writerow(common)
         for tracker in batch.observations:
             tracker_cells = {**common, "tracker": neutralised(tracker.tracker)}
             if not tracker.stars:
-                writer.writerow({**tracker_cells, **list_cells(tracker)})
+                writer.writerow({**tracker_cells, **csv_columns.list_cells(tracker)})
             for star in tracker.stars:
-                numbers = star.model_dump(exclude_none=True, include={*STAR_NUMBERS})
-                direction = zip(DIRECTION, star.vector or (), strict=False)
-                cells = {**number_cells(direction), **number_cells(numbers.items())}
-                writer.writerow({**tracker_cells, **cells, **list_cells(star)})
+                numbers = star.model_dump(exclude_none=True, include={*csv_columns.STAR_NUMBERS})
+                direction = zip(csv_columns.DIRECTION, star.vector or (), strict=False)
+                cells = {
+                    **csv_columns.number_cells(direction),
+                    **csv_columns.number_cells(numbers.items()),
+                }
+                writer.writerow({**tracker_cells, **cells, **csv_columns.list_cells(star)})
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:
     """Cells whose texts no spreadsheet takes for formulas."""
-    return {name: neutralised(cell) if name in VERBATIM else cell for name, cell in cells.items()}
+    return {
+        name: neutralised(cell) if name in csv_columns.VERBATIM else cell
+        for name, cell in cells.items()
+    }

@@ -14,22 +14,8 @@ from typing import IO
 import numpy as np
 
 from service.observations.schema import NORM_TOLERANCE
-from service.products.reading.known import (
-    MOST_RECORDS,
-    KnownAttitudes,
-    Segment,
-    known_attitudes,
-)
-from service.products.reading.tokens import (
-    AEM,
-    INERTIAL,
-    Metadata,
-    Source,
-    Token,
-    read_metadata,
-    read_version,
-    tokens_of,
-)
+from service.products.reading import tokens as ccsds
+from service.products.reading.known import KnownAttitudes, Segment, known_attitudes
 
 _BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
 _V1_ONLY = {"QUATERNION_TYPE": ("FIRST", "LAST"), "ATTITUDE_DIR": ("A2B", "B2A")}
@@ -79,19 +65,15 @@ class _Form:
 
 def read_aem(name: str, file: IO[bytes]) -> KnownAttitudes:
     """The attitudes of a message; raises `BadFile` naming file, line and field."""
-    return _Reader(Source(name)).read(file)
+    return _Reader(ccsds.Source(name)).read(file)
 
 
-class _Reader:
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self._version = 0
-        self._object: tuple[str, str] | None = None
-        self._records = 0
+class _Reader(ccsds.MessageReader):
+    _version = 0
 
     def read(self, file: IO[bytes]) -> KnownAttitudes:
-        tokens = tokens_of(self._source, file, AEM)
-        version = read_version(self._source, next(tokens, None), AEM, ("1.0", "2.0"))
+        tokens = ccsds.tokens_of(self._source, file, ccsds.AEM)
+        version = ccsds.read_version(self._source, next(tokens, None), ccsds.AEM, ("1.0", "2.0"))
         self._version = int(version[0])
         segments: list[Segment] = []
         last = 1
@@ -104,10 +86,9 @@ class _Reader:
             segments.append(self._segment(tokens, token.line))
         if not segments:
             raise self._source.bad(last, "META_START", "is missing: the message has no segment")
-        assert self._object is not None
-        return known_attitudes(self._source.name, self._object[0], segments)
+        return known_attitudes(self._source.name, self._object_name, segments)
 
-    def _segment(self, tokens: Iterator[Token], line: int) -> Segment:
+    def _segment(self, tokens: Iterator[ccsds.Token], line: int) -> Segment:
         form = self._form(self._metadata(tokens, line))
         start = next(tokens, None)
         if start is None or start.name != "DATA_START":
@@ -125,19 +106,13 @@ class _Reader:
                     token, "is out of place between DATA_START and DATA_STOP"
                 )
             time_ns, quaternion = self._state(token, form)
-            if times and time_ns <= times[-1]:
-                message = "must be later than that of the state before"
-                raise self._source.bad(token.line, "EPOCH", message, _epoch(token))
+            self._count_state(token, _epoch(token), time_ns, times)
             times.append(time_ns)
             numbers.append(quaternion)
-            self._records += 1
-            if self._records > MOST_RECORDS:
-                message = f"the file has more than the {MOST_RECORDS:,} states that are read"
-                raise self._source.bad(token.line, "states", message)
         raise self._source.bad(form.line, "DATA_STOP", "is missing: the file was cut short")
 
-    def _metadata(self, tokens: Iterator[Token], line: int) -> Metadata:
-        found = read_metadata(self._source, tokens, line, _METADATA, AEM)
+    def _metadata(self, tokens: Iterator[ccsds.Token], line: int) -> ccsds.Metadata:
+        found = ccsds.read_metadata(self._source, tokens, line, _METADATA, ccsds.AEM)
         for name in found.values:
             if self._version > 1 and name in _V1_ONLY:
                 raise found.fault(
@@ -147,7 +122,7 @@ class _Reader:
                 )
         return found
 
-    def _form(self, metadata: Metadata) -> _Form:
+    def _form(self, metadata: ccsds.Metadata) -> _Form:
         metadata.require(_REQUIRED)
         numbers = _NUMBERS[self._version]
         type = metadata.one_of("ATTITUDE_TYPE", tuple(numbers))
@@ -155,10 +130,7 @@ class _Reader:
             metadata.require(tuple(_V1_ONLY))
         time_system = metadata.time_system()
         metadata.span(time_system)
-        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
-        if self._object not in (None, about):
-            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
-        self._object = about
+        self._check_object(metadata)
         return _Form(
             line=metadata.line,
             time_system=time_system,
@@ -169,23 +141,23 @@ class _Reader:
             useable_ns=metadata.useable(time_system),
         )
 
-    def _v1_keyword(self, metadata: Metadata, name: str) -> str:
+    def _v1_keyword(self, metadata: ccsds.Metadata, name: str) -> str:
         return metadata.one_of(name, _V1_ONLY[name]) if self._version == 1 else ""
 
-    def _from_body(self, metadata: Metadata) -> bool:
+    def _from_body(self, metadata: ccsds.Metadata) -> bool:
         """True if REF_FRAME_A is the body; the other frame must be inertial."""
         frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
         is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
         for name, frame in frames.items():
-            if not is_body[name] and frame not in INERTIAL:
-                message = f"must be one of {', '.join(INERTIAL)}, or the body as SC_BODY_1"
+            if not is_body[name] and frame not in ccsds.INERTIAL:
+                message = f"must be one of {', '.join(ccsds.INERTIAL)}, or the body as SC_BODY_1"
                 raise metadata.fault(name, message)
         if is_body["REF_FRAME_A"] == is_body["REF_FRAME_B"]:
             message = "one of REF_FRAME_A and REF_FRAME_B must be inertial, the other the body"
             raise metadata.fault("REF_FRAME_B", message)
         return is_body["REF_FRAME_A"]
 
-    def _state(self, token: Token, form: _Form) -> tuple[int, tuple[float, ...]]:
+    def _state(self, token: ccsds.Token, form: _Form) -> tuple[int, tuple[float, ...]]:
         words = token.words if token.names is None else self._source.named(token, _NAMES)
         if token.names is None and len(words) != 1 + form.numbers:
             message = f"must have an epoch and {form.numbers} numbers"
@@ -207,17 +179,11 @@ class _Reader:
         quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
         if form.is_inverse:
             quaternion[:, :3] *= -1.0
-        first, last = form.useable_ns
-        return Segment(
-            f"line {form.line}",
-            time_ns,
-            quaternion,
-            times[0] if first is None else max(first, times[0]),
-            times[-1] if last is None else min(last, times[-1]),
-        )
+        span = ccsds.useable_span(times, form.useable_ns)
+        return Segment(f"line {form.line}", time_ns, *span, quaternion)
 
 
-def _epoch(token: Token) -> str:
+def _epoch(token: ccsds.Token) -> str:
     if token.names is None:
         return token.words[0]
     return dict(zip(token.names, token.words, strict=True)).get("EPOCH", "")

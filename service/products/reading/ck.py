@@ -16,13 +16,13 @@ import numpy as np
 
 from service.errors import BadFile, Fault
 from service.extras import require_extra
+from service.products.ck import leap_second_kernel
 from service.products.reading.known import (
     MOST_RECORDS,
     KnownAttitudes,
     Segment,
     known_attitudes,
 )
-from service.products.spice.ck import leap_second_kernel
 from service.products.spool import PIECE_BYTES, folder
 
 CHILD_S = 600.0
@@ -113,17 +113,9 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitu
     quaternion = np.column_stack([-records[:, 2:], records[:, 1]]) / norm[:, None]
     segments = []
     for first, count in spans.tolist():
-        times = time_ns[first : first + count]
+        at, times = f"record {first + 1}", time_ns[first : first + count]
         if np.any(np.diff(times) <= 0):
-            record_name = f"{name}, record {first + 1}"
-            raise BadFile(Fault(record_name, "times must increase within an interval"))
-        segments.append(
-            Segment(
-                f"record {first + 1}",
-                times,
-                quaternion[first : first + count],
-                int(times[0]),
-                int(times[-1]),
-            )
-        )
+            raise BadFile(Fault(f"{name}, {at}", "times must increase within an interval"))
+        within = quaternion[first : first + count]
+        segments.append(Segment(at, times, int(times[0]), int(times[-1]), within))
     return known_attitudes(name, answer["object"], segments)

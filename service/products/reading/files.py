@@ -62,7 +62,7 @@ def _read_truth(file: str, lines: Iterable[bytes]) -> KnownAttitudes:
     if (np.diff(time_ns) <= 0).any():
         raise BadFile(Fault(file, "the times of its lines do not increase"))
     quaternion = np.array([each.quaternion for each in read])
-    one = Segment(file, time_ns, quaternion, int(time_ns[0]), int(time_ns[-1]))
+    one = Segment(file, time_ns, int(time_ns[0]), int(time_ns[-1]), quaternion)
     return known_attitudes(file, read[0].spacecraft, [one])
 
 

@@ -22,19 +22,23 @@ CLOCK_NS = 200
 
 
 @dataclass(frozen=True)
-class Segment:
-    """Attitudes between which it may be interpolated; `place` names it in messages.
+class Span:
+    """Records that are valid from one time to another, `Utc.tai_ns`; some may lie beyond both.
 
-    They are valid from `first_ns` to `last_ns`; records may lie beyond both.
+    `place` names the span in messages.  The times of the records ascend.
     """
 
     place: str
     time_ns: Integers
-    """Times in ascending order; `Utc.tai_ns`."""
-    quaternion: Vector
-    """Quaternions (n, 4) of norm 1."""
     first_ns: int
     last_ns: int
+
+
+@dataclass(frozen=True)
+class Segment(Span):
+    """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated."""
+
+    quaternion: Vector
 
     def at(self, time_ns: Integers) -> Vector:
         """The attitudes (n, 4) at moments (n,); NaN outside the segment.
@@ -91,22 +95,6 @@ def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) ->
     return KnownAttitudes(object_name, in_order(file, segments))
 
 
-class Span(Protocol):
-    """A span that is valid from one time to another, `Utc.tai_ns`; `place` names it in messages."""
-
-    @property
-    def place(self) -> str:
-        """The place of an attitude in its file."""
-
-    @property
-    def first_ns(self) -> int:
-        """The first time."""
-
-    @property
-    def last_ns(self) -> int:
-        """The last time."""
-
-
 S = TypeVar("S", bound=Span)
 
 
@@ -141,21 +129,14 @@ class Ephemeris(Protocol):
 
 
 @dataclass(frozen=True)
-class StateSegment:
-    """States between which it may be interpolated; `place` names it in messages.
+class StateSegment(Span):
+    """States (n, 6), in km and km/s, between which it may be interpolated.
 
-    They are valid from `first_ns` to `last_ns`.  The polynomial goes through `points` states:
-    HERMITE through their positions and velocities, with the velocity as its derivative, LAGRANGE
-    through positions and velocities apart.
+    The polynomial goes through `points` states: HERMITE through their positions and velocities,
+    with the velocity as its derivative, LAGRANGE through positions and velocities apart.
     """
 
-    place: str
-    time_ns: Integers
-    """Times in ascending order; `Utc.tai_ns`."""
     state: Vector
-    """States (n, 6) in km and km/s."""
-    first_ns: int
-    last_ns: int
     method: Interpolation
     points: int
 

@@ -10,23 +10,12 @@ from typing import IO
 
 import numpy as np
 
-from service.errors import BadFile
+from service.products.reading import tokens as ccsds
 from service.products.reading.known import (
-    MOST_RECORDS,
     Interpolation,
     KnownStates,
     StateSegment,
     known_states,
-)
-from service.products.reading.tokens import (
-    INERTIAL,
-    OEM,
-    Metadata,
-    Source,
-    Token,
-    read_metadata,
-    read_version,
-    tokens_of,
 )
 
 _VERSIONS = ("1.0", "2.0", "3.0")
@@ -84,18 +73,13 @@ class _Form:
 
 def read_oem(name: str, file: IO[bytes]) -> KnownStates:
     """The states of a message; raises `BadFile` naming file, line and field."""
-    return _Reader(Source(name)).read(file)
+    return _Reader(ccsds.Source(name)).read(file)
 
 
-class _Reader:
-    def __init__(self, source: Source) -> None:
-        self._source = source
-        self._object: tuple[str, str] | None = None
-        self._records = 0
-
+class _Reader(ccsds.MessageReader):
     def read(self, file: IO[bytes]) -> KnownStates:
-        tokens = tokens_of(self._source, file, OEM)
-        read_version(self._source, next(tokens, None), OEM, _VERSIONS)
+        tokens = ccsds.tokens_of(self._source, file, ccsds.OEM)
+        ccsds.read_version(self._source, next(tokens, None), ccsds.OEM, _VERSIONS)
         segments: list[StateSegment] = []
         form: _Form | None = None
         last = 1
@@ -104,7 +88,9 @@ class _Reader:
             if token.name == "META_START":
                 if form is not None:
                     segments.append(self._made(form, last))
-                form = self._form(read_metadata(self._source, tokens, token.line, _METADATA, OEM))
+                form = self._form(
+                    ccsds.read_metadata(self._source, tokens, token.line, _METADATA, ccsds.OEM)
+                )
             elif form is None:
                 if token.kind != "key" or token.name not in _HEADER:
                     raise self._source.bad_token(token, "is out of place: META_START is expected")
@@ -118,24 +104,20 @@ class _Reader:
         if form is None:
             raise self._source.bad(last, "META_START", "is missing: the message has no segment")
         segments.append(self._made(form, last))
-        assert self._object is not None
-        return known_states(self._source.name, self._object[0], segments)
+        return known_states(self._source.name, self._object_name, segments)
 
-    def _pass_covariances(self, tokens: Iterator[Token], line: int) -> None:
+    def _pass_covariances(self, tokens: Iterator[ccsds.Token], line: int) -> None:
         for token in tokens:
             if token.name == "COVARIANCE_STOP":
                 return
         raise self._source.bad(line, "COVARIANCE_STOP", "is missing: the file was cut short")
 
-    def _form(self, metadata: Metadata) -> _Form:
+    def _form(self, metadata: ccsds.Metadata) -> _Form:
         metadata.require(_REQUIRED)
         metadata.one_of("CENTER_NAME", ("EARTH",))
-        metadata.one_of("REF_FRAME", INERTIAL)
+        metadata.one_of("REF_FRAME", ccsds.INERTIAL)
         time_system = metadata.time_system()
-        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
-        if self._object not in (None, about):
-            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
-        self._object = about
+        self._check_object(metadata)
         method, degree = self._interpolation(metadata)
         return _Form(
             line=metadata.line,
@@ -146,7 +128,7 @@ class _Reader:
             degree=degree,
         )
 
-    def _interpolation(self, metadata: Metadata) -> tuple[Interpolation, int | None]:
+    def _interpolation(self, metadata: ccsds.Metadata) -> tuple[Interpolation, int | None]:
         """The method, and the degree where one is given."""
         if "INTERPOLATION" not in metadata.values:
             return "HERMITE", None
@@ -160,15 +142,13 @@ class _Reader:
             raise metadata.fault("INTERPOLATION_DEGREE", message)
         return _METHODS[name], int(text)
 
-    def _add(self, form: _Form, token: Token) -> None:
+    def _add(self, form: _Form, token: ccsds.Token) -> None:
         words = token.words if token.names is None else self._source.named(token, _NAMES)
         if len(words) not in (7, 10):
             message = "must have an epoch, a position and a velocity"
             raise self._source.bad(token.line, "state", message, " ".join(words))
         time_ns = self._source.epoch_ns(token, words[0], form.time_system)
-        if form.times and time_ns <= form.times[-1]:
-            message = "must be later than that of the state before"
-            raise self._source.bad(token.line, "EPOCH", message, words[0])
+        self._count_state(token, words[0], time_ns, form.times)
         state = [self._source.number(token, word) for word in words[1:]][:6]
         for name, most, unit in (("position", MAX_KM, "km"), ("velocity", MAX_KM_PER_S, "km/s")):
             part = state[:3] if name == "position" else state[3:]
@@ -176,31 +156,25 @@ class _Reader:
                 raise self._source.bad(token.line, name, f"must be within {most:g} {unit}", part)
         form.times.append(time_ns)
         form.states.append(state)
-        self._records += 1
-        if self._records > MOST_RECORDS:
-            message = f"the file has more than the {MOST_RECORDS:,} states that are read"
-            raise self._source.bad(token.line, "states", message)
 
     def _made(self, form: _Form, line: int) -> StateSegment:
         """The segment, whose last token is in a line or before it."""
         if not form.times:
             raise self._source.bad(form.line, "META_STOP", "begins a segment of no state")
         if form.times[0] > form.span_ns[0] + SHORT_NS:
-            raise self._short(form.line, "the first state is later than START_TIME")
+            raise self._source.bad(form.line, "states", "the first state is later than START_TIME")
         if form.times[-1] < form.span_ns[1] - SHORT_NS:
             message = "the last state is earlier than STOP_TIME: the file was cut short"
-            raise self._short(line, message)
+            raise self._source.bad(line, "states", message)
         count = len(form.times)
         points = self._points(form, count)
         if form.degree is None:
             self._check_steps(form)
-        first, last = form.useable_ns
         return StateSegment(
             f"line {form.line}",
             np.array(form.times, dtype=np.int64),
+            *ccsds.useable_span(form.times, form.useable_ns),
             np.array(form.states),
-            form.times[0] if first is None else max(first, form.times[0]),
-            form.times[-1] if last is None else min(last, form.times[-1]),
             form.method,
             points,
         )
@@ -218,9 +192,6 @@ class _Reader:
                 f"is missing, and {step_s[k]:.0f} s lie between two of its states, where at most "
                 f"{longest_s[k]:.0f} s give positions to about a kilometre",
             )
-
-    def _short(self, line: int, message: str) -> BadFile:
-        return self._source.bad(line, "states", message)
 
     def _points(self, form: _Form, count: int) -> int:
         """Through how many states the polynomial goes."""

@@ -13,6 +13,7 @@ from typing import IO, Any, Literal
 from xml.parsers import expat
 
 from service.errors import BadFile, BadInput, Fault, shown_value
+from service.products.reading.known import MOST_RECORDS
 from service.times import FIRST_YEAR, LAST_YEAR, parse_utc
 
 MAX_LINE_BYTES = 4096
@@ -374,3 +375,43 @@ def read_version(
     if token.value not in versions:
         raise source.bad_token(token, f"must be {', '.join(versions[:-1])} or {versions[-1]}")
     return token.value
+
+
+class MessageReader:
+    """The checks that the readers of messages share: of one object, of order, of the amount."""
+
+    def __init__(self, source: Source) -> None:
+        self._source = source
+        self._object: tuple[str, str] | None = None
+        self._records = 0
+
+    @property
+    def _object_name(self) -> str:
+        assert self._object is not None
+        return self._object[0]
+
+    def _check_object(self, metadata: Metadata) -> None:
+        """Raise `BadFile` where a segment is of another object than those before."""
+        about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
+        if self._object not in (None, about):
+            raise metadata.fault("OBJECT_ID", "must be the same in every segment")
+        self._object = about
+
+    def _count_state(self, token: Token, epoch: str, time_ns: int, before: list[int]) -> None:
+        """Raise `BadFile` for a state not later than those before, or one too many."""
+        if before and time_ns <= before[-1]:
+            message = "must be later than that of the state before"
+            raise self._source.bad(token.line, "EPOCH", message, epoch)
+        self._records += 1
+        if self._records > MOST_RECORDS:
+            message = f"the file has more than the {MOST_RECORDS:,} states that are read"
+            raise self._source.bad(token.line, "states", message)
+
+
+def useable_span(times: list[int], useable_ns: tuple[int | None, int | None]) -> tuple[int, int]:
+    """The first and last time of a segment: of its states, or of the useable ones."""
+    first, last = useable_ns
+    return (
+        times[0] if first is None else max(first, times[0]),
+        times[-1] if last is None else min(last, times[-1]),
+    )

@@ -24,7 +24,7 @@ from urllib.parse import quote
 
 import msgspec
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, structs
 from pyarrow import parquet
 from sqlalchemy import Connection, select
 
@@ -76,6 +76,14 @@ class Manifest(Struct, frozen=True, kw_only=True):
     spacecraft: str
     day: str
     parts: list[Part]
+
+    def with_part(self, part: Part) -> "Manifest":
+        """The manifest with a part, in the place of one of the same file."""
+        return structs.replace(self, parts=[*self.without(part).parts, part])
+
+    def without(self, part: Part) -> "Manifest":
+        """The manifest without a part."""
+        return structs.replace(self, parts=[each for each in self.parts if each.file != part.file])
 
 
 class Owner(Struct, frozen=True, kw_only=True):
@@ -137,6 +145,13 @@ def manifests(folder: Path) -> Iterator[Manifest]:
         yield _decoded(file, Manifest)
 
 
+def parts_of(folder: Path) -> Iterator[tuple[str, Manifest, Part]]:
+    """Every partition with its path below the folder and the manifest that names it."""
+    for manifest in manifests(folder):
+        for part in manifest.parts:
+            yield path_of(folder, manifest, part), manifest, part
+
+
 def day_folders(folder: Path) -> list[Path]:
     """The folders of all spacecraft and days, in this order, also those without a manifest."""
     return sorted(each for each in folder.glob("spacecraft=*/day=*") if each.is_dir())
@@ -156,10 +171,12 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
     write_whole(file, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
 
 
-def read_owner(folder: Path) -> Owner | None:
-    """The database that owns an archive; None: none has written to it yet."""
-    file = folder / OWNER
-    return _decoded(file, Owner) if file.exists() else None
+def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
+    """Take a part out of the manifest, then delete its file."""
+    manifest = manifest.without(part)
+    write_manifest(folder, manifest)
+    (day_folder(folder, manifest.spacecraft, manifest.day) / part.file).unlink()
+    return manifest
 
 
 def write_partition(file: Path, partition: pa.Table) -> bytes:
@@ -311,11 +328,11 @@ def claim(connection: Connection, folder: Path) -> str:
 
     The folder must be locked.  Raises `BadConfiguration` where another database owns it.
     """
-    own, owner = identity_of(connection), read_owner(folder)
-    if owner is None:
+    own, file = identity_of(connection), folder / OWNER
+    if not file.exists():
         content = msgspec.json.format(msgspec.json.encode(Owner(database=own)), indent=1)
-        write_whole(folder / OWNER, content)
-    elif owner.database != own:
+        write_whole(file, content)
+    elif _decoded(file, Owner).database != own:
         raise BadConfiguration(
             f"{folder}: the archive belongs to another database: name another folder; only if that "
             f"database is gone for good, delete {OWNER} in this one"

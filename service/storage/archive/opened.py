@@ -12,7 +12,7 @@ from sqlalchemy import Connection, StaticPool, Table, create_engine
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from service.storage.archive.folder import Settings
-from service.storage.archive.rows import CHILDREN, OF_BATCHES, Rows
+from service.storage.archive.rows import CHILDREN, OF_BATCHES, Rows, children_of
 from service.storage.sql.tables import batches, missions, results, runs
 
 LARGE = ("input", "answer")
@@ -75,9 +75,8 @@ class Opened:
 
     def add_partition(self, partition: pa.Table) -> None:
         """Add results of a part, with the columns of it that were read."""
-        ids = partition["id"]
         columns = {name: partition[name] for name in partition.column_names}
-        columns["batch_id"] = pc.coalesce(columns["batch_id"], ids)
+        columns["batch_id"] = pc.coalesce(columns["batch_id"], columns["id"])
         # Of a batch whose first result is in another row group, a later one has all.
         of_batches = {each.name: columns.get(each.name) for each in batches.columns}
         of_batches["id"] = columns["batch_id"]
@@ -85,13 +84,10 @@ class Opened:
         of_batches["fingerprint"] = None
         rows = [(batches, of_batches)]
         rows.append((results, {each.name: columns.get(each.name) for each in results.columns}))
-        for name, (table, owner, _) in CHILDREN.items():
+        for name, (table, _, _) in CHILDREN.items():
             if name in columns:
-                lists = columns[name]
-                parts = pa.Table.from_struct_array(pc.list_flatten(lists).combine_chunks())
-                found = {each: parts[each] for each in parts.column_names}
-                found[owner] = ids.take(pc.list_parent_indices(lists))
-                rows.append((table, found))
+                found = children_of(partition, name)
+                rows.append((table, {each: found[each] for each in found.column_names}))
         with self._engine.begin() as connection:
             for name in sorted({*columns["run"].to_pylist()}):
                 row = {"name": name, "created": ""}

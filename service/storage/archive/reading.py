@@ -13,13 +13,7 @@ from service.errors import AcquisitionError, Busy, Fault, NotAvailable
 from service.extras import require_extra
 from service.sky.cache import LruCache
 from service.storage.recording.identity import stored_answers
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    archived_what_ifs,
-    results,
-    runs,
-)
+from service.storage.sql import tables
 from service.times import Utc
 
 if TYPE_CHECKING:
@@ -111,7 +105,10 @@ class Archive:
 
     def batch(self, connection: Connection, id: str) -> "Opened | None":
         """The batch of an archived result with all its results; None: it is not archived."""
-        if connection.scalar(select(results.c.id).where(results.c.id == id)) is not None:
+        if (
+            connection.scalar(select(tables.results.c.id).where(tables.results.c.id == id))
+            is not None
+        ):
             return None
         found = places(connection, [id])
         if not found:
@@ -204,7 +201,7 @@ def parts_between(
     end_ns: int | None,
 ) -> list[PlacedPart]:
     """The parts that reach into a period, of every spacecraft or run where none is named."""
-    c = archived_parts.c
+    c = tables.archived_parts.c
     chosen: list[ColumnElement[bool]] = []
     if spacecraft is not None:
         chosen.append(c.spacecraft == spacecraft)
@@ -222,9 +219,9 @@ def parts_with(
     connection: Connection, spacecraft: str | None, run: str | None, batch: str
 ) -> set[int]:
     """The ids of the parts that have a batch of this name."""
-    c = archived_batches.c
+    c = tables.archived_batches.c
     # The unique index begins with spacecraft and run: neither is left open.
-    in_runs = select(runs.c.name) if run is None else [run]
+    in_runs = select(tables.runs.c.name) if run is None else [run]
     query = select(c.part_id).where(
         c.spacecraft == spacecraft, c.run.in_(in_runs), c.batch == batch
     )
@@ -233,46 +230,29 @@ def parts_with(
 
 def batch_of(connection: Connection, id: str) -> str:
     """The id of the batch of an archived result."""
-    of_what_if = select(archived_what_ifs.c.batch_id).where(archived_what_ifs.c.id == id)
-    return connection.scalar(of_what_if) or id
+    what_ifs = tables.archived_what_ifs.c
+    return connection.scalar(select(what_ifs.batch_id).where(what_ifs.id == id)) or id
 
 
 def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
     """The ids of archived results by the path of their part."""
+    batches, what_ifs = tables.archived_batches.c, tables.archived_what_ifs.c
+    path, has_part = tables.archived_parts.c.path, tables.archived_parts.c.id == batches.part_id
+    first = select(batches.id, path).where(has_part, batches.id.in_(ids))
+    further = select(what_ifs.id, path).where(has_part, what_ifs.batch_id == batches.id)
     found: dict[str, list[str]] = {}
-    wanted = list(ids)
-    first = select(archived_batches.c.id, archived_parts.c.path).where(
-        archived_batches.c.id.in_(wanted)
-    )
-    of_batch = archived_batches.join(
-        archived_what_ifs, archived_what_ifs.c.batch_id == archived_batches.c.id
-    )
-    further = (
-        select(archived_what_ifs.c.id, archived_parts.c.path)
-        .select_from(of_batch)
-        .where(archived_what_ifs.c.id.in_(wanted))
-    )
-    has_part = archived_parts.c.id == archived_batches.c.part_id
-    queries: tuple[Any, ...] = (first.where(has_part), further.where(has_part))
-    for query in queries:
-        for id, path in connection.execute(query):
-            found.setdefault(path, []).append(id)
+    for query in (first, further.where(what_ifs.id.in_(ids))):
+        for id, file in connection.execute(query):
+            found.setdefault(file, []).append(id)
     return found
 
 
 def holds_any(connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc) -> bool:
     """True if a part reaches into a period, so that batches of it may be archived."""
-    c = archived_parts.c
-    query = select(c.id).where(
-        c.spacecraft == spacecraft,
-        c.run == run,
-        c.last_ns >= start.tai_ns,
-        c.first_ns < end.tai_ns,
-    )
-    return connection.scalar(query.limit(1)) is not None
+    return bool(parts_between(connection, spacecraft, run, start.tai_ns, end.tai_ns))
 
 
 def archived_paths(connection: Connection) -> dict[str, str]:
     """The hashes of the parts that a database has batches in, by path."""
-    query = select(archived_parts.c.path, archived_parts.c.sha256)
+    query = select(tables.archived_parts.c.path, tables.archived_parts.c.sha256)
     return dict(map(tuple, connection.execute(query)))

@@ -6,46 +6,30 @@ byte: archiving, verifying, restoring and the pages that read the archive share 
 
 import hashlib
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Connection,
-    Double,
-    Integer,
-    LargeBinary,
-    SmallInteger,
-    String,
-    Table,
-    select,
-)
+import sqlalchemy as sa
 from sqlalchemy.types import TypeEngine
 
+from service.storage.archive.folder import read_partition, whole_content
+from service.storage.sql import tables
 from service.storage.sql.columns import PackedText
-from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import (
-    batches,
-    frames,
-    idempotency_keys,
-    results,
-    solutions,
-    star_results,
-    tracker_values,
-)
+from service.storage.sql.statements import insert_all, portions
 
 Rows = dict[str, pa.Table]
 """Tables by the name of the SQL table: batches in order of time, the rest in their order."""
+Columns = dict[str, pa.ChunkedArray]
 
 CHILDREN = {
-    "stars": (star_results, "result_id", ("tracker", "position")),
-    "solution": (solutions, "result_id", ()),
-    "trackers": (tracker_values, "batch_id", ("tracker",)),
-    "frame": (frames, "batch_id", ()),
-    "keys": (idempotency_keys, "result_id", ("token_id", "key")),
+    "stars": (tables.star_results, "result_id", ("tracker", "position")),
+    "solution": (tables.solutions, "result_id", ()),
+    "trackers": (tables.tracker_values, "batch_id", ("tracker",)),
+    "frame": (tables.frames, "batch_id", ()),
+    "keys": (tables.idempotency_keys, "result_id", ("token_id", "key")),
 }
 """A partition's list columns: the table, what names its result, and its order within one.
 
@@ -53,22 +37,21 @@ The first result of a batch has the batch's id, and so the rows of a batch are t
 """
 OF_BATCHES = ("batch", "time", "received", "fingerprint", "input")
 """The columns that results do not have."""
-_AT_ONCE = 1_000
 
 # Of two that fit, the narrower stands first; Text is a String.
 _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
-    (BigInteger, pa.int64()),
-    (SmallInteger, pa.int16()),
-    (Integer, pa.int32()),
-    (Boolean, pa.bool_()),
-    (Double, pa.float64()),
-    (LargeBinary, pa.binary()),
-    (String, pa.string()),
+    (sa.BigInteger, pa.int64()),
+    (sa.SmallInteger, pa.int16()),
+    (sa.Integer, pa.int32()),
+    (sa.Boolean, pa.bool_()),
+    (sa.Double, pa.float64()),
+    (sa.LargeBinary, pa.binary()),
+    (sa.String, pa.string()),
     (PackedText, pa.string()),
 )
 
 
-def schema_of(table: Table) -> pa.Schema:
+def schema_of(table: sa.Table) -> pa.Schema:
     """The Arrow schema of an SQL table."""
     return pa.schema(
         [
@@ -78,10 +61,10 @@ def schema_of(table: Table) -> pa.Schema:
     )
 
 
-def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
+def read_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> Rows:
     """All rows of these batches; ids of no batch are passed over."""
-    found = _ordered(_read(connection, batches, "id", batch_ids), ("time_ns", "id"))
-    made = _read(connection, results, "batch_id", batch_ids)
+    found = _ordered(_read(connection, tables.batches, "id", batch_ids), ("time_ns", "id"))
+    made = _read(connection, tables.results, "batch_id", batch_ids)
     made = _in_order_of(made, "batch_id", found["id"], ("id",))
     rows = {"batches": found, "results": made}
     ids = made["id"].to_pylist()
@@ -93,25 +76,27 @@ def read_rows(connection: Connection, batch_ids: Sequence[str]) -> Rows:
     return rows
 
 
-def lock_rows(connection: Connection, batch_ids: Sequence[str]) -> None:
+def lock_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> None:
     """Let no other process add anything to these batches, or change it, before the commit.
 
     What others write refers to a result or to a batch.  Results come first, as where one is
     adopted.
     """
-    for table, owner in ((results, results.c.batch_id), (batches, batches.c.id)):
-        for first in range(0, len(batch_ids), _AT_ONCE):
-            chosen = owner.in_(batch_ids[first : first + _AT_ONCE])
-            query = select(table.c.id).where(chosen).order_by(table.c.id)
+    for table, owner in (
+        (tables.results, tables.results.c.batch_id),
+        (tables.batches, tables.batches.c.id),
+    ):
+        for ids in portions(batch_ids):
+            query = sa.select(table.c.id).where(owner.in_(ids)).order_by(table.c.id)
             connection.execute(query.with_for_update())
 
 
-def insert_rows(connection: Connection, rows: Rows) -> None:
+def insert_rows(connection: sa.Connection, rows: Rows) -> None:
     """Insert all rows, what others refer to first."""
     made = rows["results"]
     # A what-if refers to the result that it began with, which has a lower id.
     made = made.sort_by("id")
-    for table, read in ((batches, rows["batches"]), (results, made)):
+    for table, read in ((tables.batches, rows["batches"]), (tables.results, made)):
         insert_all(connection, table, read.to_pylist())
     for table, _, _ in CHILDREN.values():
         insert_all(connection, table, rows[table.name].to_pylist())
@@ -135,47 +120,53 @@ def to_partition(rows: Rows) -> pa.Table:
     return pa.table(_without_copies(columns))
 
 
-def _without_copies(columns: dict[str, pa.ChunkedArray]) -> dict[str, pa.ChunkedArray]:
+def _without_copies(columns: Columns) -> Columns:
     """The columns with nulls where a value follows from another one: a tenth of the space."""
-    digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
-    copies = {"batch_id": columns["id"], "received": columns["created"]}
-    copies["fingerprint"] = pa.array(digests, pa.string())
-    for name, copy in copies.items():
+    for name, copy in _copies(columns).items():
         own = columns[name]
         columns[name] = pc.if_else(pc.equal(own, copy), pa.scalar(None, own.type), own)
     return columns
 
 
-def _with_copies(partition: pa.Table) -> pa.Table:
-    copies = {"batch_id": partition["id"], "received": partition["created"]}
-    inputs = partition["input"].to_pylist()
-    digests = [hashlib.sha256(each.encode()).hexdigest() for each in inputs]
-    copies["fingerprint"] = pa.chunked_array([pa.array(digests, pa.string())])
-    for name, copy in copies.items():
-        place = partition.column_names.index(name)
-        partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
-    return partition
+def _copies(columns: Columns | pa.Table) -> Columns:
+    """The values that mostly follow from those of other columns, by the name of their column."""
+    digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
+    return {
+        "batch_id": columns["id"],
+        "received": columns["created"],
+        "fingerprint": pa.chunked_array([pa.array(digests, pa.string())]),
+    }
+
+
+def read_part(folder: Path, path: str, sha256: str) -> Rows:
+    """The rows of a part; raises `BadConfiguration` where its file is missing or damaged."""
+    return from_partition(read_partition(whole_content(folder, path, sha256)))
 
 
 def from_partition(partition: pa.Table) -> Rows:
     """The rows that were put into a partition; columns of a later version than its are null."""
-    partition = _with_copies(partition)
+    for name, copy in _copies(partition).items():
+        place = partition.column_names.index(name)
+        partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
     is_first = pc.equal(partition["id"], partition["batch_id"])
-    names = [each.name for each in batches.columns]
+    names = [each.name for each in tables.batches.columns]
     rows = {
         "batches": partition.filter(is_first).select(names),
-        "results": _selected(partition, results),
+        "results": _selected(partition, tables.results),
     }
-    for name, (table, owner, _) in CHILDREN.items():
-        lists = partition[name]
-        parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
-        owners = partition["id"].take(pc.list_parent_indices(lists))
-        parts = parts.append_column(owner, owners)
-        rows[table.name] = _selected(parts, table)
+    for name, (table, _, _) in CHILDREN.items():
+        rows[table.name] = _selected(children_of(partition, name), table)
     return rows
 
 
-def _selected(read: pa.Table, table: Table) -> pa.Table:
+def children_of(partition: pa.Table, name: str) -> pa.Table:
+    """The rows in a list column of a partition, each with the id of its result."""
+    lists, owner = partition[name], CHILDREN[name][1]
+    parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
+    return parts.append_column(owner, partition["id"].take(pc.list_parent_indices(lists)))
+
+
+def _selected(read: pa.Table, table: sa.Table) -> pa.Table:
     """The columns of an SQL table, in its order; null where they were not written."""
     for field in schema_of(table):
         if field.name not in read.column_names:
@@ -204,11 +195,11 @@ def _as_bits(table: pa.Table) -> pa.Table:
     return pa.table(columns)
 
 
-def _read(connection: Connection, table: Table, owner: str, ids: Sequence[str]) -> pa.Table:
+def _read(connection: sa.Connection, table: sa.Table, owner: str, ids: Sequence[str]) -> pa.Table:
     rows: list[tuple[object, ...]] = []
-    for first in range(0, len(ids), _AT_ONCE):
-        chosen = table.c[owner].in_(ids[first : first + _AT_ONCE])
-        rows += map(tuple, connection.execute(select(table).where(chosen)))
+    for some_ids in portions(ids):
+        query = sa.select(table).where(table.c[owner].in_(some_ids))
+        rows += map(tuple, connection.execute(query))
     schema = schema_of(table)
     columns = zip(*rows, strict=True) if rows else ([] for _ in schema)
     arrays = [pa.array(each, field.type) for each, field in zip(columns, schema, strict=True)]

@@ -5,8 +5,8 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import msgspec
 import numpy as np
+import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, bindparam, select
 
 from service.acquire.choices import aberration_velocity
@@ -14,7 +14,7 @@ from service.attitude.solution import NoAttitude
 from service.errors import BadInput
 from service.filtering.prediction import Known
 from service.filtering.samples import DirectionMeasurements, no_directions
-from service.grades.day import METHOD, day_bounds
+from service.grades.day import METHOD
 from service.grades.stretches import Recorded, arrays_of, usable_attitudes
 from service.gyro import Nanoseconds, tai_ns_of
 from service.identify.attitude_from_matches import matched_vectors
@@ -27,17 +27,17 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 from service.storage.gyro import BlockFilter, rates_of, times_of
-from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter, covariance_of
 from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.queries.result_tables import RATES
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.tables import batches, results, rollups_daily, solutions, star_results
 from service.times import DAY_S, Utc, recorded_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 _ATTITUDES = select(
-    results.c.time_ns,
-    *(solutions.c[name] for name in ("q1", "q2", "q3", "qc")),
-    *(solutions.c[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
+    results.c.time_ns, *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE))
 ).join_from(results, solutions, solutions.c.result_id == results.c.id)
 
 
@@ -46,14 +46,9 @@ def days_with_batches(
 ) -> list[int]:
     """The UTC days of a period (see `Utc.bucket`) that have batches, in order."""
     c = rollups_daily.c
-    chosen = [c.spacecraft == spacecraft, c.run == run]
-    if start is not None:
-        chosen.append(c.bucket >= start.bucket(DAY_S))
-    if end is not None:
-        chosen.append(c.bucket <= end.bucket(DAY_S))
-    days = connection.scalars(select(c.bucket).where(*chosen).order_by(c.bucket))
-    # The end of a period is excluded.
-    return [day for day in days if end is None or day_bounds(day)[0].tai_ns < end.tai_ns]
+    within = buckets_between(c.bucket, start, end, DAY_S)
+    chosen = c.spacecraft == spacecraft, c.run == run, *within
+    return list(connection.scalars(select(c.bucket).where(*chosen).order_by(c.bucket)))
 
 
 def recorded_in(
@@ -81,14 +76,20 @@ def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds,
         times.append(tai_ns_of(row["start_ns"], times_of(row)))
         rates.append(rates_of(row))
     tai_ns, rate = np.concatenate(times), np.concatenate(rates)
-    inside = np.ones(len(tai_ns), bool)
-    if selected.start is not None:
-        inside &= tai_ns >= selected.start.tai_ns
-    if selected.end is not None:
-        inside &= tai_ns < selected.end.tai_ns
-    tai_ns, rate = tai_ns[inside], rate[inside]
+    places = inside(tai_ns, selected)
+    tai_ns, rate = tai_ns[places], rate[places]
     order = np.argsort(tai_ns, kind="stable")
     return tai_ns[order], rate[order]
+
+
+def inside(tai_ns: Nanoseconds, selected: ResultFilter | BlockFilter) -> npt.NDArray[np.intp]:
+    """The places of the times that lie in a period."""
+    chosen = np.ones(len(tai_ns), dtype=bool)
+    if selected.start is not None:
+        chosen &= tai_ns >= selected.start.tai_ns
+    if selected.end is not None:
+        chosen &= tai_ns < selected.end.tai_ns
+    return np.flatnonzero(chosen)
 
 
 def inputs_digest(recorded: Recorded, mission: Mission) -> str:
@@ -109,16 +110,11 @@ def inputs_digest(recorded: Recorded, mission: Mission) -> str:
     return f"sha256:{digest.hexdigest()}"
 
 
-_SHOWN = (
-    results.c.id,
-    batches.c.time,
-    batches.c.time_ns,
-    batches.c.input,
-    *(solutions.c[name] for name in ("q1", "q2", "q3", "qc")),
-    *(solutions.c[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
-)
 _LAST = (
-    select(*_SHOWN)
+    select(
+        *(results.c.id, batches.c.time, batches.c.time_ns, batches.c.input),
+        *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
+    )
     .join_from(results, batches, results.c.batch_id == batches.c.id)
     .join(solutions, solutions.c.result_id == results.c.id)
     .where(
@@ -144,13 +140,6 @@ class RecordedAttitude:
     body_rates_deg_per_s: Vector
 
 
-class _Rates(msgspec.Struct):
-    body_rates_deg_per_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-
-_RATES = msgspec.json.Decoder(_Rates)
-
-
 def last_attitudes(
     connection: Connection, spacecraft: str, run: str, until: Utc, within_s: float
 ) -> list[RecordedAttitude]:
@@ -166,10 +155,9 @@ def last_attitudes(
     }
     found = []
     for row in connection.execute(_LAST, asked):
-        p11, p12, p13, p22, p23, p33 = row[8:]
-        covariance = np.array([[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]])
+        covariance = np.array(covariance_of(row[8:]))
         known = Known(row.time_ns, np.array(row[4:8]), covariance / ARCSEC_PER_RADIAN**2)
-        rates = np.array(_RATES.decode(row.input).body_rates_deg_per_s)
+        rates = np.array(RATES.decode(row.input).body_rates_deg_per_s or np.zeros(3))
         found.append(RecordedAttitude(row.id, recorded_utc(row.time), known, rates))
     return found
 
@@ -194,7 +182,6 @@ def lone_stars(
     The batch is calibrated with the settings that its result was made with; the inertial
     directions are apparent ones, as attitudes are solved from.
     """
-    missions: dict[str, Mission] = {}
     rows_of: dict[str, dict[str, int]] = {}
     found: list[tuple[int, Vector, Vector, Vector]] = []
     query = (
@@ -213,10 +200,8 @@ def lone_stars(
         stars = _unique_stars(connection, [row.id for row in part])
         inputs = _inputs(connection, [row.batch_id for row in part])
         for row in part:
-            digest = row.mission_digest
-            if digest not in missions:
-                missions[digest] = recorded_mission(connection, digest)
-            mission, batch = missions[digest], submission_from_json(inputs[row.batch_id]).batch
+            mission = recorded_mission(connection, row.mission_digest)
+            batch = submission_from_json(inputs[row.batch_id]).batch
             run_catalog = sky.run_catalog(mission, batch.time)
             if run_catalog.digest not in rows_of:
                 rows_of[run_catalog.digest] = {n: k for k, n in enumerate(run_catalog.star_id)}

@@ -25,12 +25,15 @@ from service.grades.day import (
 from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.missions.mission import Mission
-from service.storage.grades.days import DayKey, GradedDayRow, Innovation, shown
+from service.storage.grades.days import DayKey, GradedDayRow, shown
+from service.storage.grades.inputs import inside
 from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
 from service.storage.models.base import Page
+from service.storage.models.products import Innovation
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
 from service.storage.queries.limits import limits_of
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.times import DAY_S, Utc, shifted
 
@@ -81,7 +84,11 @@ def grades_of_period(
     if not blocks:
         return None
     measured = _blocks(connection, selected, INNOVATIONS)
-    days, total = _days(connection, spacecraft, run, start, end)
+    c = graded_days.c
+    chosen = c.current, c.spacecraft == spacecraft, c.run == run
+    within = buckets_between(c.day, start, end, DAY_S)
+    query = select(graded_days).where(*chosen, *within).order_by(c.day)
+    days = connection.execute(query).mappings().all()
     read = _spread(blocks)
     whole = {grade: _samples(connection, grade, read) for grade in GRADES}
     places = _of_each_part(
@@ -97,8 +104,8 @@ def grades_of_period(
         innovations=_innovations(connection, _spread(measured), selected, start, end),
         is_whole=len(blocks) <= MOST_BLOCKS and len(measured) <= MOST_BLOCKS,
         stretches=[(each.model, each.start_ns, each.end_ns) for each in blocks],
-        days=days,
-        total_days=total,
+        days=[shown(row) for row in days[-MOST_DAYS:]],
+        total_days=len(days),
     )
 
 
@@ -110,7 +117,7 @@ def latest_innovations(
     blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = _packed(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
     found = [unpacked_innovations(row.packed, row.samples) for row in rows]
-    return [each.taken(inside(each, selected)) for each in found]
+    return [each.taken(inside(each.tai_ns, selected)) for each in found]
 
 
 def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_Block]:
@@ -123,21 +130,6 @@ def _blocks(connection: Connection, selected: ResultFilter, kind: str) -> list[_
         .order_by(graded_days.c.day, c.position)
     )
     return [_Block(*row) for row in connection.execute(query)]
-
-
-def _days(
-    connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
-) -> tuple[list[GradedDayRow], int]:
-    c = graded_days.c
-    query = select(graded_days).where(
-        c.current,
-        c.spacecraft == spacecraft,
-        c.run == run,
-        c.day >= start.bucket(DAY_S),
-        c.start_ns < end.tai_ns,
-    )
-    rows = connection.execute(query.order_by(c.day)).mappings().all()
-    return [shown(row) for row in rows[-MOST_DAYS:]], len(rows)
 
 
 def _spread(blocks: Sequence[_Block]) -> list[_Block]:
@@ -172,12 +164,12 @@ def _severity(status: Integers) -> Integers:
 
 def _of_each_part(time_ns: Integers, rank: npt.ArrayLike, start: Utc, end: Utc) -> Integers:
     """The places, one in each part of the period, with the greatest rank in it; the first such."""
-    inside_ = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
+    within = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
     length_ns = max(end.tai_ns - start.tai_ns, 1)
-    part = ((time_ns[inside_] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
-    order = np.lexsort((time_ns[inside_], -np.asarray(rank)[inside_], part))
+    part = ((time_ns[within] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
+    order = np.lexsort((time_ns[within], -np.asarray(rank)[within], part))
     _, first = np.unique(part[order], return_index=True)
-    return np.asarray(inside_[order[first]])
+    return np.asarray(within[order[first]])
 
 
 def _repeated_models(read: Sequence[_Block], time_ns: Integers) -> npt.NDArray[np.bool_]:
@@ -187,11 +179,7 @@ def _repeated_models(read: Sequence[_Block], time_ns: Integers) -> npt.NDArray[n
 
 
 def _innovations(
-    connection: Connection,
-    read: Sequence[_Block],
-    selected: ResultFilter,
-    start: Utc,
-    end: Utc,
+    connection: Connection, read: Sequence[_Block], selected: ResultFilter, start: Utc, end: Utc
 ) -> MeasuredInnovations | None:
     """The innovations to show; None where none were recorded, as of an older revision."""
     if not read:
@@ -199,7 +187,7 @@ def _innovations(
     parts = []
     for row in _packed(connection, INNOVATIONS, read):
         found = unpacked_innovations(row.packed, row.samples)
-        parts.append(found.taken(inside(found, selected)))
+        parts.append(found.taken(inside(found.tai_ns, selected)))
     whole = MeasuredInnovations.joined(parts)
     is_used = whole.is_used
     nis = np.where(np.isfinite(whole.nis), whole.nis, np.inf)
@@ -223,7 +211,7 @@ def list_innovations(
     items: list[Innovation] = []
     while (block := connection.execute(beyond).mappings().first()) is not None:
         found = unpacked_innovations(block["packed"], block["samples"])
-        places = inside(found, selected)
+        places = inside(found.tai_ns, selected)
         if (block["day"], block["position"]) == (day, position):
             places = places[places >= row]
         for place, item in zip(places.tolist(), _shown(block, found, places), strict=False):
@@ -232,16 +220,6 @@ def list_innovations(
             items.append(item)
         beyond = query.where(tuple_(*PLACE) > tuple_(block["day"], block["position"]))
     return Page(items, None)
-
-
-def inside(found: MeasuredInnovations, selected: ResultFilter) -> Any:
-    """The places of the measurements in the period."""
-    chosen = np.ones(len(found), dtype=bool)
-    if selected.start is not None:
-        chosen &= found.tai_ns >= selected.start.tai_ns
-    if selected.end is not None:
-        chosen &= found.tai_ns < selected.end.tai_ns
-    return np.flatnonzero(chosen)
 
 
 def _shown(block: Any, found: MeasuredInnovations, places: Any) -> Iterator[Innovation]:

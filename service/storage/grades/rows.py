@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Any
 
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
@@ -12,19 +12,10 @@ from service.grades.carried import Carried
 from service.grades.day import Grade, day_bounds, unpacked
 from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
-from service.storage.models.base import (
-    Components,
-    Covariance,
-    DescribedAs,
-    Moment,
-    Quaternion,
-    Record,
-    doc,
-)
-from service.storage.models.base import (
-    Status as StatusWord,
-)
-from service.storage.queries.pages import ResultFilter
+from service.storage.grades.inputs import inside
+from service.storage.models.products import LiveAttitude
+from service.storage.queries.pages import ResultFilter, covariance_of
+from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.times import DAY_S, Utc
 
@@ -87,24 +78,19 @@ def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bo
         days.spacecraft == selected.spacecraft,
         days.run == selected.run,
         blocks.grade == kind,
+        *buckets_between(days.day, selected.start, selected.end, DAY_S),
     ]
     if selected.start is not None:
-        chosen += [days.day >= selected.start.bucket(DAY_S)]
-        chosen += [blocks.end_ns >= selected.start.tai_ns]
+        chosen.append(blocks.end_ns >= selected.start.tai_ns)
     if selected.end is not None:
-        chosen += [days.day <= selected.end.bucket(DAY_S), blocks.start_ns < selected.end.tai_ns]
+        chosen.append(blocks.start_ns < selected.end.tai_ns)
     return chosen
 
 
 def _rows(row: Any, selected: ResultFilter, grade: Grade) -> AttitudeRows:
     """The samples of a block that lie in the period."""
     found = unpacked(row["packed"], row["samples"])
-    first, last = 0, len(found)
-    if selected.start is not None:
-        first = int(np.searchsorted(found.tai_ns, selected.start.tai_ns))
-    if selected.end is not None:
-        last = int(np.searchsorted(found.tai_ns, selected.end.tai_ns))
-    found = found.taken(slice(first, last))
+    found = found.taken(inside(found.tai_ns, selected))
     n = len(found)
     start, _ = day_bounds(row["day"])
     status = _repeated(None, n)
@@ -140,40 +126,18 @@ def _repeated(value: str | None, n: int) -> Any:
     return column
 
 
-class LiveAttitude(Record, frozen=True, kw_only=True):
-    """The filtered attitude of a spacecraft at the last epoch of its live data."""
-
-    component: ClassVar[str] = "LiveAttitude"
-    spacecraft: str
-    time: Annotated[Moment, doc("Of the last gyro sample or, without a gyro, measurement.")]
-    quaternion: Quaternion
-    covariance_arcsec2: Covariance
-    rate_deg_per_s: Annotated[Components, doc("Of the body relative to inertial, in body axes.")]
-    bias_deg_per_h: Annotated[
-        Components | None, doc("Bias of the gyro, in body axes; null at a constant rate.")
-    ]
-    bias_sigma_deg_per_h: Annotated[
-        Components, doc("One sigma of the bias or, at a constant rate, of the rate.")
-    ]
-    status: Annotated[
-        StatusWord, doc("`suspect`: measurements contradict it, or have not confirmed it yet.")
-    ]
-    model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
-
-
 def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:
     """The answer about the last epoch; None where there is no attitude, or it is lost."""
     if carried is None or (word := STATUS.get(Status(int(carried.sample.status[0])))) is None:
         return None
     sample = carried.sample
     (time,) = texts_of(day_start, np.asarray((sample.tai_ns - day_start.tai_ns) * 1e-9))
-    p11, p12, p13, p22, p23, p33 = sample.covariance_arcsec2[0].tolist()
     is_gyro = carried.model == "gyro"
     return LiveAttitude(
         spacecraft=name,
         time=time,
         quaternion=sample.quaternion[0].tolist(),
-        covariance_arcsec2=[[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]],
+        covariance_arcsec2=covariance_of(sample.covariance_arcsec2[0].tolist()),
         rate_deg_per_s=sample.rate_deg_per_s[0].tolist(),
         bias_deg_per_h=sample.bias_deg_per_h[0].tolist() if is_gyro else None,
         bias_sigma_deg_per_h=sample.bias_sigma_deg_per_h[0].tolist(),

@@ -2,7 +2,7 @@
 
 from typing import Annotated, ClassVar, Literal
 
-from service.storage.models.base import Id, Record, Stamp, doc
+from service.storage.models.base import Id, Record, Stamp, doc, list_record, page_record
 
 Scope = Literal["read", "submit", "operate"]
 
@@ -10,14 +10,11 @@ Scope = Literal["read", "submit", "operate"]
 class Session(Record, frozen=True, kw_only=True):
     """The caller and its scopes."""
 
-    component: ClassVar[str] = "Session"
-    name: Annotated[
-        str | None, doc("The token's name, which the audit list records with each change.")
-    ]
+    name: str | None
+    """The token's name, which the audit list records with each change."""
     scopes: list[Scope]
-    spacecraft: Annotated[
-        list[str] | None, doc("Spacecraft that the token is bound to; null: all.")
-    ]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
 
 
 TokenState = Literal["good", "expired", "revoked"]
@@ -26,12 +23,10 @@ TokenState = Literal["good", "expired", "revoked"]
 class Token(Record, frozen=True, kw_only=True):
     """A token without its secret, of which only a digest is stored."""
 
-    component: ClassVar[str] = "Token"
     name: Annotated[str, doc("The audit list records changes under it; never used again.")]
     scopes: list[Scope]
-    spacecraft: Annotated[
-        list[str] | None, doc("Spacecraft that the token is bound to; null: all.")
-    ]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
     rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
     created: Stamp
     expires: Stamp
@@ -42,15 +37,10 @@ class Token(Record, frozen=True, kw_only=True):
 class NewToken(Token, frozen=True, kw_only=True):
     """A new token with its secret, which is shown this once."""
 
-    component: ClassVar[str] = "NewToken"
     token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
 
 
-class TokenList(Record, frozen=True, kw_only=True):
-    """All tokens, the oldest first."""
-
-    component: ClassVar[str] = "TokenList"
-    items: list[Token]
+TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
 
 
 class AuditEntry(Record, frozen=True, kw_only=True):
@@ -66,9 +56,4 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
 
 
-class AuditPage(Record, frozen=True, kw_only=True):
-    """A page of changes."""
-
-    component: ClassVar[str] = "AuditPage"
-    items: list[AuditEntry]
-    next_cursor: str | None
+AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")

@@ -18,7 +18,6 @@ Size = Literal["too_small", "fits", "too_large", "no_verdict"]
 class Estimate(Record, frozen=True, kw_only=True):
     """An estimate with its 95 % interval; null if the sample does not bound it."""
 
-    component: ClassVar[str] = "Estimate"
     value: float
     low: float | None
     high: float | None
@@ -27,7 +26,6 @@ class Estimate(Record, frozen=True, kw_only=True):
 class ToleranceAdvice(Record, frozen=True, kw_only=True):
     """A tolerance, compared with the differences between measurements and catalog."""
 
-    component: ClassVar[str] = "ToleranceAdvice"
     tolerance: Annotated[str, doc("The name in the mission file.")]
     symbol: Annotated[str, doc("The symbol of Fink & Shoup (1994).")]
     unit: Literal["deg", "mag"]
@@ -36,15 +34,12 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
     confidence: Literal["high", "moderate", "low", "none"]
     differences: Count
     batches: Count
-    needed: Annotated[
-        Estimate | None, doc("The value that accepts 99 % of the true pairs or stars.")
-    ]
-    share_beyond: Annotated[
-        Estimate | None, doc("Share of the true pairs or stars that the present value rejects.")
-    ]
-    recommended: Annotated[
-        float | None, doc("For votes; `not_used` says where the identifier is another.")
-    ]
+    needed: Estimate | None
+    """The value that accepts 99 % of the true pairs or stars."""
+    share_beyond: Estimate | None
+    """Share of the true pairs or stars that the present value rejects."""
+    recommended: float | None
+    """For votes; `not_used` says where the identifier is another."""
     action: Action
     text: Text
 
@@ -52,7 +47,6 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
 class GroupAdvice(Record, frozen=True, kw_only=True):
     """Findings that no setting can correct: two groups of stars, mirrored axes."""
 
-    component: ClassVar[str] = "GroupAdvice"
     action: Action
     text: Text
 
@@ -60,7 +54,6 @@ class GroupAdvice(Record, frozen=True, kw_only=True):
 class ZoneAdvice(Record, frozen=True, kw_only=True):
     """A finding on the size of the zone, or on the largest separation of its pairs."""
 
-    component: ClassVar[str] = "ZoneAdvice"
     action: Action
     text: Text
 
@@ -68,7 +61,6 @@ class ZoneAdvice(Record, frozen=True, kw_only=True):
 class NoisePeriodAdvice(Record, frozen=True, kw_only=True):
     """A tracker's noise over consecutive batches."""
 
-    component: ClassVar[str] = "NoisePeriodAdvice"
     sigma_arcsec: Estimate
     batches: Count
     first: Annotated[Moment, doc("Time of the first batch of the period.")]
@@ -78,16 +70,13 @@ class NoisePeriodAdvice(Record, frozen=True, kw_only=True):
 class NoiseAdvice(Record, frozen=True, kw_only=True):
     """A tracker's noise, one standard deviation per tangent axis."""
 
-    component: ClassVar[str] = "NoiseAdvice"
     tracker: str
     now_arcsec: float
     sigma_arcsec: Estimate | None
     batches: Count
     verdict: Size
-    worst: Annotated[
-        NoisePeriodAdvice | None,
-        doc("A period in which the noise was certainly larger than `sigma_arcsec`."),
-    ]
+    worst: NoisePeriodAdvice | None
+    """A period in which the noise was certainly larger than `sigma_arcsec`."""
     action: Action
     text: Text
 
@@ -95,12 +84,10 @@ class NoiseAdvice(Record, frozen=True, kw_only=True):
 class MagnitudeAdvice(Record, frozen=True, kw_only=True):
     """observed = catalog + offset + (scale - 1) (catalog - pivot)."""
 
-    component: ClassVar[str] = "MagnitudeAdvice"
     tracker: str
     pivot_mag: Annotated[float | None, doc("The median of the catalog magnitudes.")]
-    offset_mag: Annotated[
-        Estimate | None, doc("At the pivot; positive: the tracker measures fainter.")
-    ]
+    offset_mag: Estimate | None
+    """At the pivot; positive: the tracker measures fainter."""
     scale: Estimate | None
     now_sigma_mag: float
     scatter_mag: Annotated[Estimate | None, doc("One standard deviation about the line.")]
@@ -114,17 +101,12 @@ class MagnitudeAdvice(Record, frozen=True, kw_only=True):
 class AlignmentAdvice(Record, frozen=True, kw_only=True):
     """Rotation of a tracker from its place in the mission file, relative to the first tracker."""
 
-    component: ClassVar[str] = "AlignmentAdvice"
     tracker: str
     reference: str
-    rotation_arcsec: Annotated[
-        Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None,
-        doc("Rotation vector about the body axes."),
-    ]
-    axes_body: Annotated[
-        Annotated[list[Components], Field(min_length=3, max_length=3)] | None,
-        doc("The measured x, y and z axis of the tracker, if the sample fixes them."),
-    ]
+    rotation_arcsec: Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None
+    """Rotation vector about the body axes."""
+    axes_body: Annotated[list[Components], Field(min_length=3, max_length=3)] | None
+    """The measured x, y and z axis of the tracker, if the sample fixes them."""
     batches: Count
     verdict: Literal["off", "fits", "no_verdict"]
     action: Action
@@ -134,14 +116,10 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
 class InnovationAdvice(Record, frozen=True, kw_only=True):
     """Noise by the innovations of the filter and how they follow each other."""
 
-    component: ClassVar[str] = "InnovationAdvice"
-    subject: Annotated[
-        Literal["gyro", "attitudes"],
-        doc("`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."),
-    ]
-    ratio: Annotated[
-        Estimate | None, doc("True over assumed standard deviation; null: too little data.")
-    ]
+    subject: Literal["gyro", "attitudes"]
+    """`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."""
+    ratio: Estimate | None
+    """True over assumed standard deviation; null: too little data."""
     measurements: Annotated[Count, doc("Innovations that were used.")]
     action: Action
     text: Text
@@ -159,23 +137,16 @@ class Trial(Record, frozen=True, kw_only=True):
     unique: Count
     ambiguous: Count
     unmatched: Count
-    named_otherwise: Annotated[
-        Count,
-        doc("Stars that are unique here and under `verified`, but as different catalog stars."),
-    ]
-    change_points: Annotated[
-        Estimate | None,
-        doc(
-            "Change of the share that is not unique, in percentage points, relative to votes "
-            "with the present settings; null: not compared."
-        ),
-    ]
+    named_otherwise: Count
+    """Stars that are unique here and under `verified`, but as different catalog stars."""
+    change_points: Estimate | None
+    """Change of the share that is not unique, in percentage points, relative to votes with the
+    present settings; null: not compared."""
 
 
 class Change(Record, frozen=True, kw_only=True):
     """A line for the mission's file."""
 
-    component: ClassVar[str] = "Change"
     table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
     line: str
@@ -184,7 +155,6 @@ class Change(Record, frozen=True, kw_only=True):
 class Advice(Record, frozen=True, kw_only=True):
     """Recommended settings of a mission, from recorded batches."""
 
-    component: ClassVar[str] = "Advice"
     spacecraft: str
     run: str
     first: Annotated[Moment | None, doc("Time of the first batch of the sample.")]
@@ -196,21 +166,15 @@ class Advice(Record, frozen=True, kw_only=True):
     refusal: str | None
     mission: Digest
     identifier: Identifier
-    groups: Annotated[
-        list[GroupAdvice],
-        doc(
-            "Findings on batches in which two groups of stars give two attitudes, and on "
-            "mirrored batches."
-        ),
-    ]
+    groups: list[GroupAdvice]
+    """Findings on batches in which two groups of stars give two attitudes, and on mirrored
+    batches."""
     zone: Annotated[list[ZoneAdvice], doc("By the a priori errors of the run's latest batches.")]
     tolerances: list[ToleranceAdvice]
     noise: list[NoiseAdvice]
     magnitudes: list[MagnitudeAdvice]
     alignment: list[AlignmentAdvice]
-    innovations: Annotated[
-        list[InnovationAdvice],
-        doc("Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."),
-    ]
+    innovations: list[InnovationAdvice]
+    """Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."""
     tried: list[Trial]
     changes: list[Change]

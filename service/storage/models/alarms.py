@@ -2,10 +2,21 @@
 
 from typing import Annotated, Any, ClassVar, Literal
 
+from msgspec import Struct
+
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName
 from service.alarms.state_machine import AlarmActionName, AlarmState
-from service.storage.models.base import DescribedAs, Id, Moment, Record, Stamp, doc
+from service.storage.models.base import (
+    DescribedAs,
+    Id,
+    Moment,
+    Record,
+    Stamp,
+    doc,
+    list_record,
+    page_record,
+)
 
 SeverityName = Literal["watch", "warning", "critical"]
 
@@ -18,26 +29,20 @@ class Limit(Record, frozen=True, kw_only=True):
     quantity: QuantityName
     tracker: Annotated[str | None, doc("null: of the spacecraft as a whole.")] = None
     unit: str
-    is_default: Annotated[
-        bool, doc("Whether this is the shipped limit; of a tracker, that of its spacecraft.")
-    ]
+    is_default: bool
+    """Whether this is the shipped limit; of a tracker, that of its spacecraft."""
     since: Annotated[Stamp | None, doc("null: it was never changed.")]
     who: str | None
     comment: str | None
     settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
 
 
-class LimitList(Record, frozen=True, kw_only=True):
-    """The limits of a spacecraft."""
-
-    component: ClassVar[str] = "LimitList"
-    items: list[Limit]
+LimitList = list_record("LimitList", Limit, "The limits of a spacecraft.")
 
 
 class LimitHistory(Record, frozen=True, kw_only=True):
     """One limit, the shipped limit, and the history of changes."""
 
-    component: ClassVar[str] = "LimitHistory"
     limit: Limit
     default: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
     history: Annotated[list[Limit], doc("Newest first.")]
@@ -46,7 +51,6 @@ class LimitHistory(Record, frozen=True, kw_only=True):
 class LimitExcursion(Record, frozen=True, kw_only=True):
     """A time for which an alarm would have been out of limits."""
 
-    component: ClassVar[str] = "LimitExcursion"
     severity: Annotated[SeverityName, doc("The worst.")]
     start: Annotated[Moment, doc("Time of the batch that would have raised the alarm.")]
     end: Annotated[Moment | None, doc("First batch back in limits; null: out to the end.")]
@@ -57,15 +61,11 @@ class LimitExcursion(Record, frozen=True, kw_only=True):
 class LimitTrial(Record, frozen=True, kw_only=True):
     """How recorded batches are evaluated against a limit."""
 
-    component: ClassVar[str] = "LimitTrial"
     settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
-    evaluated: Annotated[
-        int, doc("Batches at which there was a value: the mean over the latest minimum_count.")
-    ]
-    beyond: Annotated[
-        dict[SeverityName, int],
-        doc("Values beyond the bounds of each severity, whatever hysteresis and duration are."),
-    ]
+    evaluated: int
+    """Batches at which there was a value: the mean over the latest minimum_count."""
+    beyond: dict[SeverityName, int]
+    """Values beyond the bounds of each severity, whatever hysteresis and duration are."""
     alarms: Annotated[int, doc("How often the quantity would have left its limits.")]
     excursions: Annotated[list[LimitExcursion], doc("The latest of these, oldest first.")]
 
@@ -73,7 +73,6 @@ class LimitTrial(Record, frozen=True, kw_only=True):
 class LimitPreview(Record, frozen=True, kw_only=True):
     """A limit that is not set, and the one in force, over the same recorded batches."""
 
-    component: ClassVar[str] = "LimitPreview"
     spacecraft: str
     run: str
     quantity: QuantityName
@@ -126,9 +125,8 @@ class Alarm(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     quantity: QuantityName
-    tracker: Annotated[
-        str | None, doc("The tracker that it is about; null: the spacecraft as a whole.")
-    ] = None
+    tracker: str | None = None
+    """The tracker that it is about; null: the spacecraft as a whole."""
     unit: str
     state: AlarmState
     severity: Annotated[SeverityName, doc("The worst severity so far.")]
@@ -143,12 +141,7 @@ class Alarm(Record, frozen=True, kw_only=True):
     cleared_at: Stamp | None
 
 
-class AlarmPage(Record, frozen=True, kw_only=True):
-    """A page of alarms."""
-
-    component: ClassVar[str] = "AlarmPage"
-    items: list[Alarm]
-    next_cursor: str | None
+AlarmPage = page_record("AlarmPage", Alarm, "A page of alarms.")
 
 
 class AlarmAction(Record, frozen=True, kw_only=True):
@@ -171,7 +164,7 @@ class AlarmWithActions(Alarm, frozen=True, kw_only=True):
     actions: Annotated[list[AlarmAction], doc("Oldest first.")]
 
 
-class AlarmSpan(Record, frozen=True, kw_only=True):
+class AlarmSpan(Struct, frozen=True, kw_only=True):
     """A span of telemetry time in which an alarm was out of its limits, for a chart."""
 
     id: Id
@@ -185,7 +178,6 @@ class AlarmSpan(Record, frozen=True, kw_only=True):
 class AlarmSummary(Record, frozen=True, kw_only=True):
     """How many alarms are active, by state."""
 
-    component: ClassVar[str] = "AlarmSummary"
     open: int
     acknowledged: int
     shelved: int
@@ -195,7 +187,6 @@ class AlarmSummary(Record, frozen=True, kw_only=True):
 class Annotation(Record, frozen=True, kw_only=True):
     """A note on a time or a period, signed by its author."""
 
-    component: ClassVar[str] = "Annotation"
     id: Id
     spacecraft: Annotated[str | None, doc("null: it is about every spacecraft.")]
     start: Annotated[Moment, doc("Telemetry time.")]
@@ -205,12 +196,7 @@ class Annotation(Record, frozen=True, kw_only=True):
     created: Stamp
 
 
-class AnnotationPage(Record, frozen=True, kw_only=True):
-    """A page of annotations."""
-
-    component: ClassVar[str] = "AnnotationPage"
-    items: list[Annotation]
-    next_cursor: str | None
+AnnotationPage = page_record("AnnotationPage", Annotation, "A page of annotations.")
 
 
 class AnnotationChange(Annotation, frozen=True, kw_only=True):

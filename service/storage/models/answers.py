@@ -28,6 +28,8 @@ from service.storage.models.base import (
     Stamp,
     Status,
     doc,
+    list_record,
+    page_record,
 )
 
 
@@ -58,22 +60,16 @@ class FrameSummary(Record, frozen=True, kw_only=True):
     used: Annotated[Count, doc("Of these, the stars in the batch.")]
     hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
     timings_us: FrameTimings
-    remarks: (
-        Annotated[
-            list[str], doc("What the service fitted, chose of the file, or turned, in words.")
-        ]
-        | UnsetType
-    ) = UNSET
+    remarks: list[str] | UnsetType = UNSET
+    """What the service fitted, chose of the file, or turned, in words."""
 
 
 class Detection(Record, frozen=True, kw_only=True):
     """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
 
     component: ClassVar[str] = "DetectionOut"
-    u_px: Annotated[
-        float | None,
-        doc("null if the position could not be measured; `left_out` states the reason."),
-    ]
+    u_px: float | None
+    """null if the position could not be measured; `left_out` states the reason."""
     v_px: float | None
     sigma_u_px: Annotated[float | None, doc("Predicted, one standard deviation.")]
     sigma_v_px: float | None
@@ -106,16 +102,13 @@ class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "FrameRecordOut"
     stars: Annotated[list[Detection], doc("The stars in the batch come first.")]
-    hot_or_cosmic_px: Annotated[
-        list[Annotated[list[float], Field(min_length=2, max_length=2)]],
-        doc("Positions (u, v) of rejected hot pixels and cosmic rays; the first 500."),
-    ]
+    hot_or_cosmic_px: list[Annotated[list[float], Field(min_length=2, max_length=2)]]
+    """Positions (u, v) of rejected hot pixels and cosmic rays; the first 500."""
 
 
 class StarRef(Record, frozen=True, kw_only=True):
     """A star of the catalog."""
 
-    component: ClassVar[str] = "StarRef"
     catalog: Annotated[str, Field(examples=["HIP"])]
     id: Annotated[str, Field(examples=["HIP 26311"])]
 
@@ -128,30 +121,14 @@ class Star(Record, frozen=True, kw_only=True):
     star: StarRef | None
     votes: Annotated[Count, doc("Highest number of votes (STARID).")]
     runner_up: Annotated[Count, doc("Second highest number of votes; equal to `votes` in a tie.")]
-    rivals: (
-        Annotated[
-            list[str],
-            doc(
-                "Catalog stars that it can be, if it is not unique: those with equal votes or, "
-                "with probabilities, the probable ones, most probable first."
-            ),
-        ]
-        | UnsetType
-    ) = UNSET
-    rival_probabilities: (
-        Annotated[
-            list[float],
-            doc("Probability of each entry of `rivals`, if the identifier gives probabilities."),
-        ]
-        | UnsetType
-    ) = UNSET
-    probability: Annotated[
-        float | None,
-        doc(
-            "Probability of `star`; for an ambiguous star, of its most probable rival; for an "
-            "unmatched star, that it is no star of the zone. null: the identifier gives none."
-        ),
-    ]
+    rivals: list[str] | UnsetType = UNSET
+    """Catalog stars that it can be, if it is not unique: those with equal votes or, with
+    probabilities, the probable ones, most probable first."""
+    rival_probabilities: list[float] | UnsetType = UNSET
+    """Probability of each entry of `rivals`, if the identifier gives probabilities."""
+    probability: float | None
+    """Probability of `star`; for an ambiguous star, of its most probable rival; for an unmatched
+    star, that it is no star of the zone. null: the identifier gives none."""
     residual_arcsec: Annotated[float | None, doc("null if the attitude does not use the star.")]
     flags: list[
         Annotated[
@@ -169,7 +146,6 @@ ZonePairCount = Annotated[Count, doc("Number of pairs (NTOT).")]
 class ZoneSummary(Record, frozen=True, kw_only=True):
     """The part of the sky in which the service searched for stars."""
 
-    component: ClassVar[str] = "ZoneSummary"
     kind: ZoneKind
     ra_deg: ZoneRightAscension
     dec_deg: float
@@ -189,10 +165,8 @@ class TrackerStars(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "TrackerOut"
     tracker: str
-    zone: Annotated[
-        SearchedZone | None,
-        doc("null if the whole sky gave no attitude."),
-    ]
+    zone: SearchedZone | None
+    """null if the whole sky gave no attitude."""
     stars: list[Star]
 
 
@@ -224,13 +198,9 @@ class Rival(Record, frozen=True, kw_only=True):
     covariance_arcsec2: Covariance
     probability: Annotated[float, doc("Its probability, relative to the first attitude.")]
     angle_deg: Annotated[float, doc("The rotation between the two attitudes.")]
-    stars: Annotated[
-        list[list[str | None]],
-        doc(
-            "For each tracker, its stars in the order observed; null for a star that is not in "
-            "the group."
-        ),
-    ]
+    stars: list[list[str | None]]
+    """For each tracker, its stars in the order observed; null for a star that is not in the
+    group."""
 
 
 class Attitude(Record, frozen=True, kw_only=True):
@@ -240,31 +210,21 @@ class Attitude(Record, frozen=True, kw_only=True):
     quaternion: Quaternion
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
-    method: Annotated[
-        str,
-        DescribedAs(Literal["quest", "triad", "measured"]),
-        doc("`measured`: by a tracker itself; all that needs stars is null then."),
-    ]
+    method: Annotated[str, DescribedAs(Literal["quest", "triad", "measured"])]
+    """`measured`: by a tracker itself; all that needs stars is null then."""
     residual_rms_arcsec: float | None
     predicted_rms_arcsec: float | None
     taste: Annotated[float | None, doc("Weighted sum of squared residuals; follows chi-square.")]
     degrees_of_freedom: Count
-    status: Annotated[
-        Status,
-        doc("`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."),
-    ]
+    status: Status
+    """`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."""
     triad: Quaternion | None
     quest: Quaternion | None
     triad_quest_angle_arcsec: float | None
-    trackers: Annotated[list[TrackerFit], doc("If there are several trackers.")] | UnsetType = UNSET
-    outlier: Annotated[str | None, doc("The tracker that disagrees.")] | UnsetType = UNSET
-    rival: (
-        Annotated[
-            Rival | None,
-            doc("If two groups of stars give two attitudes: the less probable one."),
-        ]
-        | UnsetType
-    ) = UNSET
+    trackers: Annotated[list[TrackerFit] | UnsetType, doc("If there are several trackers.")] = UNSET
+    outlier: Annotated[str | UnsetType | None, doc("The tracker that disagrees.")] = UNSET
+    rival: Rival | UnsetType | None = UNSET
+    """If two groups of stars give two attitudes: the less probable one."""
 
 
 class Timings(Record, frozen=True, kw_only=True):
@@ -308,15 +268,10 @@ class Tracking(Record, frozen=True, kw_only=True):
     """What came of asking for the last attitude."""
 
     component: ClassVar[str] = "TrackingOut"
-    state: Annotated[
-        str,
-        DescribedAs(TrackingState),
-        doc(
-            "`tracking`: a good attitude was found about the prediction, or the prediction "
-            "identified a star of a batch that has no attitude. `acquiring`: a good attitude was "
-            "found in the whole sky. `lost`: none of these."
-        ),
-    ]
+    state: Annotated[str, DescribedAs(TrackingState)]
+    """`tracking`: a good attitude was found about the prediction, or the prediction identified a
+    star of a batch that has no attitude. `acquiring`: a good attitude was found in the whole sky.
+    `lost`: none of these."""
     by_default: Annotated[bool, doc("The mission asks for it, not the batch.")]
     prediction: Prediction | None
     reason: Annotated[_NoPrediction | None, doc("Why nothing was predicted.")]
@@ -325,7 +280,6 @@ class Tracking(Record, frozen=True, kw_only=True):
 class Answer(Record, frozen=True, kw_only=True):
     """The answer to a batch, as it is recorded."""
 
-    component: ClassVar[str] = "Answer"
     id: Annotated[Id | None, doc("null for a what-if that was not recorded.")]
     spacecraft: str
     batch: str
@@ -333,16 +287,12 @@ class Answer(Record, frozen=True, kw_only=True):
     time: Moment
     identifier: Annotated[str, DescribedAs(Identifier)]
     path: Annotated[
-        str,
-        DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space", "measured"]),
-        doc(
-            "`zone`: the service searched about the a priori attitude. `lost_in_space`: without "
-            "an a priori attitude, it searched about an attitude from the whole sky. "
-            "`zone_then_lost_in_space`: the first search found nothing good, so the service "
-            "made the second. `measured`: the batch holds an attitude that a tracker measured; "
-            "nothing was searched for, and `identifier` was not used."
-        ),
+        str, DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space", "measured"])
     ]
+    """`zone`: the service searched about the a priori attitude. `lost_in_space`: without an a
+    priori attitude, it searched about an attitude from the whole sky. `zone_then_lost_in_space`:
+    the first search found nothing good, so the service made the second. `measured`: the batch holds
+    an attitude that a tracker measured; nothing was searched for, and `identifier` was not used."""
     observations: list[TrackerStars]
     counts: StarCounts
     attitude: Attitude | None
@@ -350,22 +300,13 @@ class Answer(Record, frozen=True, kw_only=True):
     warnings: list[str]
     timings_us: Timings
     provenance: Provenance
-    parent: (
-        Annotated[
-            Id | None,
-            doc("Only for a what-if: the result that it started from."),
-        ]
-        | UnsetType
-    ) = UNSET
-    recorded: Annotated[bool, doc("For a what-if: whether it was recorded.")] | UnsetType = UNSET
-    frame: (
-        Annotated[FrameSummary | None, doc("Only for a batch that was made from a frame.")]
-        | UnsetType
-    ) = UNSET
-    tracking: (
-        Annotated[Tracking | None, doc("Only for a batch that asks for the last attitude.")]
-        | UnsetType
-    ) = UNSET
+    parent: Id | UnsetType | None = UNSET
+    """Only for a what-if: the result that it started from."""
+    recorded: Annotated[bool | UnsetType, doc("For a what-if: whether it was recorded.")] = UNSET
+    frame: FrameSummary | UnsetType | None = UNSET
+    """Only for a batch that was made from a frame."""
+    tracking: Tracking | UnsetType | None = UNSET
+    """Only for a batch that asks for the last attitude."""
 
 
 class _MeasuresShape:
@@ -392,7 +333,6 @@ Measures = Annotated[dict[str, float | None], DescribedAs(_MeasuresShape)]
 class Summary(Record, frozen=True, kw_only=True):
     """A result in a list, without its stars and its attitude."""
 
-    component: ClassVar[str] = "Summary"
     id: Id
     spacecraft: str
     batch: str
@@ -411,12 +351,7 @@ class Summary(Record, frozen=True, kw_only=True):
     archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
 
 
-class BatchPage(Record, frozen=True, kw_only=True):
-    """A page of results."""
-
-    component: ClassVar[str] = "BatchPage"
-    items: list[Summary]
-    next_cursor: str | None
+BatchPage = page_record("BatchPage", Summary, "A page of results.")
 
 
 class Result(Record, frozen=True, kw_only=True):
@@ -424,33 +359,19 @@ class Result(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "Record"
     answer: Answer
-    input: Annotated[
-        dict[str, Any],
-        DescribedAs(BatchIn),
-        doc(
-            "The batch as it was sent, without default values. The service adds the prediction "
-            "to one that asks for the last attitude."
-        ),
-    ]
-    options: Annotated[
-        MissionSettings,
-        doc(
-            "Options of this result that replaced the mission's settings; `provenance.mission` "
-            "identifies those settings."
-        ),
-    ]
+    input: Annotated[dict[str, Any], DescribedAs(BatchIn)]
+    """The batch as it was sent, without default values. The service adds the prediction to one that
+    asks for the last attitude."""
+    options: MissionSettings
+    """Options of this result that replaced the mission's settings; `provenance.mission` identifies
+    those settings."""
     measures: Measures
     current: bool
     parent: Id | None
     archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
-    frame: (
-        Annotated[
-            FrameWithStars | None,
-            doc("Only for a batch that was made from a frame."),
-        ]
-        | UnsetType
-    ) = UNSET
+    frame: FrameWithStars | UnsetType | None = UNSET
+    """Only for a batch that was made from a frame."""
 
 
 class Neighbours(Struct, frozen=True):
@@ -464,20 +385,15 @@ class Neighbours(Struct, frozen=True):
 class BatchOutcome(Record, frozen=True, kw_only=True):
     """The outcome of one batch of an array: its answer or its problem, the other is null."""
 
-    component: ClassVar[str] = "BatchOutcome"
-    status: Annotated[
-        int,
-        doc(
-            "The status that the batch alone would have had: 201 if it is now recorded, 200 if it "
-            "was recorded before, or the status of the problem."
-        ),
-    ]
+    status: int
+    """The status that the batch alone would have had: 201 if it is now recorded, 200 if it was
+    recorded before, or the status of the problem."""
     answer: Annotated[Raw | None, DescribedAs(Answer | None), doc("As it is recorded.")]
     problem: Problem | None
 
 
-class BatchOutcomes(Record, frozen=True, kw_only=True):
-    """One outcome for each batch of an array, in the order in which they were sent."""
-
-    component: ClassVar[str] = "BatchOutcomes"
-    items: list[BatchOutcome]
+BatchOutcomes = list_record(
+    "BatchOutcomes",
+    BatchOutcome,
+    "One outcome for each batch of an array, in the order in which they were sent.",
+)

@@ -2,10 +2,16 @@
 
 A record is a msgspec struct: storage functions make it, and the API encodes it as
 it is.  Its annotations carry pydantic's `Field` for descriptions and bounds, which
-msgspec ignores; the schema in the OpenAPI document is made of them.
+msgspec ignores; the schema in the OpenAPI document is made of them.  A description too long
+for the line of its field stands below it as a text.
 """
 
+import ast
+import inspect
+import sys
+from collections.abc import Mapping
 from functools import cache
+from itertools import pairwise
 from types import UnionType
 from typing import (
     Annotated,
@@ -15,12 +21,13 @@ from typing import (
     Literal,
     TypeVar,
     Union,
+    cast,
     get_args,
     get_origin,
     get_type_hints,
 )
 
-from msgspec import NODEFAULT, UNSET, Struct, UnsetType, structs
+from msgspec import NODEFAULT, UNSET, Struct, UnsetType, defstruct, structs
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
@@ -105,7 +112,10 @@ Reason = Annotated[
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """A record; `component` is its name in the OpenAPI document, empty where no answer has it."""
+    """A record of the OpenAPI document; `component` is its name there if not that of the class.
+
+    An empty `component` says that only records derived from it are in the document.
+    """
 
     component: ClassVar[str] = ""
 
@@ -115,6 +125,7 @@ class Record(Struct, frozen=True, kw_only=True):
         return handler(described(cls))
 
 
+R = TypeVar("R", bound=Record)
 R_co = TypeVar("R_co", covariant=True)
 
 
@@ -150,15 +161,63 @@ def described(record: type[Record]) -> type[BaseModel]:
     for each in structs.fields(record):
         is_required = each.default is NODEFAULT and each.default_factory is NODEFAULT
         default = ... if is_required else None
-        alias = each.encode_name if each.encode_name != each.name else None
-        fields[each.name] = _without_unset(hints[each.name]), Field(default, alias=alias)
+        about: dict[str, Any] = {"description": _text_below(record, each.name)}
+        if each.encode_name != each.name:
+            about["alias"] = each.encode_name
+        known = {name: value for name, value in about.items() if value is not None}
+        fields[each.name] = _without_unset(hints[each.name]), Field(default, **known)
     return create_model(component_name(record), __base__=Shape, __doc__=record.__doc__, **fields)
 
 
+def _text_below(record: type[Record], field: str) -> str | None:
+    owners = [each for each in record.__mro__ if issubclass(each, Record)]
+    texts = (_texts_below_fields(each.__module__).get((each.__name__, field)) for each in owners)
+    return next(filter(None, texts), None)
+
+
+@cache
+def _texts_below_fields(module: str) -> Mapping[tuple[str, str], str]:
+    """The texts that stand below fields in the source of a module, by class and field."""
+    found = {}
+    for record in ast.parse(inspect.getsource(sys.modules[module])).body:
+        if isinstance(record, ast.ClassDef):
+            for field, below in pairwise(record.body):
+                match field, below:
+                    case ast.AnnAssign(ast.Name(name)), ast.Expr(ast.Constant(str(text))):
+                        found[record.name, name] = " ".join(text.split())
+    return found
+
+
 def _without_unset(kind: Any) -> Any:
+    if get_origin(kind) is Annotated:
+        return Annotated[(_without_unset(kind.__origin__), *kind.__metadata__)]
     if get_origin(kind) not in (Union, UnionType):
         return kind
     return Union[tuple(each for each in get_args(kind) if each is not UnsetType)]  # noqa: UP007
+
+
+class Items(Record, frozen=True, kw_only=True):
+    """A whole list."""
+
+    component: ClassVar[str] = ""
+    items: list[Any]
+
+
+def list_record(name: str, item: type[Record], description: str) -> type[Items]:
+    """The record of a whole list."""
+    return _defined(name, [("items", list[item])], Items, description)  # type: ignore[valid-type]
+
+
+def page_record(name: str, item: type[Record], description: str) -> type[Record]:
+    """The record that describes a `Page` of a list."""
+    fields = [("items", list[item]), ("next_cursor", str | None)]  # type: ignore[valid-type]
+    return _defined(name, fields, Record, description)
+
+
+def _defined(name: str, fields: Any, base: type[R], description: str) -> type[R]:
+    content = {"__doc__": description, "__module__": __name__}
+    record = defstruct(name, fields, bases=(base,), namespace=content, frozen=True, kw_only=True)
+    return cast(type[R], record)
 
 
 class FieldFault(Record, frozen=True, kw_only=True):
@@ -173,10 +232,9 @@ class FieldFault(Record, frozen=True, kw_only=True):
 class Problem(Record, frozen=True, kw_only=True):
     """A problem (RFC 9457)."""
 
-    component: ClassVar[str] = "Problem"
     type: Annotated[str, doc("The type of problem; `about:blank` if the status says everything.")]
     title: str
     status: int
     detail: str
     instance: Annotated[str, doc("The path of the request.")]
-    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET
+    errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET

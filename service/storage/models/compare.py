@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
-from msgspec import field
+from msgspec import Struct, field
 
 from service.storage.models.answers import StarCounts
 from service.storage.models.base import Count, Id, MissionSettings, Moment, Outcome, Record, doc
@@ -20,15 +20,13 @@ class ComparedSide(StarCounts, frozen=True, kw_only=True):
     solved: Count
     suspect: Count
     residual_ratio_mean: float | None
-    us_per_batch: Annotated[
-        float | None, doc("Median time for zones, identification and attitude.")
-    ]
+    us_per_batch: float | None
+    """Median time for zones, identification and attitude."""
 
 
 class Transition(Record, frozen=True, kw_only=True):
     """Number of stars with an outcome on side a and an outcome on side b, including equal ones."""
 
-    component: ClassVar[str] = "Transition"
     from_: Outcome = field(name="from")
     to: Outcome
     stars: Count
@@ -49,7 +47,6 @@ class ComparedAttitudes(Record, frozen=True, kw_only=True):
 class StarSide(Record, frozen=True, kw_only=True):
     """One star on one side."""
 
-    component: ClassVar[str] = "StarSide"
     outcome: Outcome
     star: str | None
 
@@ -57,7 +54,6 @@ class StarSide(Record, frozen=True, kw_only=True):
 class StarChange(Record, frozen=True, kw_only=True):
     """One star that differs."""
 
-    component: ClassVar[str] = "StarChange"
     tracker: str
     position: Annotated[Count, doc("Position among the tracker's stars, from 0.")]
     a: StarSide
@@ -67,7 +63,6 @@ class StarChange(Record, frozen=True, kw_only=True):
 class BatchChange(Record, frozen=True, kw_only=True):
     """One batch of which a star or the attitude differs."""
 
-    component: ClassVar[str] = "BatchChange"
     id: Id
     batch: str
     time: Moment
@@ -80,7 +75,6 @@ class BatchChange(Record, frozen=True, kw_only=True):
 class Comparison(Record, frozen=True, kw_only=True):
     """The results of both sides, and their differences."""
 
-    component: ClassVar[str] = "Comparison"
     spacecraft: str
     run: str
     start: Annotated[Moment | None, doc("Time of the earliest batch of the sample.")]
@@ -92,15 +86,14 @@ class Comparison(Record, frozen=True, kw_only=True):
     a: ComparedSide
     b: ComparedSide
     transitions: list[Transition]
-    renamed: Annotated[
-        Count, doc("Stars that are unique on both sides, but as different catalog stars.")
-    ]
+    renamed: Count
+    """Stars that are unique on both sides, but as different catalog stars."""
     attitudes: ComparedAttitudes
     changed_batches: Count
     changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]
 
 
-class OutcomeCounts(Record, frozen=True, kw_only=True):
+class OutcomeCounts(Struct, frozen=True, kw_only=True):
     """Stars by outcome, without their sum."""
 
     unique: int
@@ -108,7 +101,7 @@ class OutcomeCounts(Record, frozen=True, kw_only=True):
     unmatched: int
 
 
-class StatusCounts(Record, frozen=True, kw_only=True):
+class StatusCounts(Struct, frozen=True, kw_only=True):
     """Batches by the status of their attitude."""
 
     good: int = 0
@@ -116,7 +109,7 @@ class StatusCounts(Record, frozen=True, kw_only=True):
     none: int = 0
 
 
-class RunTransition(Record, frozen=True, kw_only=True):
+class RunTransition(Struct, frozen=True, kw_only=True):
     """Number of stars with an outcome in one run and an outcome in the other."""
 
     before: str
@@ -130,7 +123,7 @@ class RunTransition(Record, frozen=True, kw_only=True):
         return self.before != self.after or (self.before == "unique" and not self.same_star)
 
 
-class RunStars(Record, frozen=True, kw_only=True):
+class RunStars(Struct, frozen=True, kw_only=True):
     """Outcomes of the stars of the batches that both runs have."""
 
     observed: int
@@ -139,7 +132,7 @@ class RunStars(Record, frozen=True, kw_only=True):
     transitions: list[RunTransition]
 
 
-class AngleStatistics(Record, frozen=True, kw_only=True):
+class AngleStatistics(Struct, frozen=True, kw_only=True):
     """Angles between the attitudes of two runs, in arcseconds."""
 
     median: float
@@ -147,7 +140,7 @@ class AngleStatistics(Record, frozen=True, kw_only=True):
     max: float
 
 
-class RunAttitudes(Record, frozen=True, kw_only=True):
+class RunAttitudes(Struct, frozen=True, kw_only=True):
     """Attitudes of the batches that both runs have, and the angles between them."""
 
     before: StatusCounts
@@ -156,7 +149,7 @@ class RunAttitudes(Record, frozen=True, kw_only=True):
     angle_arcsec: AngleStatistics | None
 
 
-class RunComparison(Record, frozen=True, kw_only=True):
+class RunComparison(Struct, frozen=True, kw_only=True):
     """The batches that two runs have in common: `before` in `run`, `after` in `other`."""
 
     run: str | None
@@ -166,7 +159,7 @@ class RunComparison(Record, frozen=True, kw_only=True):
     attitudes: RunAttitudes
 
 
-class RunChangeSide(Record, frozen=True, kw_only=True):
+class RunChangeSide(Struct, frozen=True, kw_only=True):
     """What a batch came to in one of two runs."""
 
     id: Id
@@ -174,7 +167,7 @@ class RunChangeSide(Record, frozen=True, kw_only=True):
     status: str | None
 
 
-class RunChange(Record, frozen=True, kw_only=True):
+class RunChange(Struct, frozen=True, kw_only=True):
     """A batch that came to something else in another run."""
 
     batch: str

@@ -1,7 +1,7 @@
 """The data of events, by their kind: of the event stream, and of webhooks."""
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from service.acquire.result import TrackingState
 from service.storage.models.alarms import Alarm, AnnotationChange, Limit
@@ -18,14 +18,13 @@ from service.storage.models.base import (
     Status,
     doc,
 )
-from service.storage.models.gyro import GyroBlockRow
 from service.storage.models.runs import ReplayProgress
+from service.storage.models.spacecraft import GyroBlockRow
 
 
 class LatestBatch(Record, frozen=True, kw_only=True):
     """The latest of the batches of an event."""
 
-    component: ClassVar[str] = "LatestBatch"
     id: Id
     batch: str
     time: Moment
@@ -37,7 +36,6 @@ class LatestBatch(Record, frozen=True, kw_only=True):
 class BatchesEvent(Record, frozen=True, kw_only=True):
     """Batches that were recorded."""
 
-    component: ClassVar[str] = "BatchesEvent"
     spacecraft: str
     run: str
     batches: Annotated[Count, doc("How many.")]
@@ -47,7 +45,6 @@ class BatchesEvent(Record, frozen=True, kw_only=True):
 class AdoptedEvent(Record, frozen=True, kw_only=True):
     """A what-if that was adopted."""
 
-    component: ClassVar[str] = "AdoptedEvent"
     spacecraft: str
     run: str
     id: Annotated[Id, doc("Of the result that stands for the batch now.")]
@@ -57,7 +54,6 @@ class AdoptedEvent(Record, frozen=True, kw_only=True):
 class TrackingEvent(Record, frozen=True, kw_only=True):
     """A change of the tracking state of a spacecraft."""
 
-    component: ClassVar[str] = "TrackingEvent"
     spacecraft: str
     run: str
     id: Id
@@ -70,7 +66,6 @@ class TrackingEvent(Record, frozen=True, kw_only=True):
 class CalibrationEvent(Record, frozen=True, kw_only=True):
     """A change of the calibration in force."""
 
-    component: ClassVar[str] = "CalibrationEvent"
     id: Id
     spacecraft: str
     adopted: Stamp

@@ -1,24 +1,22 @@
 """The state of the service: spacecraft at a glance, a fleet, versions, and the cache of zones."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import Annotated, ClassVar
 
 from pydantic import Field
 
+from service.storage.models import answers
 from service.storage.models.alarms import Alarm, AlarmSummary
-from service.storage.models.answers import (
-    Summary,
-    ZoneKind,
-    ZonePairCount,
-    ZoneRightAscension,
-    ZoneStarCount,
-    ZoneSummary,
+from service.storage.models.base import (
+    Components,
+    Count,
+    Digest,
+    Moment,
+    Record,
+    Stamp,
+    doc,
+    list_record,
 )
-from service.storage.models.base import Components, Count, Digest, Moment, Record, Stamp, doc
 from service.storage.models.spacecraft import SpacecraftRow
-from service.times import Utc
-from service.vectors import Matrix
 
 Shares = list[float]
 
@@ -41,7 +39,6 @@ class WindowCounts(Record, frozen=True, kw_only=True):
 class Sparkline(Record, frozen=True, kw_only=True):
     """Shares of stars in time steps; steps without batches are omitted."""
 
-    component: ClassVar[str] = "Sparkline"
     bucket_s: int
     unix_s: Annotated[list[float], doc("POSIX time of the beginning of each step.")]
     batches: list[Count]
@@ -53,15 +50,11 @@ class Sparkline(Record, frozen=True, kw_only=True):
 class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
     """The state of one spacecraft; null without a batch in the run."""
 
-    component: ClassVar[str] = "OverviewRow"
-    sigma_arcsec: Annotated[
-        Components | None,
-        doc("Standard deviations of `last_attitude` about the body axes."),
-    ]
+    sigma_arcsec: Components | None
+    """Standard deviations of `last_attitude` about the body axes."""
     age_s: Annotated[float | None, doc("Time from its latest batch to the run's latest batch.")]
-    received_age_s: Annotated[
-        float | None, doc("Time since the service received its latest batch.")
-    ]
+    received_age_s: float | None
+    """Time since the service received its latest batch."""
     last_hour: WindowCounts | None
     last_day: WindowCounts | None
     sparkline_hour: Sparkline | None
@@ -72,7 +65,6 @@ class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
 class Overview(Record, frozen=True, kw_only=True):
     """Every spacecraft in a run."""
 
-    component: ClassVar[str] = "Overview"
     run: str
     default_run: Annotated[str, doc("`live`; while it is empty, the newest run.")]
     as_of: Annotated[Moment | None, doc("The time of the run's latest batch.")]
@@ -84,7 +76,6 @@ class Overview(Record, frozen=True, kw_only=True):
 class CatalogAbout(Record, frozen=True, kw_only=True):
     """The star catalog."""
 
-    component: ClassVar[str] = "CatalogAbout"
     digest: Digest
     name: str
     stars: Count
@@ -93,7 +84,6 @@ class CatalogAbout(Record, frozen=True, kw_only=True):
 class MissionAbout(Record, frozen=True, kw_only=True):
     """A mission of this service."""
 
-    component: ClassVar[str] = "MissionAbout"
     name: str
     description: str
     digest: Digest
@@ -102,7 +92,6 @@ class MissionAbout(Record, frozen=True, kw_only=True):
 class About(Record, frozen=True, kw_only=True):
     """The service and its data."""
 
-    component: ClassVar[str] = "About"
     version: str
     started: Stamp
     database: Annotated[str, Field(examples=["sqlite", "postgresql"])]
@@ -111,96 +100,9 @@ class About(Record, frozen=True, kw_only=True):
     credits: list[str]
 
 
-@dataclass(frozen=True)
-class TrackerCounts:
-    """One tracker's stars of the latest batch, and how many of them are unique."""
-
-    tracker: str
-    observed: int
-    unique: int
-
-
-@dataclass(frozen=True)
-class KnownAttitude:
-    """The newest attitude of a spacecraft: of which result, at what time, how good."""
-
-    id: str
-    time: str
-    status: str
-    sigma_arcsec: tuple[float, float, float]
-    """One standard deviation about each body axis."""
-
-
-@dataclass(frozen=True)
-class FleetRow:
-    """The state of one spacecraft in a run; None without a batch."""
-
-    name: str
-    description: str
-    retired: bool
-    """True if no mission file describes it any more."""
-    state: str
-    """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
-    latest_batch: Summary | None
-    last_attitude: KnownAttitude | None
-    """It can be older than the latest batch."""
-    trackers: tuple[TrackerCounts, ...]
-    age_s: float | None
-    """From its latest batch to the run's latest batch."""
-    received_age_s: float | None
-    """Since the service received its latest batch."""
-    last_hour: WindowCounts | None
-    alarms: tuple[Alarm, ...]
-    """The alarms that are not cleared, worst first."""
-
-    @property
-    def alarms_now(self) -> list[Alarm]:
-        """Alarms whose quantity is out of its limits, without shelved ones."""
-        return [each for each in self.alarms if not each.in_limits and each.state != "shelved"]
-
-    @property
-    def alarms_returned(self) -> list[Alarm]:
-        """Alarms whose quantity is back in its limits and that wait to be acknowledged."""
-        return [each for each in self.alarms if each.in_limits and each.state != "shelved"]
-
-    @property
-    def has_attitude(self) -> bool:
-        """True if the latest batch has an attitude of its own."""
-        return self.state in ("good", "suspect")
-
-
-@dataclass(frozen=True)
-class FleetCells:
-    """Counts in cells of equal width in time: a row for each spacecraft, a column for each cell."""
-
-    start_s: float
-    """POSIX time at which the first cell begins."""
-    width_s: int
-    counts: Mapping[str, Matrix]
-    """A rollup's counts, such as `observed`; 0 where there was no batch."""
-
-    @property
-    def columns(self) -> int:
-        """How many cells there are in time."""
-        return int(self.counts["batches"].shape[1])
-
-
-@dataclass(frozen=True)
-class Fleet:
-    """Every spacecraft in a run; the rows of `cells` are those of `rows`."""
-
-    run: str
-    as_of: Utc | None
-    """The time of the run's latest batch."""
-    alarms: AlarmSummary
-    rows: tuple[FleetRow, ...]
-    cells: FleetCells | None
-
-
 class CacheUse(Record, frozen=True, kw_only=True):
     """Cost and use of a cache entry."""
 
-    component: ClassVar[str] = "CacheUse"
     bytes: Count
     hits: Count
     build_us: Count
@@ -209,12 +111,11 @@ class CacheUse(Record, frozen=True, kw_only=True):
 class CachedZone(CacheUse, frozen=True, kw_only=True):
     """A zone in the cache."""
 
-    component: ClassVar[str] = "CachedZone"
-    kind: ZoneKind
-    ra_deg: ZoneRightAscension
+    kind: answers.ZoneKind
+    ra_deg: answers.ZoneRightAscension
     dec_deg: float
-    stars: ZoneStarCount
-    pairs: ZonePairCount
+    stars: answers.ZoneStarCount
+    pairs: answers.ZonePairCount
     spacecraft: str
     grid_deg: float
     run_catalog: Digest
@@ -223,7 +124,6 @@ class CachedZone(CacheUse, frozen=True, kw_only=True):
 class CachedRunCatalog(CacheUse, frozen=True, kw_only=True):
     """A run catalog in the cache."""
 
-    component: ClassVar[str] = "CachedRunCatalog"
     digest: Digest
     epoch_year: float
     stars: Count
@@ -236,7 +136,6 @@ class ZoneCache(Record, frozen=True, kw_only=True):
     both; each entry has its own.
     """
 
-    component: ClassVar[str] = "ZoneCache"
     items: list[CachedZone]
     run_catalogs: list[CachedRunCatalog]
     bytes: Count
@@ -247,15 +146,10 @@ class ZoneCache(Record, frozen=True, kw_only=True):
     build_us: Count
 
 
-class ZoneList(Record, frozen=True, kw_only=True):
-    """Zones."""
-
-    component: ClassVar[str] = "ZoneList"
-    items: list[ZoneSummary]
+ZoneList = list_record("ZoneList", answers.ZoneSummary, "Zones.")
 
 
 class Dropped(Record, frozen=True, kw_only=True):
     """How many zones were dropped."""
 
-    component: ClassVar[str] = "Dropped"
     dropped: Count

@@ -14,16 +14,13 @@ class PictureAttitudeFound(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "PictureAttitude"
     status: Annotated[str, doc("`suspect`: the lens was fitted on the picture itself.")]
-    quaternion: Annotated[
-        Quaternion,
-        doc("ICRS to camera, scalar last: x right, y down, z to the sky through the middle."),
-    ]
+    quaternion: Quaternion
+    """ICRS to camera, scalar last: x right, y down, z to the sky through the middle."""
     sigma_arcsec: Annotated[Components, doc("One standard deviation about x, y and z.")]
     ra_deg: Annotated[float, doc("Of the middle of the picture.")]
     dec_deg: Annotated[float, doc("Of the middle of the picture.")]
-    roll_deg: Annotated[
-        float, doc("Position angle of the upper edge, from north through east, 0 to 360.")
-    ]
+    roll_deg: float
+    """Position angle of the upper edge, from north through east, 0 to 360."""
     aberration: str
     log_odds: Annotated[float, doc("Logarithm of the odds against chance.")]
 
@@ -31,7 +28,6 @@ class PictureAttitudeFound(Record, frozen=True, kw_only=True):
 class PictureLens(Record, frozen=True, kw_only=True):
     """The lens that fits a picture; a sigma of a parameter that was not fitted is null."""
 
-    component: ClassVar[str] = "PictureLens"
     field_deg: Annotated[list[float], doc("Of the width and of the height.")]
     focal_px: float
     focal_sigma_px: float | None
@@ -56,7 +52,6 @@ class PictureStarFound(Record, frozen=True, kw_only=True):
 class Picture(Record, frozen=True, kw_only=True):
     """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
 
-    component: ClassVar[str] = "Picture"
     width_px: Count
     height_px: Count
     candidates: Annotated[Count, doc("Points of light.")]
@@ -71,14 +66,12 @@ class Picture(Record, frozen=True, kw_only=True):
     residual_rms_px: float | None
     sigma_scale: Annotated[float | None, doc("By which the residuals scaled the sigmas.")]
     shared_error_px: Annotated[float | None, doc("The error that neighbouring stars share.")]
-    zero_point_mag: Annotated[
-        float | None, doc("Magnitude of one count, per second if `exposure_s` is known.")
-    ]
+    zero_point_mag: float | None
+    """Magnitude of one count, per second if `exposure_s` is known."""
     zero_point_sigma_mag: float | None
     stars: Annotated[list[PictureStarFound], doc("The identified stars, brightest first.")]
-    overlay_png: Annotated[
-        str | None, doc("Base64: the picture with stars, names, a grid and a scale, if asked for.")
-    ] = None
+    overlay_png: str | None = None
+    """Base64: the picture with stars, names, a grid and a scale, if asked for."""
 
 
 def picture_of(result: "PictureResult") -> Picture:

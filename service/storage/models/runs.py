@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import UNSET, UnsetType
 from pydantic import Field
 
-from service.storage.models.base import Count, FieldFault, Id, Record, Stamp, doc
+from service.storage.models.base import Count, FieldFault, Id, Record, Stamp, doc, list_record
 
 ReplayStateName = Literal["running", "waiting", "done", "interrupted", "failed", "cancelled"]
 """A replay that is `waiting` goes on by itself as soon as the service is ready after a restart."""
@@ -24,35 +24,25 @@ class Run(Record, frozen=True, kw_only=True):
     last_day: str
 
 
-class RunList(Record, frozen=True, kw_only=True):
-    """Every run with batches."""
-
-    component: ClassVar[str] = "RunList"
-    items: list[Run]
+RunList = list_record("RunList", Run, "Every run with batches.")
 
 
 class Forgotten(Record, frozen=True, kw_only=True):
     """What is removed from a run."""
 
-    component: ClassVar[str] = "Forgotten"
     run: str
     spacecraft: Annotated[str | None, doc("null: of every spacecraft.")]
     batches: Annotated[Count, doc("Batches in the database, with their results.")]
     archived_batches: Annotated[Count, doc("Batches in the archive.")]
     gyro_blocks: Count
-    graded_days: Annotated[
-        Count,
-        doc(
-            "Days of filtered and smoothed attitudes that were computed with them, every revision "
-            "counted. `acquire smooth` computes them again from what is left."
-        ),
-    ]
+    graded_days: Count
+    """Days of filtered and smoothed attitudes that were computed with them, every revision counted.
+    `acquire smooth` computes them again from what is left."""
 
 
 class ReplayLines(Record, frozen=True, kw_only=True):
     """The lines of a replay."""
 
-    component: ClassVar[str] = "ReplayLines"
     total: Annotated[int | None, doc("null if the number is not known in advance.")]
     done: Count
     refused: Count
@@ -61,12 +51,10 @@ class ReplayLines(Record, frozen=True, kw_only=True):
 class ReplayCounts(Record, frozen=True, kw_only=True):
     """Results of the lines so far."""
 
-    component: ClassVar[str] = "ReplayCounts"
     new: Annotated[Count, doc("Batches that this replay recorded.")]
     repeated: Annotated[Count, doc("Batches that were already recorded.")]
-    observed: Annotated[
-        Count, doc("Stars of these batches; the next fields count them by outcome.")
-    ]
+    observed: Count
+    """Stars of these batches; the next fields count them by outcome."""
     unique: Count
     ambiguous: Count
     unmatched: Count
@@ -78,15 +66,13 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
 class ApidPackets(Record, frozen=True, kw_only=True):
     """The packets of one APID."""
 
-    component: ClassVar[str] = "ApidPackets"
     apid: Annotated[int, Field(ge=0, le=2047)]
     packets: Count
     described: Annotated[bool, doc("Whether the XTCE file describes them.")]
     gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
     missing: Annotated[Count, doc("Packets that are missing in these places.")]
-    backward: Annotated[
-        Count, doc("Places where the count repeats or goes back: a reset, or a changed order.")
-    ]
+    backward: Count
+    """Places where the count repeats or goes back: a reset, or a changed order."""
     refused: Count
     incomplete: Annotated[Count, doc("Segments of packets of which others are missing.")] = 0
 
@@ -94,7 +80,6 @@ class ApidPackets(Record, frozen=True, kw_only=True):
 class ReplayPackets(Record, frozen=True, kw_only=True):
     """The space packets of a replay so far."""
 
-    component: ClassVar[str] = "ReplayPackets"
     packets: Count
     bytes: Count
     batches: Annotated[Count, doc("Batches that the packets hold.")]
@@ -109,31 +94,26 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     backward: Count
     refused: Annotated[Count, doc("Packets that could not be read.")]
     joined: Annotated[Count, doc("Packets that were joined of segments.")] = 0
-    incomplete: Annotated[
-        Count, doc("Segments of packets of which others are missing; they are refused, too.")
-    ] = 0
-    unread_bytes: Annotated[
-        Count, doc("From the packets on at which files could not be read any further.")
-    ] = 0
+    incomplete: Count = 0
+    """Segments of packets of which others are missing; they are refused, too."""
+    unread_bytes: Count = 0
+    """From the packets on at which files could not be read any further."""
     empty_files: Annotated[Count, doc("Files without a packet.")] = 0
-    without_attitude: Annotated[
-        Count, doc("Packets whose a priori quaternion was zero or not finite.")
-    ] = 0
+    without_attitude: Count = 0
+    """Packets whose a priori quaternion was zero or not finite."""
     apids: Annotated[list[ApidPackets], doc("The hundred APIDs with the most packets.")]
 
 
 class LineProblem(Record, frozen=True, kw_only=True):
     """The faults of a line."""
 
-    component: ClassVar[str] = "LineProblem"
     detail: str
-    errors: Annotated[list[FieldFault], doc("Every fault, field by field.")] | UnsetType = UNSET
+    errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET
 
 
 class RefusedLine(Record, frozen=True, kw_only=True):
     """A refused line; the replay continues with the next one."""
 
-    component: ClassVar[str] = "RefusedLine"
     line: Annotated[int, doc("Number of the line, or of the packet in its file, from 1.")]
     problem: LineProblem
 
@@ -157,10 +137,8 @@ class Replay(ReplayProgress, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "ReplayState"
     packets: Annotated[ReplayPackets | None, doc("null unless the replay reads space packets.")]
-    errors: Annotated[
-        list[RefusedLine],
-        doc("The first thousand refused lines; then, for a failed replay, the reason."),
-    ]
+    errors: list[RefusedLine]
+    """The first thousand refused lines; then, for a failed replay, the reason."""
 
     def progress(self) -> ReplayProgress:
         """The replay without the refused lines."""
@@ -168,16 +146,11 @@ class Replay(ReplayProgress, frozen=True, kw_only=True):
         return ReplayProgress(**{name: getattr(self, name) for name in names})
 
 
-class ReplayList(Record, frozen=True, kw_only=True):
-    """The latest replays, newest first."""
-
-    component: ClassVar[str] = "ReplayList"
-    items: list[Replay]
+ReplayList = list_record("ReplayList", Replay, "The latest replays, newest first.")
 
 
 class RunState(Record, frozen=True, kw_only=True):
     """A run, and whether its batches can raise alarms."""
 
-    component: ClassVar[str] = "RunState"
     run: str
     alarms: bool

@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
-from msgspec import Struct
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
@@ -19,21 +18,19 @@ from service.alarms.subjects import Subject, quantity_and_tracker, sampler, subj
 from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
 from service.storage.projections.recorded import RecordedResult
-from service.storage.queries.alarms import change, record_action
+from service.storage.queries.alarms import change
 from service.storage.queries.limits import limits_of
+from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import alarms, watches
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
-from service.storage.sql.tables import batches, missions, results, runs
+from service.storage.sql.tables import batches, results, runs
 from service.times import Utc, recorded_utc
 
 # Run with every batch of a live spacecraft, or with a few of them.
-_PLACE = (
-    watches.c.spacecraft == bindparam("of_spacecraft"),
-    watches.c.run == bindparam("of_run"),
-)
+_PLACE = (watches.c.spacecraft == bindparam("of_spacecraft"), watches.c.run == bindparam("of_run"))
 _LOCK = prepared(select(watches).where(*_PLACE).with_for_update())
 _COLUMNS = ("time", "time_ns", "batch_id", "received", "state")
 _SAVE = prepared(
@@ -78,16 +75,19 @@ class LimitEvaluator:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
         self._new = new
-        self._limits = limits_of(connection, _mission(connection, new[0]))
-        row = self._locked()
+        mission = recorded_mission(connection, new[0].result["mission_digest"])
+        self._limits = limits_of(connection, mission)
+        row = _locked(connection, spacecraft, run)
         if row is None:
             first = {"spacecraft": spacecraft, "run": run, "state": "{}"}
             insert_missing(connection, watches, [first | _columns_of(new[0].result)])
-            row = self._locked()
+            row = _locked(connection, spacecraft, run)
         assert row is not None
         self._row = row
-        saved = _LAST_SAVED.pop((spacecraft, run), _NOTHING_SAVED)
-        self._windows = saved.windows_of(row["state"])
+        state, self._windows = _LAST_SAVED.pop((spacecraft, run), ("", {}))
+        if state != row["state"]:
+            stored = msgspec.json.decode(row["state"])
+            self._windows = {name: SampleWindow.from_json(each) for name, each in stored.items()}
         self._active = ActiveAlarms(connection, spacecraft, run)
 
     def evaluate(self) -> None:
@@ -139,25 +139,19 @@ class LimitEvaluator:
         """
         due = []
         for name, limits in self._limits.items():
-            samples = list(filter(None, self._samples(name, self._new)))
+            every = list(self._samples(name, self._new))
+            samples = list(filter(None, every))
             if not samples:
                 continue
             window = self._windows.setdefault(name, SampleWindow())
             if self._active.is_out(name) or not window.add_if_within(samples, limits):
                 due.append((name, limits))
             elif self._active.has(name) and (value := window.value(limits)) is not None:
-                batch = self._latest_with(name)
+                present = (each.result for each, one in zip(self._new, every, strict=True) if one)
+                batch = max(present, key=lambda result: int(result["time_ns"]))
                 point = Point(value, *self._latest_in_window(batch, window.samples[-1][0]))
                 self._active.observe(name, None, limits, point, batch["received"])
         return due
-
-    def _latest_with(self, name: Subject) -> Row:
-        """The latest new batch that has a value of a subject."""
-        latest_first = sorted(self._new, key=lambda each: -each.result["time_ns"])
-        samples = self._samples(name, latest_first)
-        return next(
-            each.result for each, sample in zip(latest_first, samples, strict=True) if sample
-        )
 
     @staticmethod
     def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:
@@ -203,10 +197,6 @@ class LimitEvaluator:
                 now = new.result["received"]
                 self._active.observe(name, found.severity, limits, point, now, found.worst)
 
-    def _locked(self) -> Row | None:
-        place = {"of_spacecraft": self._spacecraft, "of_run": self._run}
-        return next(iter(_LOCK.read(self._connection, place)), None)
-
     def _save(self, newest: Row | None, received: str) -> None:
         windows = {name: window.to_json() for name, window in self._windows.items()}
         state = msgspec.json.encode(windows).decode()
@@ -216,28 +206,12 @@ class LimitEvaluator:
         _SAVE.run(self._connection, [place | {name: row[name] for name in _COLUMNS}])
         if len(_LAST_SAVED) >= _MAX_SAVED:
             _LAST_SAVED.clear()
-        _LAST_SAVED[self._spacecraft, self._run] = _SavedWindows(state, self._windows)
+        _LAST_SAVED[self._spacecraft, self._run] = state, self._windows
 
 
-class _SavedWindows(Struct):
-    """The windows of one spacecraft and run as this process last wrote them.
-
-    Where the database still holds the same text, it is not decoded again.
-    """
-
-    state: str
-    windows: dict[str, SampleWindow]
-
-    def windows_of(self, state: str) -> dict[str, SampleWindow]:
-        """The windows that a stored text holds."""
-        if self.state == state:
-            return self.windows
-        stored = msgspec.json.decode(state)
-        return {name: SampleWindow.from_json(each) for name, each in stored.items()}
-
-
-_NOTHING_SAVED = _SavedWindows("", {})
-_LAST_SAVED: dict[tuple[str, str], _SavedWindows] = {}
+# The windows of a spacecraft and run as this process last wrote them, with the text that it wrote:
+# where the database still holds that, it is not decoded again.
+_LAST_SAVED: dict[tuple[str, str], tuple[str, dict[str, SampleWindow]]] = {}
 _MAX_SAVED = 64
 
 
@@ -245,22 +219,6 @@ def _by_tracker(new: RecordedResult) -> Mapping[str, Row]:
     """The values of each tracker of a result as those of a result of its own."""
     time_ns = {"time_ns": new.result["time_ns"]}
     return {row["tracker"]: row | time_ns for row in new.trackers}
-
-
-def _mission(connection: Connection, new: RecordedResult) -> Mission:
-    """The mission that a result was computed with; what a digest stands for never changes."""
-    digest = new.result["mission_digest"]
-    mission = _MISSIONS.get(digest)
-    if mission is None:
-        query = select(missions.c.settings).where(missions.c.digest == digest)
-        mission = Mission.model_validate_json(connection.execute(query).scalar_one())
-        if len(_MISSIONS) >= _MAX_SAVED:
-            _MISSIONS.clear()
-        _MISSIONS[digest] = mission
-    return mission
-
-
-_MISSIONS: dict[str, Mission] = {}
 
 
 def _columns_of(batch: Row) -> Row:
@@ -281,7 +239,7 @@ def silence_severity(limits: Mapping[Subject, LimitSettings], gap_s: float) -> S
 def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
     """Raise the alarms of live spacecraft that are silent, and end shelving that has expired."""
     for spacecraft in sorted(_silent(connection, missions, now)):
-        row = _locked_watch(connection, spacecraft)
+        row = _locked(connection, spacecraft, LIVE)
         if row is None:
             continue
         active = ActiveAlarms(connection, spacecraft, LIVE)
@@ -327,9 +285,9 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
     return found
 
 
-def _locked_watch(connection: Connection, spacecraft: str) -> Any:
-    query = select(watches).where(watches.c.spacecraft == spacecraft, watches.c.run == LIVE)
-    return connection.execute(query.with_for_update()).mappings().first()
+def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:
+    place = {"of_spacecraft": spacecraft, "of_run": run}
+    return next(iter(_LOCK.read(connection, place)), None)
 
 
 def _expired(now: Utc) -> Any:
@@ -408,7 +366,7 @@ class ActiveAlarms:
                 what = {"quantity": quantity, "tracker": tracker}
                 alarm = {"id": _IDS.new(), **what, **self._place, **columns}
                 self._connection.execute(insert(alarms), alarm)
-                record_action(self._connection, alarm, actions, now)
+                change(self._connection, alarm, {}, actions, now)
                 self._alarms[subject] = alarm
             return
         changes, actions = state_machine.observed(alarm, severity, limits, point, now, worst)

@@ -23,7 +23,7 @@ from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals
 from service.storage.projections.recorded import RecordedResult, recorded_after
 from service.storage.projections.rollups import lock_position
-from service.storage.queries.pages import PLACE
+from service.storage.queries.pages import newest_first
 from service.storage.recording import events
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
@@ -72,8 +72,7 @@ def _note_states(
     if run == LIVE:
         received_ns = max(each.received_ns for each in tracked)
         query = query.where(results.c.time_ns <= received_ns + AHEAD_NS)
-    latest = query.order_by(*(column.desc() for column in PLACE)).limit(1)
-    row = connection.execute(latest).first()
+    row = connection.execute(newest_first(query).limit(1)).first()
     before = None if row is None else state_in(row.answer)
     for each in sorted(tracked, key=lambda each: int(each.result["time_ns"])):
         if row is not None and row.time_ns > each.result["time_ns"]:
@@ -131,8 +130,6 @@ class _Step:
     position: int
     is_all: bool
     """True if the transaction projected every result that it could see."""
-    has_time: bool
-    """The next one may wait until there is more."""
     is_blocked: bool = False
     """True if the next result is one after a gap that may still be filled."""
 
@@ -179,10 +176,8 @@ class Projector:
         self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
         self._thread.start()
         self._writer.after_jobs.append(self._wake)
-        self._store.before_reading, self._store.hold_back = (
-            self.wait,
-            partial(self.catch_up, MOST_BEHIND),
-        )
+        self._store.before_reading = self.wait
+        self._store.hold_back = partial(self.catch_up, MOST_BEHIND)
 
     def wait(self) -> float:
         """Return when all that is recorded now is projected, or after `WAIT_S`.
@@ -205,7 +200,13 @@ class Projector:
         if position >= newest:
             return 0.0
         if not self._is_projecting:
-            return self._wait_for_another(newest)
+            # Another process projects.
+            end_s = time.monotonic() + WAIT_S
+            while time.monotonic() < end_s and not self._is_closing:
+                time.sleep(POLL_S)
+                if self._places()[1] >= newest:
+                    return 0.0
+            return time.monotonic() - self._up_to_date_s
 
         def has_passed() -> bool:
             # Of others' results the writer's count says nothing.
@@ -259,15 +260,6 @@ class Projector:
             self._up_to_date_s = max(self._up_to_date_s, asked_s)
         return newest, position
 
-    def _wait_for_another(self, newest: int) -> float:
-        """`wait` for the process that projects."""
-        end_s = time.monotonic() + WAIT_S
-        while time.monotonic() < end_s and not self._is_closing:
-            time.sleep(POLL_S)
-            if self._places()[1] >= newest:
-                return 0.0
-        return time.monotonic() - self._up_to_date_s
-
     # ---- the projector's thread --------------------------------------------------------------
 
     def _wake(self) -> None:
@@ -302,7 +294,7 @@ class Projector:
                 elif step.is_blocked:
                     self._changed.wait(GAP_S)
                 pause_s = begun_s + EVERY_S - time.monotonic()
-                if pause_s > 0.0 and (step is None or step.has_time):
+                if pause_s > 0.0 and (step is None or step.is_all):
                     self._changed.wait_for(lambda: self._readers or self._is_closing, pause_s)
 
     def _has_work(self) -> bool:
@@ -336,7 +328,7 @@ class Projector:
             # One faulty result must not hold up the others: it is looked for one by one.
             if self._most > 1:
                 self._most = 1
-                return _Step(self._position, is_all=False, has_time=False)
+                return _Step(self._position, is_all=False)
             log.exception("a result could not be projected, and is passed over")
         return self._write(self._pass_over)
 
@@ -373,7 +365,7 @@ class Projector:
                 apply(connection, new)
             took_s = time.monotonic() - begun_s
             self._most = max(1, min(MOST_AT_ONCE, int(2 * len(new) * LONGEST_S / took_s)))
-        return _Step(position, is_all, has_time=is_all, is_blocked=is_blocked)
+        return _Step(position, is_all, is_blocked)
 
     def _without_gaps(
         self, connection: Connection, position: int, new: list[RecordedResult], oldest: int
@@ -407,7 +399,7 @@ class Projector:
             position = each.seq
             connection.execute(update(projector).values(seq=position))
             seals.apply(connection, [each])
-        return _Step(position, is_all=False, has_time=False)
+        return _Step(position, is_all=False)
 
 
 @contextmanager

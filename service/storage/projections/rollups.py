@@ -8,13 +8,12 @@ projector.
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, Select, Table, and_, delete, func, insert, select
+from sqlalchemy import ColumnElement, Connection, delete, func, insert, select
 
-from service.errors import BadInput, Fault
 from service.storage.projections.recorded import RecordedResult
+from service.storage.queries.time_buckets import TRENDS, Bucket, Trend
 from service.storage.recording.result_metrics import (
     OF_TRACKERS,
     SUMMED,
@@ -22,49 +21,23 @@ from service.storage.recording.result_metrics import (
     merge,
     rolled_up,
 )
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import add_rollups, insert_all
-from service.storage.sql.tables import (
-    COUNTS,
-    MAXIMA,
-    MINIMA,
-    SUMS,
-    archived_hours,
-    batches,
-    projector,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    tracker_rollups_daily,
-    tracker_rollups_hourly,
-    tracker_values,
-)
-from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc, recorded_utc
+from service.storage.sql.tables import COUNTS, batches, projector, results, tracker_values
+from service.times import HOUR_S, bucket_start, parse_utc, recorded_utc
 
-Bucket = Literal["hour", "day"]
 BucketKey = tuple[str, str, int]
 """(spacecraft, run, bucket)."""
-TrackerKey = tuple[str, str, str, int]
-"""(spacecraft, run, tracker, bucket)."""
 Rollups = dict[Any, Row]
-"""Rows by `BucketKey`, or by `TrackerKey`."""
+"""Rows by (spacecraft, run, tracker, bucket), or by a part of it."""
+WHOLE = ""
+"""The tracker that stands for the spacecraft as a whole."""
 _KEY = ("spacecraft", "run", "bucket")
 _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
-MAX_RATES = 20_000
-"""The most buckets of one answer: two years of hours, or half a century of days."""
-
-
-@dataclass(frozen=True)
-class _Trend:
-    table: Table
-    tracker_table: Table
-    width_s: int
-
-
-_TRENDS: dict[Bucket, _Trend] = {
-    "hour": _Trend(rollups_hourly, tracker_rollups_hourly, HOUR_S),
-    "day": _Trend(rollups_daily, tracker_rollups_daily, DAY_S),
-}
+_NOTHING: Row = dict.fromkeys((*COUNTS, *tables.SUMS), 0) | dict.fromkeys(
+    (*tables.MINIMA, *tables.MAXIMA)
+)
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
@@ -74,25 +47,19 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
     """
     current = [each for each in new if each.result["current"]]
     firsts = [each for each in current if each.is_first]
-    add(connection, ((each.hour, each.result) for each in firsts))
-    add_trackers(connection, ((each.hour, row) for each in firsts for row in each.trackers))
+    add(connection, ((each.hour, row) for each in firsts for row in (each.result, *each.trackers)))
     renew(connection, [each.hour for each in current if not each.is_first])
 
 
 def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
-    """Add current results, each with its spacecraft, run and hour, to their hours and days."""
-    of_hour: dict[BucketKey, list[Row]] = {}
-    for key, result in new:
-        of_hour.setdefault(key, []).append(result)
-    _add(connection, of_hour, (rollups_hourly, rollups_daily), _KEY)
+    """Add current results, or rows of `tracker_values`, to the hours and days of their owners.
 
-
-def add_trackers(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
-    """Add rows of `tracker_values` to the hours and days of their trackers."""
-    of_hour: dict[TrackerKey, list[Row]] = {}
+    Each comes with its spacecraft, run and hour.
+    """
+    of_hour: dict[tuple[str, str, str, int], list[Row]] = {}
     for (spacecraft, run, hour), row in new:
-        of_hour.setdefault((spacecraft, run, row["tracker"], hour), []).append(row)
-    _add(connection, of_hour, (tracker_rollups_hourly, tracker_rollups_daily), _TRACKER_KEY)
+        of_hour.setdefault((spacecraft, run, row.get("tracker", WHOLE), hour), []).append(row)
+    _add_hours(connection, {key: rolled_up(rows) for key, rows in of_hour.items()})
 
 
 def add_shares(
@@ -100,17 +67,12 @@ def add_shares(
 ) -> None:
     """Add rollups that are there already, by hour and by tracker; `WHOLE` is the spacecraft's."""
     lock_position(connection)
-    whole: Rollups = {}
-    of_trackers: Rollups = {}
-    for hour, shares in of_hour.items():
-        for tracker, share in shares.items():
-            if tracker == WHOLE:
-                whole[spacecraft, run, hour] = share
-            else:
-                of_trackers[spacecraft, run, tracker, hour] = share
-    _add_hours(connection, whole, (rollups_hourly, rollups_daily), _KEY)
-    tables = tracker_rollups_hourly, tracker_rollups_daily
-    _add_hours(connection, of_trackers, tables, _TRACKER_KEY)
+    hourly: Rollups = {
+        (spacecraft, run, tracker, hour): share
+        for hour, shares in of_hour.items()
+        for tracker, share in shares.items()
+    }
+    _add_hours(connection, hourly)
 
 
 def lock_position(connection: Connection) -> int:
@@ -122,24 +84,15 @@ def lock_position(connection: Connection) -> int:
     return int(connection.execute(query).scalar_one())
 
 
-def _add(
-    connection: Connection,
-    of_hour: Mapping[Any, list[Row]],
-    tables: tuple[Table, Table],
-    names: tuple[str, ...],
-) -> None:
-    _add_hours(connection, {key: rolled_up(found) for key, found in of_hour.items()}, tables, names)
-
-
-def _add_hours(
-    connection: Connection, hourly: Rollups, tables: tuple[Table, Table], names: tuple[str, ...]
-) -> None:
+def _add_hours(connection: Connection, hourly: Rollups) -> None:
     daily: Rollups = {}
     for (*owner, hour), row in hourly.items():
         _put(daily, (*owner, hour // 24), row)
-    for table, found in zip(tables, (hourly, daily), strict=True):
-        rows = [dict(zip(names, key, strict=True)) | row for key, row in found.items()]
-        add_rollups(connection, table, rows)
+    for trend, rollups in zip(TRENDS.values(), (hourly, daily), strict=True):
+        rows = [dict(zip(_TRACKER_KEY, key, strict=True)) | row for key, row in rollups.items()]
+        add_rollups(connection, trend.table, [row for row in rows if row["tracker"] == WHOLE])
+        of_trackers = [row for row in rows if row["tracker"] != WHOLE]
+        add_rollups(connection, trend.tracker_table, of_trackers)
 
 
 def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
@@ -154,59 +107,30 @@ def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
         return
     lock_position(connection)
     for key in changed:
-        _put_back(connection, rollups_hourly, key, _of_hour(connection, key))
+        _replace(connection, TRENDS["hour"], key, _of_hour(connection, key))
     for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
-        row = _of_day(connection, (spacecraft, run, day))
-        _put_back(connection, rollups_daily, (spacecraft, run, day), row)
-    _renew_trackers(connection, changed)
+        of_day = _of_day(connection, spacecraft, run, day)
+        _replace(connection, TRENDS["day"], (spacecraft, run, day), of_day)
 
 
-def _renew_trackers(connection: Connection, changed: Iterable[BucketKey]) -> None:
-    """Count the same hours and days anew for each tracker; those of the spacecraft are locked."""
-    tracker = tracker_values.c.tracker
-    for key in changed:
-        query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
-        found = connection.execute(_within_hour(query, key).group_by(tracker)).mappings()
-        of_hour: Rollups = {row["tracker"]: dict(row) for row in found}
-        for name, share in shares_of_hour(connection, *key).items():
-            if name != WHOLE:
-                _put(of_hour, name, share)
-        _replace(connection, tracker_rollups_hourly, key, of_hour)
-    for spacecraft, run, day in sorted({(key[0], key[1], key[2] // 24) for key in changed}):
-        hours = _hours_of_day(connection, tracker_rollups_hourly, (spacecraft, run, day))
-        of_day: Rollups = {}
-        for row in hours:
-            _put(of_day, row["tracker"], row)
-        _replace(connection, tracker_rollups_daily, (spacecraft, run, day), of_day)
-
-
-def _replace(
-    connection: Connection,
-    table: Table,
-    key: BucketKey,
-    of_tracker: Mapping[str, Mapping[str, Any]],
-) -> None:
-    """Replace the rows of all trackers of an hour or a day."""
-    connection.execute(delete(table).where(_place(table, key)))
+def _replace(connection: Connection, trend: Trend, key: BucketKey, of_tracker: Rollups) -> None:
+    """Replace the rows of a spacecraft and of its trackers of an hour or a day."""
     own = dict(zip(_KEY, key, strict=True))
-    rows = [dict(row) | own | {"tracker": tracker} for tracker, row in sorted(of_tracker.items())]
-    insert_all(connection, table, rows)
+    for table, is_whole in ((trend.table, True), (trend.tracker_table, False)):
+        connection.execute(delete(table).where(*(table.c[name] == own[name] for name in own)))
+        rows = [
+            row | own | {"tracker": tracker}
+            for tracker, row in sorted(of_tracker.items())
+            if (tracker == WHOLE) == is_whole and row["batches"]
+        ]
+        insert_all(connection, table, rows)
 
 
-def _of_hour(connection: Connection, key: BucketKey) -> Row | None:
-    """The rollup of the current results of an hour, archived ones included."""
-    query = _within_hour(select(*SUMMED.values()), key)
-    row = dict(connection.execute(query).mappings().one())
-    archived = shares_of_hour(connection, *key).get(WHOLE)
-    if archived is not None:
-        merge(row, archived)
-    return row if row["batches"] else None
-
-
-def _within_hour(query: Select[Any], key: BucketKey) -> Select[Any]:
-    """The query over the current results of an hour."""
+def _of_hour(connection: Connection, key: BucketKey) -> Rollups:
+    """The rollups of the current results of an hour by tracker, archived ones included."""
     spacecraft, run, hour = key
-    return query.where(
+    of_tracker = _summed(
+        connection,
         results.c.current,
         results.c.seq <= select(projector.c.seq).scalar_subquery(),
         results.c.spacecraft == spacecraft,
@@ -214,33 +138,37 @@ def _within_hour(query: Select[Any], key: BucketKey) -> Select[Any]:
         results.c.time_ns >= bucket_start(hour, HOUR_S).tai_ns,
         results.c.time_ns < bucket_start(hour + 1, HOUR_S).tai_ns,
     )
+    for tracker, share in shares_of_hour(connection, *key).items():
+        _put(of_tracker, tracker, share)
+    return of_tracker
 
 
-def _of_day(connection: Connection, key: BucketKey) -> Row | None:
-    """The rollup of the hours of a day."""
-    found: Rollups = {}
-    for row in _hours_of_day(connection, rollups_hourly, key):
-        _put(found, key, {name: row[name] for name in row if name not in _KEY})
-    return found.get(key)
+def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
+    """The rollups of some results by tracker, that of the `WHOLE` first."""
+    whole = connection.execute(select(*SUMMED.values()).where(*chosen)).mappings().one()
+    tracker = tracker_values.c.tracker
+    query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
+    of_tracker: Rollups = {WHOLE: dict(whole)}
+    for found in connection.execute(query.where(*chosen).group_by(tracker)).mappings():
+        row = dict(found)
+        of_tracker[row.pop("tracker")] = row
+    return of_tracker
 
 
-def _hours_of_day(connection: Connection, table: Table, key: BucketKey) -> list[Row]:
-    """The rows of a rollup by hour that belong to a day, in order of time."""
-    spacecraft, run, day = key
-    query = select(table).where(
-        table.c.spacecraft == spacecraft,
-        table.c.run == run,
-        table.c.bucket >= 24 * day,
-        table.c.bucket < 24 * (day + 1),
-    )
-    return [dict(row) for row in connection.execute(query.order_by(table.c.bucket)).mappings()]
-
-
-def _put_back(connection: Connection, table: Table, key: BucketKey, row: Row | None) -> None:
-    # The row may be missing: that of a first result that was superseded at once.
-    connection.execute(delete(table).where(_place(table, key)))
-    if row is not None:
-        insert_all(connection, table, [row | dict(zip(_KEY, key, strict=True))])
+def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Rollups:
+    """The rollups of the hours of a day by tracker."""
+    of_tracker: Rollups = {}
+    for table in (tables.rollups_hourly, tables.tracker_rollups_hourly):
+        query = select(table).where(
+            table.c.spacecraft == spacecraft,
+            table.c.run == run,
+            table.c.bucket >= 24 * day,
+            table.c.bucket < 24 * (day + 1),
+        )
+        for row in connection.execute(query.order_by(table.c.bucket)).mappings():
+            hour = {name: row[name] for name in tables.ROLLED_UP}
+            _put(of_tracker, row.get("tracker", WHOLE), hour)
+    return of_tracker
 
 
 def _put(found: Rollups, key: Any, row: Row) -> None:
@@ -251,54 +179,9 @@ def _put(found: Rollups, key: Any, row: Row) -> None:
         found[key] = dict(row)
 
 
-def _place(table: Table, key: BucketKey) -> ColumnElement[bool]:
-    spacecraft, run, number = key
-    return and_(table.c.spacecraft == spacecraft, table.c.run == run, table.c.bucket == number)
-
-
-def rates(
-    connection: Connection,
-    spacecraft: str,
-    *,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    bucket: Bucket,
-) -> list[Row]:
-    """The buckets that begin at or after `start`'s own and before `end`, oldest first.
-
-    Raises `BadInput` where there are more than `MAX_RATES`.
-    """
-    trend = _TRENDS[bucket]
-    table = trend.table
-    query = select(table.c.bucket, *(table.c[name] for name in COUNTS)).where(
-        table.c.spacecraft == spacecraft, table.c.run == run
-    )
-    if start is not None:
-        query = query.where(table.c.bucket >= start.bucket(trend.width_s))
-    if end is not None:
-        last = end.bucket(trend.width_s)
-        # A bucket that begins just where the range ends lies outside it.
-        last -= bucket_start(last, trend.width_s).tai_ns == end.tai_ns
-        query = query.where(table.c.bucket <= last)
-    rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
-    if len(rows) > MAX_RATES:
-        value = "nothing" if start is None else start.text
-        shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
-        wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
-        raise BadInput(Fault("start", wrong, value))
-    return [
-        {
-            "start": bucket_start(number, trend.width_s).text,
-            **dict(zip(COUNTS, counts, strict=True)),
-        }
-        for number, *counts in rows
-    ]
-
-
 def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
     """The trends as they are kept: of spacecraft, or of their trackers."""
-    trend = _TRENDS[bucket]
+    trend = TRENDS[bucket]
     table, names = (trend.tracker_table, _TRACKER_KEY) if of_trackers else (trend.table, _KEY)
     return {
         tuple(row[name] for name in names): {name: row[name] for name in row if name not in names}
@@ -318,14 +201,14 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
     if of_trackers:
         source = OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
         query = select(tracker_values, *place).select_from(source)
-    width_s = _TRENDS[bucket].width_s
+    width_s = TRENDS[bucket].width_s
     found: Rollups = {}
     for row in connection.execute(query.where(results.c.current)).mappings():
         tracker = (row["tracker"],) if of_trackers else ()
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number
         _put(found, key, rolled_up([dict(row)]))
-    for spacecraft, run, name, hour, share in every_share(connection):
+    for spacecraft, run, name, hour, share in _shares(connection):
         if (name != WHOLE) == of_trackers:
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)
             _put(found, (*owner, hour * HOUR_S // width_s), share)
@@ -341,7 +224,7 @@ def hours_of_all(connection: Connection) -> set[BucketKey]:
         (spacecraft, run, recorded_utc(time).bucket(HOUR_S))
         for spacecraft, run, time in connection.execute(query)
     }
-    for table in (rollups_hourly, archived_hours):
+    for table in (tables.rollups_hourly, tables.archived_hours):
         query = select(*(table.c[name] for name in _KEY)).distinct()
         found.update((row[0], row[1], row[2]) for row in connection.execute(query))
     return found
@@ -353,7 +236,7 @@ def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
         results, batches, results.c.batch_id == batches.c.id
     )
     query = query.where(results.c.seq > select(projector.c.seq).scalar_subquery())
-    width_s = _TRENDS[bucket].width_s
+    width_s = TRENDS[bucket].width_s
     return {
         (spacecraft, run, parse_utc(time).bucket(width_s))
         for spacecraft, run, time in connection.execute(query)
@@ -364,10 +247,6 @@ def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
 #
 # A trend holds recorded and archived batches alike.  Where an hour is counted anew from the
 # recorded ones, the share that is kept here is added.
-
-WHOLE = ""
-"""The tracker that stands for the spacecraft as a whole."""
-_NOTHING: Row = dict.fromkeys((*COUNTS, *SUMS), 0) | dict.fromkeys((*MINIMA, *MAXIMA))
 
 
 def keep_share(
@@ -381,20 +260,10 @@ def keep_share(
 
     `of_hour` has the ids of the batches by the number of their hour.
     """
-    found: dict[int, dict[str, Row]] = {}
-    for hour, batch_ids in of_hour.items():
-        chosen = results.c.current, results.c.batch_id.in_(batch_ids)
-        whole = connection.execute(select(*SUMMED.values()).where(*chosen)).mappings().one()
-        of_trackers = (
-            select(tracker_values.c.tracker, *SUMMED_OF_TRACKERS.values())
-            .select_from(OF_TRACKERS)
-            .where(*chosen)
-            .group_by(tracker_values.c.tracker)
-        )
-        found[hour] = {WHOLE: dict(whole)}
-        for row in connection.execute(of_trackers).mappings():
-            share = dict(row)
-            found[hour][share.pop("tracker")] = share
+    found = {
+        hour: _summed(connection, results.c.current, results.c.batch_id.in_(batch_ids))
+        for hour, batch_ids in of_hour.items()
+    }
     insert_share(connection, part_id, spacecraft, run, found)
 
 
@@ -413,31 +282,31 @@ def insert_share(
         for tracker, share in shares.items()
     ]
     if rows:
-        connection.execute(insert(archived_hours), rows)
+        connection.execute(insert(tables.archived_hours), rows)
 
 
 def forget_share(connection: Connection, part_id: int, spacecraft: str, run: str) -> None:
     """Delete the share of a part whose batches are recorded again."""
-    c = archived_hours.c
+    c = tables.archived_hours.c
     own = c.spacecraft == spacecraft, c.run == run, c.part_id == part_id
-    connection.execute(delete(archived_hours).where(*own))
+    connection.execute(delete(tables.archived_hours).where(*own))
 
 
 def shares_of_hour(connection: Connection, spacecraft: str, run: str, hour: int) -> dict[str, Row]:
     """The share of all archived batches of an hour, by tracker and for the `WHOLE`."""
-    c = archived_hours.c
-    query = select(c.tracker, c.sums).where(
-        c.spacecraft == spacecraft, c.run == run, c.bucket == hour
-    )
-    found: dict[str, Row] = {}
-    for tracker, sums in connection.execute(query):
-        merge(found.setdefault(tracker, dict(_NOTHING)), _NOTHING | json.loads(sums))
+    c = tables.archived_hours.c
+    found: Rollups = {}
+    own = c.spacecraft == spacecraft, c.run == run, c.bucket == hour
+    for *_, tracker, _, share in _shares(connection, *own):
+        _put(found, tracker, share)
     return found
 
 
-def every_share(connection: Connection) -> Iterator[tuple[str, str, str, int, Row]]:
-    """Every share as (spacecraft, run, tracker, hour, columns)."""
-    c = archived_hours.c
-    query = select(c.spacecraft, c.run, c.tracker, c.bucket, c.sums)
+def _shares(
+    connection: Connection, *chosen: ColumnElement[bool]
+) -> Iterator[tuple[str, str, str, int, Row]]:
+    """The chosen shares, or all, as (spacecraft, run, tracker, hour, columns)."""
+    c = tables.archived_hours.c
+    query = select(c.spacecraft, c.run, c.tracker, c.bucket, c.sums).where(*chosen)
     for spacecraft, run, tracker, hour, sums in connection.execute(query):
         yield spacecraft, run, tracker, hour, _NOTHING | json.loads(sums)

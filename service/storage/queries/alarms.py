@@ -9,18 +9,7 @@ from service.alarms.limits import Severity
 from service.alarms.quantities import quantity_named
 from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
 from service.errors import BadBatch, Fault, NotFound, shown_value
-from service.storage.models.alarms import (
-    Acted,
-    Alarm,
-    AlarmAction,
-    AlarmRaised,
-    AlarmSpan,
-    AlarmSummary,
-    AlarmValue,
-    AlarmWithActions,
-    SeverityName,
-    Shelved,
-)
+from service.storage.models import alarms as models
 from service.storage.models.base import Page
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid
@@ -42,7 +31,7 @@ def list_alarms(
     limit: int,
     cursor: str | None,
     now: str,
-) -> Page[Alarm]:
+) -> Page[models.Alarm]:
     """Alarms, the newest first; without a run those of every run."""
     chosen = _in_state(state, now)
     if run is not None:
@@ -60,18 +49,18 @@ def list_alarms(
     return Page(items, items[-1].id if more else None)
 
 
-def active_alarms(connection: Connection, run: str, now: str) -> list[Alarm]:
+def active_alarms(connection: Connection, run: str, now: str) -> list[models.Alarm]:
     """The alarms of a run that are not cleared, the worst first."""
     query = select(alarms).where(alarms.c.run == run, _ACTIVE).order_by(alarms.c.id.desc())
     found = [shown_alarm(row, now) for row in connection.execute(query).mappings()]
     return sorted(found, key=lambda each: -_rank(each.severity))
 
 
-def summary(found: Sequence[Alarm]) -> AlarmSummary:
+def summary(found: Sequence[models.Alarm]) -> models.AlarmSummary:
     """How many active alarms there are by state, and the worst of those not shelved."""
     states = ("open", "acknowledged", "shelved")
-    worst: list[SeverityName] = [each.severity for each in found if each.state != "shelved"]
-    return AlarmSummary(
+    worst: list[models.SeverityName] = [each.severity for each in found if each.state != "shelved"]
+    return models.AlarmSummary(
         **{state: sum(each.state == state for each in found) for state in states},
         worst=max(worst, key=_rank, default=None),
     )
@@ -81,16 +70,16 @@ def _rank(severity: str | None) -> Severity:
     return Severity[(severity or "").upper()]
 
 
-def read_alarm(connection: Connection, id: str, now: str) -> AlarmWithActions:
+def read_alarm(connection: Connection, id: str, now: str) -> models.AlarmWithActions:
     """An alarm with all that was noted of it, oldest first; raises `NotFound`."""
     alarm = _stored(connection, id)
     query = select(alarm_actions).where(alarm_actions.c.alarm_id == id).order_by(alarm_actions.c.id)
     shown = ("at", "action", "who", "comment", "severity", "value", "time")
     actions = [
-        AlarmAction(**{name: row[name] for name in shown})
+        models.AlarmAction(**{name: row[name] for name in shown})
         for row in connection.execute(query).mappings()
     ]
-    return AlarmWithActions(**_fields(alarm, now), actions=actions)
+    return models.AlarmWithActions(**_fields(alarm, now), actions=actions)
 
 
 def act(
@@ -101,7 +90,7 @@ def act(
     who: str,
     comment: str | None,
     now: str,
-) -> AlarmWithActions:
+) -> models.AlarmWithActions:
     """Apply a step of the state machine to an alarm, and note who did it and their comment."""
     alarm = _stored(connection, id, lock=True)
     changes, actions = step(alarm)
@@ -122,39 +111,29 @@ def change(
     """Change a stored alarm, record the actions and add an event; returns the changed alarm."""
     if changes:
         connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
-    whole = {**alarm, **changes}
-    record_action(connection, whole, actions, now, who=who, comment=comment)
-    return whole
+    alarm = {**alarm, **changes}
+    if actions:
+        row = {
+            "alarm_id": alarm["id"],
+            "at": now,
+            "value": alarm["latest_value"],
+            "time": alarm["latest_time"],
+            "severity": alarm["current_severity"],
+            "who": None,
+            "comment": None,
+        }
+        rows = [row | {"action": action} for action in actions]
+        # The first action is the user's; the others follow from it.
+        rows[0] |= {"who": who, "comment": comment}
+        connection.execute(insert(alarm_actions), rows)
+        shown, run, spacecraft = shown_alarm(alarm, now), alarm["run"], alarm["spacecraft"]
+        events.add_event(connection, "alarm", shown, run=run, spacecraft=spacecraft)
+    return alarm
 
 
-def record_action(
-    connection: Connection,
-    alarm: Row,
-    actions: Sequence[AlarmActionName],
-    now: str,
-    *,
-    who: str | None = None,
-    comment: str | None = None,
-) -> None:
-    """Record actions on an alarm, and add an event."""
-    if not actions:
-        return
-    point = {"value": alarm["latest_value"], "time": alarm["latest_time"]}
-    severity = {"severity": alarm["current_severity"]}
-    # The first action is the user's; the others follow from it.
-    by = [{"who": who, "comment": comment}] + [{"who": None, "comment": None}] * len(actions)
-    rows = [
-        {"alarm_id": alarm["id"], "at": now, "action": action, **point, **severity, **whom}
-        for action, whom in zip(actions, by, strict=False)
-    ]
-    connection.execute(insert(alarm_actions), rows)
-    shown = shown_alarm(alarm, now)
-    events.add_event(connection, "alarm", shown, run=alarm["run"], spacecraft=alarm["spacecraft"])
-
-
-def shown_alarm(alarm: Any, now: str) -> Alarm:
+def shown_alarm(alarm: Any, now: str) -> models.Alarm:
     """A stored alarm as the interface shows it."""
-    return Alarm(**_fields(alarm, now))
+    return models.Alarm(**_fields(alarm, now))
 
 
 def _fields(alarm: Any, now: str) -> Row:
@@ -167,9 +146,9 @@ def _fields(alarm: Any, now: str) -> Row:
         "severity": alarm["severity"],
         "current_severity": alarm["current_severity"],
         "in_limits": alarm["current_severity"] is None,
-        "raised": AlarmRaised(**_value(alarm, "raised"), **raised),
-        "worst": AlarmValue(**_value(alarm, "worst")),
-        "latest": AlarmValue(**_value(alarm, "latest")),
+        "raised": models.AlarmRaised(**_value(alarm, "raised"), **raised),
+        "worst": models.AlarmValue(**_value(alarm, "worst")),
+        "latest": models.AlarmValue(**_value(alarm, "latest")),
         "returned_at": alarm["returned_at"],
         "acknowledged": _acted(alarm, "acknowledged"),
         "shelved": _shelved(alarm),
@@ -181,16 +160,16 @@ def _value(alarm: Any, which: str) -> Row:
     return {name: alarm[f"{which}_{name}"] for name in ("value", "time", "batch_id")}
 
 
-def _acted(alarm: Any, which: str) -> Acted | None:
+def _acted(alarm: Any, which: str) -> models.Acted | None:
     at = alarm[f"{which}_at"]
-    return None if at is None else Acted(at=at, who=alarm[f"{which}_by"])
+    return None if at is None else models.Acted(at=at, who=alarm[f"{which}_by"])
 
 
-def _shelved(alarm: Any) -> Shelved | None:
+def _shelved(alarm: Any) -> models.Shelved | None:
     at = alarm["shelved_at"]
     if at is None:
         return None
-    return Shelved(at=at, who=alarm["shelved_by"], until=alarm["shelved_until"])
+    return models.Shelved(at=at, who=alarm["shelved_by"], until=alarm["shelved_until"])
 
 
 def _stored(connection: Connection, id: str, lock: bool = False) -> Row:
@@ -228,7 +207,7 @@ TimeOut = tuple[str, str | None]
 
 def alarm_spans(
     connection: Connection, run: str, spacecraft: str, start: Utc, end: Utc
-) -> list[AlarmSpan]:
+) -> list[models.AlarmSpan]:
     """The spans of telemetry time in which alarms were out of their limits, oldest first.
 
     Those that touch the period from `start` to before `end`, of the newest alarms.
@@ -247,7 +226,7 @@ def alarm_spans(
     )
     found = [shown_alarm(row, utc_now().text) for row in connection.execute(chosen).mappings()]
     spans = [
-        AlarmSpan(
+        models.AlarmSpan(
             id=alarm.id,
             quantity=alarm.quantity,
             tracker=alarm.tracker,
@@ -261,7 +240,7 @@ def alarm_spans(
     return sorted((each for each in spans if _touches(each, start, end)), key=lambda s: s.start)
 
 
-def times_out(connection: Connection, found: Sequence[Alarm]) -> list[list[TimeOut]]:
+def times_out(connection: Connection, found: Sequence[models.Alarm]) -> list[list[TimeOut]]:
     """For each alarm, from when to when it was out of its limits, in telemetry time."""
     actions: dict[str, list[tuple[str, str | None]]] = {alarm.id: [] for alarm in found}
     noted = (
@@ -277,7 +256,7 @@ def times_out(connection: Connection, found: Sequence[Alarm]) -> list[list[TimeO
     return [_times_out(alarm, actions[alarm.id]) for alarm in found]
 
 
-def _times_out(alarm: Alarm, actions: Sequence[tuple[str, str | None]]) -> list[TimeOut]:
+def _times_out(alarm: models.Alarm, actions: Sequence[tuple[str, str | None]]) -> list[TimeOut]:
     spans: list[TimeOut] = [(alarm.raised.time, None)]
     for action, time in actions:
         begin, until = spans[-1]
@@ -290,6 +269,6 @@ def _times_out(alarm: Alarm, actions: Sequence[tuple[str, str | None]]) -> list[
     return spans
 
 
-def _touches(span: AlarmSpan, start: Utc, end: Utc) -> bool:
+def _touches(span: models.AlarmSpan, start: Utc, end: Utc) -> bool:
     is_over = span.end is not None and recorded_utc(span.end).tai_ns < start.tai_ns
     return not is_over and recorded_utc(span.start).tai_ns < end.tai_ns

@@ -2,39 +2,20 @@
 
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
 from service.storage.archive.reading import Archive, parts_between, places
-from service.storage.models.compare import (
-    AngleStatistics,
-    OutcomeCounts,
-    RatesOfRuns,
-    RunAttitudes,
-    RunChange,
-    RunChangeSide,
-    RunComparison,
-    RunRates,
-    RunStars,
-    RunTransition,
-    StatusCounts,
-)
-from service.storage.queries.pages import PLACE, Place, ResultFilter
-from service.storage.queries.time_buckets import BucketFilter, Columns, Level, read_buckets
-from service.storage.queries.with_archive import ArchiveUse, bounds_of, first_rows
-from service.storage.sql.tables import (
-    COUNTED,
-    COUNTS,
-    archived_batches,
-    batches,
-    results,
-    rollups_daily,
-    solutions,
-    star_results,
-)
+from service.storage.models import compare
+from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter, newest_first
+from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
+from service.storage.queries.with_archive import Listing, bounds_of
+from service.storage.sql import tables
+from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
@@ -42,7 +23,6 @@ if TYPE_CHECKING:
     from service.storage.archive.opened import Opened
 
 _READ_AT_ONCE = 10_000
-_QUATERNION = ("q1", "q2", "q3", "qc")
 
 
 def compare_runs(
@@ -51,21 +31,52 @@ def compare_runs(
     selected: ResultFilter,
     other: str,
     latest: int | None = None,
-) -> RunComparison:
+) -> compare.RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
     `stars` counts what became of each, from the one run (`before`) to the other
     (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
     compares what both have.  With `latest`, of the period's latest batches alone.
     """
-    tally = _Tally()
-    if not is_archived_in_part(connection, selected, other):
-        tally.add(connection, _pairs(selected, other, latest))
-    else:
-        for group in both_runs(connection, archive, selected, other, latest):
-            with group.reading() as of_group:
-                tally.add(of_group, _pairs(selected, other))
-    return tally.comparison(selected.run, other)
+    stars: Counter[tuple[str, str, bool]] = Counter()
+    before: Counter[str] = Counter()
+    after: Counter[str] = Counter()
+    angles_arcsec = [np.empty(0)]
+    for of_group, pairs in _groups(connection, archive, selected, other, latest):
+        stars.update(_transitions(of_group, pairs))
+        states = pairs.c.status_before, pairs.c.status_after
+        for old, new, count in of_group.execute(select(*states, func.count()).group_by(*states)):
+            before[old or "none"] += int(count)
+            after[new or "none"] += int(count)
+        angles_arcsec += _angles_arcsec(of_group, pairs)
+    transitions = [
+        compare.RunTransition(before=old, after=new, same_star=alike, stars=number)
+        for (old, new, alike), number in stars.items()
+    ]
+    # The most frequent first.
+    transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
+    angles = np.concatenate(angles_arcsec)
+    statistics = None
+    if len(angles):
+        median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
+        statistics = compare.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+    return compare.RunComparison(
+        run=selected.run,
+        other=other,
+        batches=before.total(),
+        stars=compare.RunStars(
+            observed=stars.total(),
+            before=_sums((each.before, each.stars) for each in transitions),
+            after=_sums((each.after, each.stars) for each in transitions),
+            transitions=transitions,
+        ),
+        attitudes=compare.RunAttitudes(
+            before=compare.StatusCounts(**before),
+            after=compare.StatusCounts(**after),
+            in_both=len(angles),
+            angle_arcsec=statistics,
+        ),
+    )
 
 
 def changed_batches(
@@ -75,33 +86,49 @@ def changed_batches(
     other: str,
     latest: int,
     limit: int,
-) -> list[RunChange]:
+) -> list[compare.RunChange]:
     """The batches whose counts of stars or whose status differ in the other run, latest first.
 
     At most `limit` of the period's `latest` batches.
     """
-    if not is_archived_in_part(connection, selected, other):
-        return _changed(connection, _pairs(selected, other, latest), limit)
-    found: list[RunChange] = []
-    for group in both_runs(connection, archive, selected, other, latest):
-        with group.reading() as of_group:
-            found += _changed(of_group, _pairs(selected, other), limit)
+    found: list[compare.RunChange] = []
+    for of_group, pairs in _groups(connection, archive, selected, other, latest):
+        found += _changed(of_group, pairs, limit)
         if len(found) >= limit:
             break
     return found[:limit]
 
 
-def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunChange]:
+def _groups(
+    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
+) -> Iterator[tuple[Connection, Subquery]]:
+    """The pairs of results of both runs with the database that they are in, latest first.
+
+    Without an archive that is one group.
+    """
+    is_archived = any(
+        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
+        for run in (selected.run, other)
+    )
+    if not is_archived:
+        yield connection, _pairs(selected, other, latest)
+        return
+    for group in both_runs(connection, archive, selected, other, latest):
+        with group.reading() as of_group:
+            yield of_group, _pairs(selected, other)
+
+
+def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compare.RunChange]:
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
-        *(old.c[name] != new.c[name] for name in (*COUNTED, "status")),
+        *(old.c[name] != new.c[name] for name in (*tables.COUNTED, "status")),
         # Without an attitude the status is null.
         old.c.status.is_(None) != new.c.status.is_(None),
     )
     sides = [
         each.c[name].label(f"{side}_{name}")
         for side, each in (("before", old), ("after", new))
-        for name in ("id", *COUNTED, "status")
+        for name in ("id", *tables.COUNTED, "status")
     ]
     query = (
         select(batches.c.batch, batches.c.time, *sides)
@@ -114,7 +141,7 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunCha
         .limit(limit)
     )
     return [
-        RunChange(
+        compare.RunChange(
             batch=row["batch"],
             time=row["time"],
             before=_side(row, "before"),
@@ -124,10 +151,10 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[RunCha
     ]
 
 
-def _side(row: Any, side: str) -> RunChangeSide:
+def _side(row: Any, side: str) -> compare.RunChangeSide:
     counts = {name: row[f"{side}_{name}"] for name in ("unique", "ambiguous", "unmatched")}
-    return RunChangeSide(
-        id=row[f"{side}_id"], counts=OutcomeCounts(**counts), status=row[f"{side}_status"]
+    return compare.RunChangeSide(
+        id=row[f"{side}_id"], counts=compare.OutcomeCounts(**counts), status=row[f"{side}_status"]
     )
 
 
@@ -137,8 +164,7 @@ def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Sub
     of_run = selected.conditions()
     if latest is not None:
         # The limit comes first: to look for partners of millions of batches takes minutes.
-        chosen = select(results.c.id).where(*of_run)
-        chosen = chosen.order_by(results.c.time_ns.desc(), results.c.batch_id.desc())
+        chosen = newest_first(select(results.c.id).where(*of_run))
         of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
         select(
@@ -162,62 +188,9 @@ def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Sub
     )
 
 
-class _Tally:
-    """Both runs so far, over the groups of batches that were compared."""
-
-    def __init__(self) -> None:
-        self.batches = 0
-        self.stars: Counter[tuple[str, str, bool]] = Counter()
-        self.before: Counter[str] = Counter()
-        self.after: Counter[str] = Counter()
-        self.angles_arcsec: list[Vector] = []
-
-    def add(self, connection: Connection, pairs: Subquery) -> None:
-        """Take the pairs of a group."""
-        self.batches += int(connection.scalar(select(func.count()).select_from(pairs)) or 0)
-        self.stars.update(_transitions(connection, pairs))
-        states = select(pairs.c.status_before, pairs.c.status_after, func.count()).group_by(
-            pairs.c.status_before, pairs.c.status_after
-        )
-        for old, new, count in connection.execute(states):
-            self.before[old or "none"] += int(count)
-            self.after[new or "none"] += int(count)
-        self.angles_arcsec += _angles_arcsec(connection, pairs)
-
-    def comparison(self, run: str | None, other: str) -> RunComparison:
-        """The whole; of the transitions the most frequent first."""
-        transitions = [
-            RunTransition(before=before, after=after, same_star=alike, stars=stars)
-            for (before, after, alike), stars in self.stars.items()
-        ]
-        transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
-        angles = np.concatenate([np.empty(0), *self.angles_arcsec])
-        statistics = None
-        if len(angles):
-            median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-            statistics = AngleStatistics(median=median, p95=p95, max=float(angles.max()))
-        return RunComparison(
-            run=run,
-            other=other,
-            batches=self.batches,
-            stars=RunStars(
-                observed=sum(each.stars for each in transitions),
-                before=_sums((each.before, each.stars) for each in transitions),
-                after=_sums((each.after, each.stars) for each in transitions),
-                transitions=transitions,
-            ),
-            attitudes=RunAttitudes(
-                before=StatusCounts(**self.before),
-                after=StatusCounts(**self.after),
-                in_both=len(angles),
-                angle_arcsec=statistics,
-            ),
-        )
-
-
 def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str, bool], int]:
     """How many stars went from which outcome to which, and whether they name the same star."""
-    old, new = star_results.alias("old_star"), star_results.alias("new_star")
+    old, new = tables.star_results.alias("old_star"), tables.star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
     query = (
         select(old.c.outcome, new.c.outcome, same, func.count())
@@ -239,18 +212,20 @@ def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str
     }
 
 
-def _sums(stars: Iterable[tuple[str, int]]) -> OutcomeCounts:
+def _sums(stars: Iterable[tuple[str, int]]) -> compare.OutcomeCounts:
     counts: Counter[str] = Counter()
     for outcome, number in stars:
         counts[outcome] += number
-    return OutcomeCounts(**{name: counts[name] for name in OutcomeCounts.__struct_fields__})
+    return compare.OutcomeCounts(
+        **{name: counts[name] for name in compare.OutcomeCounts.__struct_fields__}
+    )
 
 
 def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
     """The angles between the attitudes that both have, in arrays."""
-    old, new = solutions.alias("old_solution"), solutions.alias("new_solution")
+    old, new = tables.solutions.alias("old_solution"), tables.solutions.alias("new_solution")
     query = (
-        select(*(each.c[name] for each in (old, new) for name in _QUATERNION))
+        select(*(each.c[name] for each in (old, new) for name in QUATERNION))
         .select_from(pairs)
         .join(old, old.c.result_id == pairs.c.before)
         .join(new, new.c.result_id == pairs.c.after)
@@ -272,50 +247,31 @@ _COMPARED = ("solution", "stars")
 _AT_ONCE = 1_000
 
 
-def is_archived_in_part(connection: Connection, selected: ResultFilter, other: str) -> bool:
-    """True if the archive has batches of the period in one of the runs."""
-    return any(
-        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
-        for run in (selected.run, other)
-    )
-
-
 def both_runs(
-    connection: Connection,
-    archive: Archive,
-    selected: ResultFilter,
-    other: str,
-    latest: int | None,
+    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
 ) -> Iterator["Opened"]:
     """The selected batches with those of the same names in another run, latest first.
 
     At most the `latest` of those selected.  Recorded and archived ones are copied into one
     database, so that any of the two may be in either place.
     """
-    from service.storage.archive.opened import Opened
-
     named = (results.c.spacecraft, batches.c.batch)
     query = select(*PLACE, *named).join_from(results, batches, results.c.batch_id == batches.c.id)
     query = query.where(*selected.conditions())
-    use, left = ArchiveUse(archive), latest
+    listing, left = Listing(archive, query, selected, newest_first=True), latest
     beyond: Place | None = None
     while left is None or left > 0:
         limit = GROUP if left is None else min(GROUP, left)
-        found = first_rows(
-            connection, use, query, selected, limit, newest_first=True, beyond=beyond
-        ).rows
+        found = listing.first_rows(connection, limit, beyond).rows
         if not found:
             return
-        opened = Opened()
         names = [(each.row.spacecraft, each.row.batch) for each in found]
         own: dict[bool, list[str]] = {True: [], False: []}
         for each in found:
             own[each.archived].append(each.row.batch_id)
-        _add_recorded(connection, opened, [*own[False], *_named(connection, batches, other, names)])
-        archived = [*own[True], *_named(connection, archived_batches, other, names)]
-        _add_archived(connection, archive, opened, archived)
-        opened.add_indexes()
-        yield opened
+        recorded = [*own[False], *_named(connection, batches, other, names)]
+        archived = [*own[True], *_named(connection, tables.archived_batches, other, names)]
+        yield _opened(connection, archive, recorded, archived)
         beyond = found[-1].place
         left = None if left is None else left - len(found)
         if len(found) < limit:
@@ -335,29 +291,25 @@ def _named(
     return found
 
 
-def _add_recorded(connection: Connection, opened: "Opened", ids: Sequence[str]) -> None:
+def _opened(
+    connection: Connection, archive: Archive, recorded: Sequence[str], archived: Sequence[str]
+) -> "Opened":
+    """Recorded and archived batches in one database."""
+    from service.storage.archive.opened import Opened, columns_of
     from service.storage.archive.rows import read_rows
 
-    if ids:
-        opened.add_rows(read_rows(connection, ids))
-
-
-def _add_archived(
-    connection: Connection, archive: Archive, opened: "Opened", ids: Collection[str]
-) -> None:
-    from service.storage.archive.opened import columns_of
-
-    for path, of_part in _places(connection, list(ids)).items():
-        own: Any = [[("id", "in", of_part)], [("batch_id", "in", of_part)]]
+    opened = Opened()
+    if recorded:
+        opened.add_rows(read_rows(connection, recorded))
+    of_file: dict[str, list[str]] = {}
+    for first in range(0, len(archived), _AT_ONCE):
+        for path, ids in places(connection, archived[first : first + _AT_ONCE]).items():
+            of_file.setdefault(path, []).extend(ids)
+    for path, ids in of_file.items():
+        own: Any = [[("id", "in", ids)], [("batch_id", "in", ids)]]
         opened.add_partition(archive.read(path, columns_of(_COMPARED), own))
-
-
-def _places(connection: Connection, ids: Sequence[str]) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for first in range(0, len(ids), _AT_ONCE):
-        for path, added in places(connection, ids[first : first + _AT_ONCE]).items():
-            found.setdefault(path, []).extend(added)
-    return found
+    opened.add_indexes()
+    return opened
 
 
 _SHOWN_BY_HOUR_S = 30 * DAY_S
@@ -368,12 +320,8 @@ _SHARES = ("ambiguous", "unmatched")
 
 
 def run_rates(
-    connection: Connection,
-    spacecraft: str,
-    runs: Sequence[str],
-    start: Utc | None,
-    end: Utc | None,
-) -> RatesOfRuns | None:
+    connection: Connection, spacecraft: str, runs: Sequence[str], start: Utc | None, end: Utc | None
+) -> compare.RatesOfRuns | None:
     """The rates of all stars of each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
@@ -382,41 +330,34 @@ def run_rates(
     common = _common_days(connection, spacecraft, runs)
     if common is None:
         return None
-    start = max(start or common[0], common[0], key=_tai_ns)
-    end = min(end or common[1], common[1], key=_tai_ns)
+    start = max(start or common[0], common[0], key=attrgetter("tai_ns"))
+    end = min(end or common[1], common[1], key=attrgetter("tai_ns"))
     if start.tai_ns >= end.tai_ns:
         return None
     first_s, end_s = unix_seconds([start.tai_ns, end.tai_ns]).tolist()
-    level: Level = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
-    width_s = HOUR_S if level == "hour" else DAY_S * _days_of_a_cell(end_s - first_s)
+    level: Bucket = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
+    days = math.ceil((end_s - first_s) / (DAY_S * _MOST_CELLS_OF_DAYS))
+    width_s = HOUR_S if level == "hour" else DAY_S * days
     cells = int(-(-end_s // width_s) - first_s // width_s)
     rates = []
     for run in runs:
         span = BucketFilter(spacecraft, run, start, end)
-        buckets = read_buckets(connection, span, level, COUNTS)
+        buckets = read_buckets(connection, span, level, tables.COUNTS)
         place = (buckets["unix_s"] // width_s - first_s // width_s).astype(int)
         rates.append(
-            RunRates(
+            compare.RunRates(
                 run=run,
-                totals={name: int(buckets[name].sum()) for name in COUNTS},
+                totals={name: int(buckets[name].sum()) for name in tables.COUNTS},
                 shares={name: _share(buckets, name, place, cells) for name in _SHARES},
             )
         )
-    return RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
-
-
-def _tai_ns(moment: Utc) -> int:
-    return moment.tai_ns
-
-
-def _days_of_a_cell(length_s: float) -> int:
-    return math.ceil(length_s / (DAY_S * _MOST_CELLS_OF_DAYS))
+    return compare.RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
 
 
 def _common_days(
     connection: Connection, spacecraft: str, runs: Sequence[str]
 ) -> tuple[Utc, Utc] | None:
-    c = rollups_daily.c
+    c = tables.rollups_daily.c
     query = (
         select(func.min(c.bucket), func.max(c.bucket))
         .where(c.spacecraft == spacecraft, c.run.in_(runs), c.batches > 0)

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Literal
 
@@ -10,58 +11,23 @@ from msgspec import structs
 from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, select
 
 from service.missions.mission import Mission
-from service.storage.models.alarms import Alarm
+from service.storage.models.alarms import Alarm, AlarmSummary
 from service.storage.models.answers import Summary
-from service.storage.models.overview import (
-    Fleet,
-    FleetCells,
-    FleetRow,
-    KnownAttitude,
-    Overview,
-    OverviewRow,
-    Sparkline,
-    TrackerCounts,
-    WindowCounts,
-)
+from service.storage.models.overview import Overview, OverviewRow, Sparkline, WindowCounts
+from service.storage.queries import time_buckets
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
-from service.storage.queries.pages import PLACE
+from service.storage.queries.pages import newest_first
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.time_buckets import (
-    MAX_BATCHES_SUMMED,
-    BucketFilter,
-    Columns,
-    batches_about,
-    has_archived,
-    read_buckets,
-    read_steps,
-    totals,
-)
+from service.storage.queries.time_buckets import BucketFilter
 from service.storage.queries.trends import latest_time_of
 from service.storage.recording.result_metrics import SUMMED
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTS,
-    batches,
-    mission_uses,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    runs,
-    solutions,
-    star_results,
-)
-from service.times import (
-    DAY_S,
-    HOUR_S,
-    UNIX_DAY,
-    Utc,
-    bucket_start,
-    recorded_utc,
-    shifted,
-    unix_seconds,
-)
+from service.storage.sql.tables import COUNTS, batches, results
+from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, recorded_utc, shifted, unix_seconds
+from service.vectors import Matrix
 
 Period = Literal["hour", "day", "week"]
 PERIODS_S: Mapping[Period, int] = {"hour": HOUR_S, "day": DAY_S, "week": 7 * DAY_S}
@@ -73,6 +39,92 @@ MOST_SUMMED = 20_000
 _TICK_S = 1e-6
 _Sums = Sequence[tuple[Any, ...]]
 """Rows of spacecraft, POSIX time at which a cell begins, and counts."""
+
+
+@dataclass(frozen=True)
+class TrackerCounts:
+    """One tracker's stars of the latest batch, and how many of them are unique."""
+
+    tracker: str
+    observed: int
+    unique: int
+
+
+@dataclass(frozen=True)
+class KnownAttitude:
+    """The newest attitude of a spacecraft: of which result, at what time, how good."""
+
+    id: str
+    time: str
+    status: str
+    sigma_arcsec: tuple[float, float, float]
+    """One standard deviation about each body axis."""
+
+
+@dataclass(frozen=True)
+class FleetRow:
+    """The state of one spacecraft in a run; None without a batch."""
+
+    name: str
+    description: str
+    retired: bool
+    """True if no mission file describes it any more."""
+    state: str
+    """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
+    alarms: tuple[Alarm, ...]
+    """The alarms that are not cleared, worst first."""
+    latest_batch: Summary | None = None
+    last_attitude: KnownAttitude | None = None
+    """It can be older than the latest batch."""
+    trackers: tuple[TrackerCounts, ...] = ()
+    age_s: float | None = None
+    """From its latest batch to the run's latest batch."""
+    received_age_s: float | None = None
+    """Since the service received its latest batch."""
+    last_hour: WindowCounts | None = None
+
+    @property
+    def alarms_now(self) -> list[Alarm]:
+        """Alarms whose quantity is out of its limits, without shelved ones."""
+        return [each for each in self.alarms if not each.in_limits and each.state != "shelved"]
+
+    @property
+    def alarms_returned(self) -> list[Alarm]:
+        """Alarms whose quantity is back in its limits and that wait to be acknowledged."""
+        return [each for each in self.alarms if each.in_limits and each.state != "shelved"]
+
+    @property
+    def has_attitude(self) -> bool:
+        """True if the latest batch has an attitude of its own."""
+        return self.state in ("good", "suspect")
+
+
+@dataclass(frozen=True)
+class FleetCells:
+    """Counts in cells of equal width in time: a row for each spacecraft, a column for each cell."""
+
+    start_s: float
+    """POSIX time at which the first cell begins."""
+    width_s: int
+    counts: Mapping[str, Matrix]
+    """A rollup's counts, such as `observed`; 0 where there was no batch."""
+
+    @property
+    def columns(self) -> int:
+        """How many cells there are in time."""
+        return int(self.counts["batches"].shape[1])
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Every spacecraft in a run; the rows of `cells` are those of `rows`."""
+
+    run: str
+    as_of: Utc | None
+    """The time of the run's latest batch."""
+    alarms: AlarmSummary
+    rows: tuple[FleetRow, ...]
+    cells: FleetCells | None
 
 
 def fleet(
@@ -119,33 +171,20 @@ class _Facts:
 def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
     name = mission.name
     batch = None if facts is None else facts.latest.get(name)
+    about = name, mission.description, mission.retired
     alarms = tuple(each for each in active if each.spacecraft == name)
     if facts is None or batch is None:
-        return FleetRow(
-            name,
-            mission.description,
-            mission.retired,
-            "no_batches",
-            None,
-            None,
-            (),
-            None,
-            None,
-            None,
-            alarms,
-        )
+        return FleetRow(*about, state="no_batches", alarms=alarms)
     return FleetRow(
-        name=name,
-        description=mission.description,
-        retired=mission.retired,
+        *about,
         state=batch.status or "no_attitude",
+        alarms=alarms,
         latest_batch=batch,
         last_attitude=facts.attitudes.get(name),
         trackers=_of_every_tracker(mission, facts.trackers.get(batch.id, {})),
         age_s=max(0.0, (facts.as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9),
         received_age_s=(now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9,
         last_hour=facts.last_hour.get(name),
-        alarms=alarms,
     )
 
 
@@ -173,9 +212,9 @@ def _latest_ids(
 @cache
 def _newest_query(solved: bool) -> Select[Any]:
     # Every spacecraft of a mission file is noted with its settings when the service starts.
-    known = select(mission_uses.c.spacecraft.label("name")).distinct()
+    known = select(tables.mission_uses.c.spacecraft.label("name")).distinct()
     asked = known.where(
-        mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
+        tables.mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
     ).subquery()
     newest = select(results.c.id).where(
         results.c.current,
@@ -185,7 +224,7 @@ def _newest_query(solved: bool) -> Select[Any]:
     )
     if solved:
         newest = newest.where(results.c.status.is_not(None))
-    newest = newest.order_by(*(column.desc() for column in PLACE)).limit(1).correlate(asked)
+    newest = newest_first(newest).limit(1).correlate(asked)
     return select(asked.c.name, newest.scalar_subquery())
 
 
@@ -199,7 +238,7 @@ def _tracker_counts(
     connection: Connection, ids: Iterable[str]
 ) -> dict[str, dict[str, tuple[int, int]]]:
     """Stars and unique stars of each tracker, by the id of the result."""
-    columns = star_results.c
+    columns = tables.star_results.c
     unique = func.sum(case((columns.outcome == "unique", 1), else_=0))
     query = (
         select(columns.result_id, columns.tracker, func.count(), unique)
@@ -213,7 +252,7 @@ def _tracker_counts(
 
 
 def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, KnownAttitude]:
-    columns = solutions.c
+    columns = tables.solutions.c
     query = (
         select(
             results.c.spacecraft,
@@ -223,7 +262,7 @@ def _attitudes(connection: Connection, ids: Mapping[str, str]) -> dict[str, Know
             *(columns.p11, columns.p22, columns.p33),
         )
         .join_from(results, batches, results.c.batch_id == batches.c.id)
-        .join(solutions, columns.result_id == results.c.id)
+        .join(tables.solutions, columns.result_id == results.c.id)
         .where(results.c.id.in_(list(ids.values())))
     )
     return {
@@ -245,7 +284,9 @@ def _last_hours(
     start = shifted(end, -HOUR_S)
     query = select(results.c.spacecraft, *(SUMMED[name] for name in COUNTS))
     asked = {"names": names, "run": run, "start_ns": start.tai_ns, "end_ns": end.tai_ns}
-    rows = connection.execute(query.where(*_IN_SPAN).group_by(results.c.spacecraft), asked)
+    rows = connection.execute(
+        query.where(*time_buckets.IN_PERIOD, _IN_NAMES).group_by(results.c.spacecraft), asked
+    )
     return {
         name: WindowCounts(
             start=start.text, end=as_of.text, **dict(zip(COUNTS, map(int, counts), strict=True))
@@ -270,16 +311,12 @@ def _cells(
     return _table(names, rows, as_of, span_s, width_s)
 
 
-def _first_cell_s(as_of: Utc, span_s: int, width_s: int) -> float:
-    end_s = float(unix_seconds([as_of.tai_ns])[0])
-    return (end_s - span_s) // width_s * width_s + width_s
-
-
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
 ) -> FleetCells:
     """Sums as a table of spacecraft and time."""
-    start_s = _first_cell_s(as_of, span_s, width_s)
+    end_s = float(unix_seconds([as_of.tai_ns])[0])
+    start_s = (end_s - span_s) // width_s * width_s + width_s
     place = {name: k for k, name in enumerate(names)}
     counts = {name: np.zeros((len(names), span_s // width_s)) for name in COUNTS}
     found = [(place[row[0]], int((row[1] - start_s) // width_s), row[2:]) for row in rows]
@@ -296,7 +333,7 @@ def _hours(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
     """Sums of whole hours, from the rollups."""
-    table, hours = rollups_hourly.c, width_s // HOUR_S
+    table, hours = tables.rollups_hourly.c, width_s // HOUR_S
     first = shifted(as_of, -span_s).bucket(HOUR_S)
     cell = (table.bucket // hours).label("cell")
     query = (
@@ -315,51 +352,29 @@ def _hours(
     ]
 
 
-_IN_SPAN = (
-    results.c.current,
-    results.c.spacecraft.in_(bindparam("names", expanding=True)),
-    results.c.run == bindparam("run"),
-    results.c.time_ns >= bindparam("start_ns"),
-    results.c.time_ns < bindparam("end_ns"),
+_IN_NAMES = results.c.spacecraft.in_(bindparam("names", expanding=True))
+_STEPS = (
+    select(results.c.spacecraft, time_buckets.STEP, *(SUMMED[name] for name in COUNTS))
+    .where(*time_buckets.IN_PERIOD, _IN_NAMES)
+    .group_by(results.c.spacecraft, time_buckets.STEP)
 )
 
 
 def _steps(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums of less than an hour, from the batches.
-
-    Each day is read by itself: between two of them there may be a leap second.
-    """
+    """Sums of less than an hour, from the batches."""
     end = shifted(as_of, _TICK_S)
-    begin = shifted(end, -span_s)
     found: list[tuple[Any, ...]] = []
-    for day in range(begin.bucket(DAY_S), as_of.bucket(DAY_S) + 1):
-        midnight, next_midnight = bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
-        asked = {
-            "names": names,
-            "run": run,
-            "start_ns": max(begin.tai_ns, midnight.tai_ns),
-            "end_ns": min(end.tai_ns, next_midnight.tai_ns),
-            "midnight_ns": midnight.tai_ns,
-        }
+    for midnight, asked in time_buckets.steps_by_day(shifted(end, -span_s), end, width_s):
         midnight_s = float(unix_seconds([midnight.tai_ns])[0])
         found += [
             (name, midnight_s + step * width_s, *counts)
-            for name, step, *counts in connection.execute(_steps_query(width_s), asked)
+            for name, step, *counts in connection.execute(
+                _STEPS, {"names": names, "run": run} | asked
+            )
         ]
     return found
-
-
-@cache
-def _steps_query(width_s: int) -> Select[Any]:
-    since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
-    number = since_ns // (width_s * 10**9)
-    # A leap second belongs to the cell that it ends.
-    last = DAY_S // width_s - 1
-    step = case((number > last, last), else_=number).label("step")
-    query = select(results.c.spacecraft, step, *(SUMMED[name] for name in COUNTS))
-    return query.where(*_IN_SPAN).group_by(results.c.spacecraft, step)
 
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
@@ -398,12 +413,12 @@ def default_run(connection: Connection, spacecraft: Collection[str] | None = Non
 
     With `spacecraft`, batches of these.
     """
-    batches = select(rollups_daily.c.run).where(rollups_daily.c.run == runs.c.name)
+    daily, c = tables.rollups_daily.c, tables.runs.c
+    filled = select(daily.run).where(daily.run == c.name)
     if spacecraft is not None:
-        batches = batches.where(rollups_daily.c.spacecraft.in_(spacecraft))
-    filled = batches.exists()
-    query = select(runs.c.name).where(filled)
-    first = query.order_by(runs.c.name != LIVE, runs.c.created.desc(), runs.c.name).limit(1)
+        filled = filled.where(daily.spacecraft.in_(spacecraft))
+    query = select(c.name).where(filled.exists())
+    first = query.order_by(c.name != LIVE, c.created.desc(), c.name).limit(1)
     return str(connection.execute(first).scalar() or LIVE)
 
 
@@ -433,7 +448,7 @@ def _item(
         end = shifted(as_of, _TICK_S)
         span = BucketFilter(mission.name, run, shifted(end, -width_s), end)
         step_s, buckets = _read(connection, span, width_s)
-        window = WindowCounts(start=span.start.text, end=as_of.text, **totals(buckets))
+        window = WindowCounts(start=span.start.text, end=as_of.text, **time_buckets.totals(buckets))
         item[f"last_{name}"] = window
         item[f"sparkline_{name}"] = _sparkline(buckets, step_s)
     return OverviewRow(**item)
@@ -444,16 +459,19 @@ def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
     return [math.sqrt(max(covariance_arcsec2[axis][axis], 0.0)) for axis in range(3)]
 
 
-def _read(connection: Connection, span: BucketFilter, width_s: int) -> tuple[int, Columns]:
+def _read(
+    connection: Connection, span: BucketFilter, width_s: int
+) -> tuple[int, time_buckets.Columns]:
     are_many = width_s > HOUR_S and (
-        batches_about(connection, span) > MAX_BATCHES_SUMMED or has_archived(connection, span)
+        time_buckets.batches_about(connection, span) > time_buckets.MAX_BATCHES_SUMMED
+        or time_buckets.has_archived(connection, span)
     )
     if are_many:
-        return HOUR_S, read_buckets(connection, span, "hour", COUNTS)
-    return STEPS[width_s], read_steps(connection, span, STEPS[width_s], COUNTS)
+        return HOUR_S, time_buckets.read_buckets(connection, span, "hour", COUNTS)
+    return STEPS[width_s], time_buckets.read_steps(connection, span, STEPS[width_s], COUNTS)
 
 
-def _sparkline(buckets: Columns, step_s: int) -> Sparkline:
+def _sparkline(buckets: time_buckets.Columns, step_s: int) -> Sparkline:
     observed = np.maximum(buckets["observed"], 1.0)
     return Sparkline(
         bucket_s=step_s,

@@ -16,9 +16,16 @@ from service.storage.archive.reading import Archive
 from service.storage.models.base import Page
 from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
-from service.storage.queries.pages import PLACE, ResultFilter, newest
+from service.storage.queries.pages import (
+    COVARIANCE,
+    PLACE,
+    QUATERNION,
+    ResultFilter,
+    covariance_of,
+    newest,
+)
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive import MOST_OPENED, ArchiveUse, page_of
+from service.storage.queries.with_archive import MOST_OPENED, Listing
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import (
@@ -61,15 +68,9 @@ def list_attitudes(
 ) -> Page[AttitudeRow]:
     """The attitudes of current results, recorded and archived, oldest batch time first."""
     chosen = [*selected.conditions(), results.c.status.is_not(None)]
-    return page_of(
-        connection,
-        ArchiveUse(archive, ("solution",), most_opened=MOST_OPENED),
-        attitudes().where(*chosen),
-        selected,
-        limit,
-        attitude_row,
-        cursor=cursor,
-    )
+    query = attitudes().where(*chosen)
+    listing = Listing(archive, query, selected, needs=("solution",), most_opened=MOST_OPENED)
+    return listing.page(connection, limit, cursor, attitude_row)
 
 
 def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:
@@ -85,6 +86,10 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
     row = newest(connection, solved, selected, now)
     last = None if row is None else attitude_row(row)
     is_latest = batch is not None and last is not None and last.id == batch["id"]
+    tracking = None
+    if batch is not None:
+        answer = select(results.c.answer).where(results.c.id == batch["id"])
+        tracking = state_in(connection.execute(answer).scalar_one())
     return SpacecraftRow(
         name=mission.name,
         description=mission.description,
@@ -93,13 +98,8 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
         latest_batch=None if batch is None else summary_of(batch),
         attitude=last if is_latest else None,
         last_attitude=last,
-        tracking=None if batch is None else _tracking(connection, batch["id"]),
+        tracking=tracking,
     )
-
-
-def _tracking(connection: Connection, id: str) -> str | None:
-    answer = connection.execute(select(results.c.answer).where(results.c.id == id)).scalar_one()
-    return state_in(answer)
 
 
 def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen]:
@@ -196,18 +196,13 @@ def attitudes() -> Select[Any]:
 def attitude_row(row: Any) -> AttitudeRow:
     """An attitude in a history: of which batch, at what time, how good."""
     is_measured = row["method"] == METHOD
-    p = {name: row[name] for name in ("p11", "p12", "p13", "p22", "p23", "p33")}
     return AttitudeRow(
         id=row["id"],
         batch=row["batch"],
         time=row["time"],
-        quaternion=[row[name] for name in ("q1", "q2", "q3", "qc")],
+        quaternion=[row[name] for name in QUATERNION],
         frame=row["frame"],
-        covariance_arcsec2=[
-            [p["p11"], p["p12"], p["p13"]],
-            [p["p12"], p["p22"], p["p23"]],
-            [p["p13"], p["p23"], p["p33"]],
-        ],
+        covariance_arcsec2=covariance_of([row[name] for name in COVARIANCE]),
         residual_rms_arcsec=None if is_measured else row["residual_rms_arcsec"],
         predicted_rms_arcsec=None if is_measured else row["predicted_rms_arcsec"],
         taste=None if is_measured else row["taste"],

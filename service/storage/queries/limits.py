@@ -5,35 +5,22 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import Connection, bindparam, insert, select, update
+from sqlalchemy import ColumnElement, Connection, bindparam, insert, select, update
 
+from service.alarms import quantities, subjects
 from service.alarms.limits import LimitSettings
-from service.alarms.quantities import (
-    QUANTITIES,
-    QuantityName,
-    default_limits,
-    limited_names,
-    tracker_names,
-)
-from service.alarms.subjects import (
-    Subject,
-    limits_of_subjects,
-    quantity_and_tracker,
-    sampler,
-    subject_of,
-)
+from service.alarms.quantities import QuantityName
 from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
-from service.storage.queries.pages import ResultFilter, newest
+from service.storage.queries.pages import ResultFilter, newest_first
 from service.storage.recording import events
 from service.storage.sql.alarm_tables import limits
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import prepared
-from service.storage.sql.tables import COUNTED, MEASURED, batches, results, tracker_values
-from service.times import Utc, recorded_utc
+from service.storage.sql.tables import COUNTED, MEASURED, results, tracker_values
 
-LimitsInForce = Mapping[Subject, LimitSettings]
+LimitsInForce = Mapping[subjects.Subject, LimitSettings]
 
 _SHIPPED: dict[tuple[str, tuple[str, ...]], Mapping[QuantityName, LimitSettings]] = {}
 # Run with every batch of a live spacecraft.
@@ -47,16 +34,16 @@ _IN_FORCE = prepared(
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     """The limits in force for a spacecraft and its trackers: own ones in place of the shipped."""
     # Read with every batch; a process meets few missions.
-    key = mission.digest, limited_names()
+    key = mission.digest, quantities.limited_names()
     shipped = _SHIPPED.get(key)
     if shipped is None:
-        shipped = _SHIPPED[key] = default_limits(mission)
+        shipped = _SHIPPED[key] = quantities.default_limits(mission)
     own = {
-        subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
+        subjects.subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
         for row in _in_force(connection, mission.name)
         if row["settings"] is not None
     }
-    return limits_of_subjects(mission, shipped, own)
+    return subjects.limits_of_subjects(mission, shipped, own)
 
 
 @lru_cache(maxsize=256)
@@ -83,15 +70,7 @@ def limit_history(
 ) -> LimitHistory:
     """The limit in force for a quantity, the shipped one, and every one set, newest first."""
     shipped = _inherited(connection, mission, tracker)[quantity]
-    query = (
-        select(limits)
-        .where(
-            limits.c.spacecraft == mission.name,
-            limits.c.quantity == quantity,
-            limits.c.tracker == tracker,
-        )
-        .order_by(limits.c.id.desc())
-    )
+    query = select(limits).where(*_place(mission, quantity, tracker)).order_by(limits.c.id.desc())
     rows = [dict(row) for row in connection.execute(query).mappings()]
     latest = next((row for row in rows if row["until"] is None), None)
     return LimitHistory(
@@ -101,15 +80,20 @@ def limit_history(
     )
 
 
+def _place(mission: Mission, quantity: str, tracker: str) -> tuple[ColumnElement[bool], ...]:
+    c = limits.c
+    return c.spacecraft == mission.name, c.quantity == quantity, c.tracker == tracker
+
+
 def _inherited(
     connection: Connection, mission: Mission, tracker: str
 ) -> Mapping[QuantityName, LimitSettings]:
     """The limits that hold where none was set: the shipped ones, or a tracker's spacecraft's."""
-    shipped = default_limits(mission)
+    shipped = quantities.default_limits(mission)
     if not tracker:
         return shipped
     whole = limits_of(connection, mission)
-    return {name: whole[name] for name in shipped if name in tracker_names()}
+    return {name: whole[name] for name in shipped if name in quantities.tracker_names()}
 
 
 def set_limit(
@@ -124,12 +108,8 @@ def set_limit(
     tracker: str = "",
 ) -> Limit:
     """Set a limit from now on; None restores the shipped one.  The one before stays in history."""
-    place = (
-        limits.c.spacecraft == mission.name,
-        limits.c.quantity == quantity,
-        limits.c.tracker == tracker,
-    )
-    connection.execute(update(limits).where(*place, limits.c.until.is_(None)).values(until=now))
+    before = *_place(mission, quantity, tracker), limits.c.until.is_(None)
+    connection.execute(update(limits).where(*before).values(until=now))
     row = {
         "spacecraft": mission.name,
         "quantity": quantity,
@@ -160,7 +140,7 @@ def shown_limit(
         spacecraft=spacecraft,
         quantity=quantity,
         tracker=tracker or None,
-        unit=QUANTITIES[quantity].unit,
+        unit=quantities.QUANTITIES[quantity].unit,
         is_default=own is None,
         since=row and row["since"],
         who=row and row["who"],
@@ -173,18 +153,11 @@ def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
     return _IN_FORCE.read(connection, {"of_spacecraft": spacecraft})
 
 
-def latest_time(connection: Connection, selected: ResultFilter, now: Utc) -> Utc | None:
-    """The time of the newest batch; None without any."""
-    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
-    row = newest(connection, query, selected, now)
-    return None if row is None else recorded_utc(row["time"])
-
-
 def latest_samples(
-    connection: Connection, selected: ResultFilter, subject: Subject, limit: int
+    connection: Connection, selected: ResultFilter, subject: subjects.Subject, limit: int
 ) -> tuple[list[int], list[Sample]]:
     """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
-    _, tracker = quantity_and_tracker(subject)
+    _, tracker = subjects.quantity_and_tracker(subject)
     values = tracker_values if tracker else results
     columns = [values.c[name] for name in (*COUNTED, "status", *MEASURED)]
     query = select(results.c.time_ns, *columns).where(*selected.conditions())
@@ -192,8 +165,8 @@ def latest_samples(
         same_batch = tracker_values.c.batch_id == results.c.batch_id
         of_tracker = tracker_values.c.tracker == tracker
         query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
-    query = query.order_by(results.c.time_ns.desc(), results.c.batch_id.desc()).limit(limit)
-    sample_of = sampler(subject)
+    query = newest_first(query).limit(limit)
+    sample_of = subjects.sampler(subject)
     rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
     samples = [sample_of(row, {tracker: row}) for row in rows]
     return [row["time_ns"] for row in rows], [each for each in samples if each is not None]

@@ -1,23 +1,24 @@
 """Current results in order of their batches' time, a page at a time."""
 
 import base64
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, RowMapping, Select, tuple_
+from sqlalchemy import ColumnElement, Connection, RowMapping, Select, select
 
 from service.errors import BadBatch, Fault, shown_value
-from service.storage.models.base import Page
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
-from service.storage.sql.tables import results
-from service.times import Utc
-
-T = TypeVar("T")
+from service.storage.sql.tables import batches, results
+from service.times import Utc, recorded_utc
 
 Place = tuple[int, str]
 """The time of a batch, and its id."""
+
+QUATERNION = ("q1", "q2", "q3", "qc")
+COVARIANCE = ("p11", "p12", "p13", "p22", "p23", "p33")
+"""Columns of `solutions`."""
 
 PLACE = (results.c.time_ns, results.c.batch_id)
 """The order of a list.  Columns of the batch, not of the result: adopting changes no order."""
@@ -49,6 +50,12 @@ class ResultFilter:
         return chosen
 
 
+def covariance_of(upper: Sequence[float]) -> list[list[float]]:
+    """The covariance matrix of what its columns `COVARIANCE` hold."""
+    p11, p12, p13, p22, p23, p33 = upper
+    return [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+
+
 def newest(
     connection: Connection, query: Select[Any], selected: ResultFilter, now: Utc
 ) -> RowMapping | None:
@@ -67,35 +74,16 @@ def newest(
     return connection.execute(newest_first(chosen).limit(1)).mappings().first()
 
 
-def newest_first(query: Select[Any], cursor: str | None = None) -> Select[Any]:
-    """The query in descending order of time, from beyond the cursor."""
-    if cursor is not None:
-        query = query.where(tuple_(*PLACE) < tuple_(*read_cursor(cursor)))
+def newest_first(query: Select[Any]) -> Select[Any]:
+    """The query in descending order of time."""
     return query.order_by(*(column.desc() for column in PLACE))
 
 
-def oldest_first(query: Select[Any], cursor: str | None = None) -> Select[Any]:
-    """The query in ascending order of time, from beyond the cursor."""
-    if cursor is not None:
-        query = query.where(tuple_(*PLACE) > tuple_(*read_cursor(cursor)))
-    return query.order_by(*PLACE)
-
-
-def page_of(
-    connection: Connection, query: Select[Any], limit: int, shown: Callable[[Any], T]
-) -> Page[T]:
-    """The first `limit` rows of a query, each as `shown` makes it."""
-    # One row more than asked for tells whether there is another page.
-    rows = list(connection.execute(query.limit(limit + 1)).mappings())
-    more = len(rows) > limit
-    rows = rows[:limit]
-    return Page(
-        [shown(row) for row in rows], cursor_of(_place_of(rows[-1])) if more and rows else None
-    )
-
-
-def _place_of(row: Any) -> Place:
-    return row["time_ns"], row["batch_id"]
+def latest_time(connection: Connection, selected: ResultFilter, now: Utc) -> Utc | None:
+    """The time of the newest batch; None without any."""
+    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
+    row = newest(connection, query, selected, now)
+    return None if row is None else recorded_utc(row["time"])
 
 
 def cursor_of(place: Place) -> str:

@@ -1,7 +1,8 @@
 """The batches of a period: a bounded sample of them, and the arrays that its charts show.
 
 Nothing is identified here.  Directions are computed from what was sent, with the
-settings of the mission as they were for each result.
+settings of the mission as they were for each result.  Batches (b) are in order of time.
+Where something is not known an array has NaN.
 """
 
 from collections.abc import Sequence
@@ -12,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import BigInteger, Connection, Select, bindparam, select
 
+from service import vectors
 from service.acquire.choices import aberration_velocity
-from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
+from service.identify.prior_attitude import PriorAttitude, search_region
 from service.missions.mission import Mission, Tracker
-from service.observations.batch import ObservationBatch, QuaternionPrior
+from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations, correct
 from service.observations.schema import submission_from_json
 from service.sky.catalog.run_catalog import RunCatalog
@@ -23,22 +25,15 @@ from service.sky.ephemeris import apparent, sun_direction
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star
-from service.storage.models.charts import PeriodAttitudes, PeriodStars, TrackerStarsOfPeriod
-from service.storage.queries.pages import PLACE, ResultFilter
+from service.storage.queries.pages import PLACE, ResultFilter, newest_first
 from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json
+from service.storage.queries.star_field import presumed_attitude
 from service.storage.queries.time_buckets import BucketFilter, read_buckets
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.times import HOUR_S, utc_of_unix
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    angle_between_deg,
-    matrix_from_quaternion,
-    unit,
-)
+from service.times import HOUR_S, Utc, utc_of_unix
+from service.vectors import Matrix, Vector
 
 MOST_READ = 600
 """Batches that are read in full: their stars take less than a second."""
@@ -51,6 +46,70 @@ _SHOWN: Select[tuple[str, str, int, str, str]] = select(
     batches.c.input,
 ).join_from(results, batches, results.c.batch_id == batches.c.id)
 _FROM_NS = bindparam("from_ns", type_=BigInteger)
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodAttitudes:
+    """The attitudes of the batches that were read.
+
+    `quaternion` (b, 4) is inertial to body, `covariance_arcsec2` (b, 3, 3) of the error
+    rotation about the body axes.  `status` is `good`, `suspect` or `no_attitude`.
+    `follows` (b,) says whether no other batch lies between one and that before it.
+    """
+
+    time_ns: npt.NDArray[np.int64]
+    time: tuple[str, ...]
+    status: tuple[str, ...]
+    quaternion: Vector
+    covariance_arcsec2: Vector
+    follows: npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerStarsOfPeriod:
+    """The unique stars (n) of one tracker, and where it looked in each batch.
+
+    `place_deg` (n, 2) is h and v on the focal plane.  `residual_arcsec` (n, 2) is
+    observed minus predicted along h and along v, and `expected_arcsec` (n, 2) its
+    standard deviation: the star's sigma less the part of the noise that the
+    attitude takes up.  Both are NaN for a star that the attitude does not use.
+    `boresight` (b, 3) is inertial; without an attitude that of the a priori one.
+    """
+
+    tracker: str
+    field_of_view_radius_deg: float
+    sigma_arcsec: float
+    boresight: Vector
+    place_deg: Vector
+    residual_arcsec: Vector
+    expected_arcsec: Vector
+    observed_mag: Vector
+    catalog_mag: Vector
+    region: SearchRegion | None
+    """Where the stars of the latest batch were searched for."""
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodStars:
+    """What was read of the `total` batches of a period: all, or some where there are many.
+
+    `other_catalog` is how many of those read were identified with a star catalog that
+    the service no longer has; they are without stars here.  `sun` (b, 3) are inertial
+    directions to the Sun.
+    """
+
+    total: int
+    attitudes: PeriodAttitudes
+    trackers: tuple[TrackerStarsOfPeriod, ...]
+    other_catalog: int
+    sun: Vector
+    first: Utc | None
+    last: Utc | None
+
+    @property
+    def read(self) -> int:
+        """The number of batches that were read."""
+        return len(self.attitudes.time)
 
 
 @dataclass(frozen=True)
@@ -80,21 +139,22 @@ def sample_period(
     selected = ResultFilter(span.run, span.spacecraft, span.start, span.end)
     query = _SHOWN.order_by(*PLACE)
     if total <= most:
-        rows = _rows(connection, query.where(*selected.conditions()).limit(most))
+        chosen = query.where(*selected.conditions()).limit(most)
+        rows = tuple(map(dict, connection.execute(chosen).mappings()))
         follows = np.arange(len(rows)) > 0
     else:
         drawn = _drawn_times_ns(hours["unix_s"], hours["batches"], most // 2)
         # The first hour may begin before the period.
         pairs = _pairs(connection, selected, [max(each, span.start.tai_ns) for each in drawn])
-        chosen = {id for pair in pairs for id in pair}
+        drawn_ids = {id for pair in pairs for id in pair}
         # Without the period, through which the ids would be looked for one after another.
-        own = (results.c.current, results.c.batch_id.in_(chosen))
-        rows = _rows(connection, query.where(*own))
+        chosen = query.where(results.c.current, results.c.batch_id.in_(drawn_ids))
+        rows = tuple(map(dict, connection.execute(chosen).mappings()))
         ids = [row["batch_id"] for row in rows]
         follows = np.array([False, *(pair in pairs for pair in pairwise(ids))])
     digests = {row["mission_digest"] for row in rows}
     missions = {digest: recorded_mission(connection, digest) for digest in digests}
-    return PeriodSample(total, follows, tuple(rows), missions)
+    return PeriodSample(total, follows, rows, missions)
 
 
 def _drawn_times_ns(
@@ -120,12 +180,7 @@ def _pairs(
         .order_by(*PLACE)
         .limit(2)
     )
-    backward = (
-        select(results.c.batch_id)
-        .where(*selected.conditions())
-        .order_by(*(column.desc() for column in PLACE))
-        .limit(2)
-    )
+    backward = newest_first(select(results.c.batch_id).where(*selected.conditions())).limit(2)
     found = set()
     for begin_ns in begins_ns:
         pair = [row[0] for row in connection.execute(forward, {"from_ns": begin_ns})]
@@ -133,10 +188,6 @@ def _pairs(
             pair = [row[0] for row in connection.execute(backward)][::-1]
         found.add((pair[0], pair[1]))
     return found
-
-
-def _rows(connection: Connection, query: Select[tuple[str, str, int, str, str]]) -> list[Row]:
-    return [dict(row) for row in connection.execute(query).mappings()]
 
 
 LEAST_EXPECTED = 0.1
@@ -159,25 +210,9 @@ class _Collected:
     region: SearchRegion | None = None
 
 
-class _Catalogs:
-    """Run catalogs by epoch, with the rows of their stars by name."""
-
-    def __init__(self, sky: SkyModel) -> None:
-        self._sky = sky
-        self._rows: dict[str, dict[str, int]] = {}
-
-    def of(self, mission: Mission, batch: ObservationBatch) -> tuple[RunCatalog, dict[str, int]]:
-        run_catalog = self._sky.run_catalog(mission, batch.time)
-        rows = self._rows.get(run_catalog.digest)
-        if rows is None:
-            rows = {name: row for row, name in enumerate(run_catalog.star_id)}
-            self._rows[run_catalog.digest] = rows
-        return run_catalog, rows
-
-
 def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     """Attitudes, boresights, residuals and magnitudes of a sample of batches."""
-    catalogs = _Catalogs(sky)
+    rows_of: dict[str, dict[str, int]] = {}
     read = [
         (
             submission_from_json(row["input"]).batch,
@@ -189,10 +224,13 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     collected: dict[str, _Collected] = {}
     other_catalog = 0
     for place, (batch, answer, mission) in enumerate(read):
-        run_catalog, rows = catalogs.of(mission, batch)
-        is_known = run_catalog.digest == answer.provenance.run_catalog
+        run_catalog = sky.run_catalog(mission, batch.time)
+        digest = run_catalog.digest
+        if digest not in rows_of:
+            rows_of[digest] = {name: row for row, name in enumerate(run_catalog.star_id)}
+        is_known = digest == answer.provenance.run_catalog
         other_catalog += not is_known
-        presumed = _presumed(batch, answer, mission)
+        presumed = presumed_attitude(batch, answer, mission)
         for tracker in mission.trackers:
             into = collected.setdefault(
                 tracker.name, _Collected(tracker, [np.array(_UNKNOWN_DIRECTION)] * len(read))
@@ -203,7 +241,7 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
             into.tracker = seen.tracker
             into.region = _region(seen.tracker, presumed, mission)
             if is_known:
-                _add(into, batch, answer, seen, found.stars, run_catalog, rows)
+                _add(into, batch, answer, seen, found.stars, run_catalog, rows_of[digest])
     times = [batch.time for batch, _, _ in read]
     return PeriodStars(
         total=sample.total,
@@ -216,20 +254,12 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
     )
 
 
-def _presumed(batch: ObservationBatch, answer: Answer, mission: Mission) -> PriorAttitude | None:
-    """The attitude about which stars were searched for; None where nothing gave one."""
-    prior = batch.a_priori
-    if answer.attitude is not None and answer.path != "zone":
-        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
-    return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
-
-
 def _boresight(
     tracker: Tracker, answer: Answer, presumed: PriorAttitude | None, mission: Mission
 ) -> Vector:
     """The direction in which a tracker looked, inertial; NaN where nothing tells it."""
     if answer.attitude is not None:
-        attitude = matrix_from_quaternion(answer.attitude.quaternion)
+        attitude = vectors.matrix_from_quaternion(answer.attitude.quaternion)
     elif presumed is None or not _knows(tracker, presumed, mission):
         return np.array(_UNKNOWN_DIRECTION)
     else:
@@ -239,7 +269,7 @@ def _boresight(
 
 def _knows(tracker: Tracker, presumed: PriorAttitude, mission: Mission) -> bool:
     """True if a priori knowledge tells where a tracker looks: with the roll, or without it."""
-    off_deg = angle_between_deg(tracker.boresight_body, mission.axis_body)
+    off_deg = vectors.angle_between_deg(tracker.boresight_body, mission.axis_body)
     return presumed.roll_known or bool(off_deg <= ALIGNED_DEG)
 
 
@@ -274,7 +304,7 @@ def _add(
     into.catalog_mag.append(run_catalog.magnitude_mag[row])
     residual, expected = np.full((2, len(own), 2), np.nan)
     if answer.attitude is not None:
-        to_tracker = turned.T @ matrix_from_quaternion(answer.attitude.quaternion)
+        to_tracker = turned.T @ vectors.matrix_from_quaternion(answer.attitude.quaternion)
         natural = run_catalog.direction_at(batch.time)[row]
         predicted = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
         covariance = turned.T @ np.array(answer.attitude.covariance_arcsec2) @ turned
@@ -294,9 +324,9 @@ def _residuals(
     the tangent h by e . v and along v by -e . h.  The optimal attitude takes up just so
     much of the star's own noise, so that sigma^2 - v' P v remains along h.
     """
-    along_h = unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
+    along_h = vectors.unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
     along_v = np.cross(direction, along_h)
-    off = (direction - predicted) * ARCSEC_PER_RADIAN
+    off = (direction - predicted) * vectors.ARCSEC_PER_RADIAN
     residual = np.stack([np.sum(off * along_h, axis=1), np.sum(off * along_v, axis=1)], axis=1)
     taken = np.stack(
         [

@@ -15,7 +15,7 @@ from service.storage.archive.reading import Archive, PlacedPart
 from service.storage.models.answers import Answer
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result
-from service.storage.queries.with_archive import ArchiveUse, bounds_of, count_of_part, parts_of
+from service.storage.queries.with_archive import bounds_of, count_of_part, parts_of
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 
@@ -50,8 +50,19 @@ def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, A
 
 def recorded_mission(connection: Connection, digest: str) -> Mission:
     """A mission as its settings were when their digest was recorded."""
-    query = select(missions.c.settings).where(missions.c.digest == digest)
-    return Mission.model_validate_json(connection.execute(query).scalar_one())
+    mission = _MISSIONS.get(digest)
+    if mission is None:
+        query = select(missions.c.settings).where(missions.c.digest == digest)
+        mission = Mission.model_validate_json(connection.execute(query).scalar_one())
+        if len(_MISSIONS) >= _MOST_MISSIONS:
+            _MISSIONS.clear()
+        _MISSIONS[digest] = mission
+    return mission
+
+
+# What a digest stands for never changes.
+_MISSIONS: dict[str, Mission] = {}
+_MOST_MISSIONS = 64
 
 
 def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -> ObservationBatch:
@@ -86,9 +97,7 @@ def sample_batches(
     always or never; the same seed draws the same.  The archived ones count as the earlier.
     """
     conditions = selected.conditions()
-    parts = sorted(
-        parts_of(connection, ArchiveUse(archive), selected), key=lambda each: each.first_ns
-    )
+    parts = sorted(parts_of(connection, selected), key=lambda each: each.first_ns)
     ends = np.cumsum([0, *(count_of_part(archive, part, selected) for part in parts)])
     recorded = int(connection.scalar(select(func.count()).where(*conditions)) or 0)
     total = int(ends[-1]) + recorded

@@ -8,33 +8,25 @@ from msgspec import structs
 from sqlalchemy import Connection, insert, select, update
 
 from service.errors import NotFound, WrongState, shown_value
-from service.storage.models.runs import (
-    RefusedLine,
-    Replay,
-    ReplayCounts,
-    ReplayLines,
-    ReplayPackets,
-    ReplayProgress,
-    ReplayStateName,
-)
+from service.storage.models import runs
 from service.storage.recording import events
 from service.storage.sql.tables import replays, rollups_daily
 
 MAX_LISTED = 100
-CANCELLED: ReplayStateName = "cancelled"
-UNFINISHED: tuple[ReplayStateName, ...] = ("running", "waiting")
+CANCELLED: runs.ReplayStateName = "cancelled"
+UNFINISHED: tuple[runs.ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
 """The gyro counts of packets that an earlier version counted."""
-_NO_COUNTS = dict.fromkeys(ReplayCounts.__struct_fields__, 0)
+_NO_COUNTS = dict.fromkeys(runs.ReplayCounts.__struct_fields__, 0)
 
 
-def find_replay(connection: Connection, id: str) -> Replay | None:
+def find_replay(connection: Connection, id: str) -> runs.Replay | None:
     """A replay and its progress; None where there is none."""
     row = connection.execute(select(replays).where(replays.c.id == id)).mappings().first()
     return None if row is None else _replay(row)
 
 
-def read_replay(connection: Connection, id: str) -> Replay:
+def read_replay(connection: Connection, id: str) -> runs.Replay:
     """A replay and its progress; raises `NotFound`."""
     replay = find_replay(connection, id)
     if replay is None:
@@ -42,7 +34,9 @@ def read_replay(connection: Connection, id: str) -> Replay:
     return replay
 
 
-def list_replays(connection: Connection, spacecraft: Collection[str] | None = None) -> list[Replay]:
+def list_replays(
+    connection: Connection, spacecraft: Collection[str] | None = None
+) -> list[runs.Replay]:
     """The latest replays and their progress, newest first.
 
     With `spacecraft`, those into runs that hold batches of these alone.
@@ -56,27 +50,29 @@ def list_replays(connection: Connection, spacecraft: Collection[str] | None = No
     return [_replay(row) for row in connection.execute(query).mappings()]
 
 
-def _replay(row: Any) -> Replay:
+def _replay(row: Any) -> runs.Replay:
     # A row of an earlier version may have no counts.
     counts = _NO_COUNTS | msgspec.json.decode(row["counts"] or "{}")
     packets = counts.pop("packets", None)
-    return Replay(
+    return runs.Replay(
         id=row["id"],
         run=row["run"],
         name=row["name"],
         state=row["state"],
-        lines=ReplayLines(
+        lines=runs.ReplayLines(
             total=row["lines_total"], done=row["lines_done"], refused=row["lines_refused"]
         ),
-        counts=msgspec.convert(counts, ReplayCounts),
-        packets=None if packets is None else msgspec.convert(_NO_GYRO | packets, ReplayPackets),
-        errors=msgspec.json.decode(row["errors"], type=list[RefusedLine]),
+        counts=msgspec.convert(counts, runs.ReplayCounts),
+        packets=None
+        if packets is None
+        else msgspec.convert(_NO_GYRO | packets, runs.ReplayPackets),
+        errors=msgspec.json.decode(row["errors"], type=list[runs.RefusedLine]),
         started=row["started"],
         finished=row["finished"],
     )
 
 
-def insert_replay(connection: Connection, replay: Replay) -> None:
+def insert_replay(connection: Connection, replay: runs.Replay) -> None:
     """Add a replay."""
     row = {
         "id": replay.id,
@@ -92,16 +88,16 @@ def insert_replay(connection: Connection, replay: Replay) -> None:
 
 def update_replay(
     connection: Connection,
-    progress: ReplayProgress,
-    packets: ReplayPackets | None,
-    errors: list[RefusedLine] | None,
+    progress: runs.ReplayProgress,
+    packets: runs.ReplayPackets | None,
+    errors: list[runs.RefusedLine] | None,
 ) -> None:
     """Store the progress of a replay, and the refused lines unless they are None."""
     values = _progress(progress, packets) | ({} if errors is None else _errors(errors))
     connection.execute(update(replays).where(replays.c.id == progress.id).values(values))
 
 
-def _progress(progress: ReplayProgress, packets: ReplayPackets | None) -> dict[str, Any]:
+def _progress(progress: runs.ReplayProgress, packets: runs.ReplayPackets | None) -> dict[str, Any]:
     counts = msgspec.to_builtins(progress.counts)
     if packets is not None:
         counts["packets"] = msgspec.to_builtins(packets)
@@ -114,7 +110,7 @@ def _progress(progress: ReplayProgress, packets: ReplayPackets | None) -> dict[s
     }
 
 
-def _errors(errors: list[RefusedLine]) -> dict[str, str]:
+def _errors(errors: list[runs.RefusedLine]) -> dict[str, str]:
     return {"errors": msgspec.json.encode(errors).decode()}
 
 

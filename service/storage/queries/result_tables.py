@@ -12,15 +12,14 @@ from service.alarms.quantities import QUANTITIES
 from service.products.attitudes import AttitudeRows
 from service.products.tables import Column, Page, Table
 from service.storage.archive.reading import Archive
-from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.queries.with_archive import ArchiveUse, Reading, all_rows, row_pages
+from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter
+from service.storage.queries.with_archive import Listing, Reading, all_rows
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, solutions, star_results
 from service.vectors import Vector
 
 PAGE = 5_000
 """Rows that are read together."""
 
-_SOLVED = ("q1", "q2", "q3", "qc", "p11", "p12", "p13", "p22", "p23", "p33")
 _QUALITY = ("residual_rms_arcsec", "predicted_rms_arcsec")
 _QUERY: Select[Any] = (
     select(
@@ -31,7 +30,7 @@ _QUERY: Select[Any] = (
         batches.c.time,
         batches.c.input,
         solutions.c.method,
-        *(solutions.c[name] for name in (*_SOLVED, *_QUALITY)),
+        *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE, *_QUALITY)),
         *(results.c[name] for name in COUNTED),
     )
     .join_from(results, batches, results.c.batch_id == batches.c.id)
@@ -40,12 +39,11 @@ _QUERY: Select[Any] = (
 
 
 class _Rates(msgspec.Struct):
-    """The rates of a recorded input."""
-
     body_rates_deg_per_s: tuple[float, float, float] | None = None
 
 
-_RATES = msgspec.json.Decoder(_Rates)
+RATES = msgspec.json.Decoder(_Rates)
+"""Reads the rates of a recorded input."""
 _UNKNOWN = (np.nan, np.nan, np.nan)
 
 
@@ -63,16 +61,9 @@ def attitude_pages(
 
     Between two pages no connection is held, so that a slow reader keeps none from others.
     """
-    use = ArchiveUse(archive, ("input", "solution"))
-    pages = row_pages(
-        reading,
-        use,
-        _QUERY.where(*selected.conditions()),
-        selected,
-        page,
-        newest_first=newest_first,
-    )
-    return map(_columns, pages)
+    query = _QUERY.where(*selected.conditions())
+    listing = Listing(archive, query, selected, newest_first, needs=("input", "solution"))
+    return map(_columns, listing.row_pages(reading, page))
 
 
 def _columns(rows: Sequence[Any]) -> AttitudeRows:
@@ -80,7 +71,7 @@ def _columns(rows: Sequence[Any]) -> AttitudeRows:
     values = np.array(numbers, dtype=np.float64)
     # In the table they are zero.
     values[10:12, np.array(method, dtype=object) == METHOD] = np.nan
-    rates = [_RATES.decode(each).body_rates_deg_per_s for each in sent]
+    rates = [RATES.decode(each).body_rates_deg_per_s for each in sent]
     return AttitudeRows(
         time_ns=np.array(time_ns, dtype=np.int64),
         time=_texts(time),
@@ -159,10 +150,10 @@ def batch_table(
         for each in BATCH_COLUMNS
     ]
     query = select(*PLACE, *read).join_from(results, batches, results.c.batch_id == batches.c.id)
-    chosen = selected.conditions()
+    listing = Listing(archive, query.where(*selected.conditions()), selected)
     pages = (
         _table_columns([row[len(PLACE) :] for row in rows])
-        for rows in row_pages(reading, ArchiveUse(archive), query.where(*chosen), selected, BATCHES)
+        for rows in listing.row_pages(reading, BATCHES)
     )
     return Table(BATCH_COLUMNS, pages, {"product": "batches", **about})
 
@@ -187,11 +178,12 @@ def _stars(reading: Reading, archive: Archive, selected: ResultFilter) -> Iterat
         .join(batches, results.c.batch_id == batches.c.id)
         .order_by(*PLACE, star_results.c.tracker, star_results.c.position)
     )
-    use = ArchiveUse(archive, ("stars",))
-    for rows in row_pages(reading, use, ids, selected, BATCHES_OF_STARS):
+    listing = Listing(archive, ids, selected, needs=("stars",))
+    for rows in listing.row_pages(reading, BATCHES_OF_STARS):
         chosen = query.where(star_results.c.result_id.in_([row[-1] for row in rows]))
         with reading() as connection:
-            stars = all_rows(connection, use, chosen, [row[: len(PLACE)] for row in rows])
+            places_of = [row[: len(PLACE)] for row in rows]
+            stars = all_rows(connection, archive, ("stars",), chosen, places_of)
         if stars:
             yield _table_columns([row[len(PLACE) :] for row in stars])
 

@@ -11,35 +11,14 @@ from sqlalchemy import ColumnElement, Connection, Select, or_, select
 from service.alarms.quantities import QUANTITIES, value_names
 from service.errors import Busy, NotFound, WrongState, shown_value
 from service.storage.archive.reading import Archive, parts_with
-from service.storage.models.answers import (
-    Answer,
-    FrameWithStars,
-    Neighbours,
-    Result,
-    StarCounts,
-    Summary,
-)
+from service.storage.models import answers
 from service.storage.models.base import Page
+from service.storage.queries import with_archive
 from service.storage.queries.pages import ResultFilter, newest
-from service.storage.queries.with_archive import (
-    FIRST_ID,
-    LAST_ID,
-    MOST_OPENED,
-    ArchiveUse,
-    first_rows,
-    page_of,
-)
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_what_ifs,
-    batches,
-    frames,
-    missions,
-    results,
-    runs,
-)
+from service.storage.sql.tables import batches, results
 from service.times import Utc
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
@@ -56,7 +35,7 @@ def list_batches(
     batch: str | None,
     limit: int,
     cursor: str | None,
-) -> Page[Summary]:
+) -> Page[answers.Summary]:
     """Current results, recorded and archived, newest batch time first.
 
     `outcome` keeps batches with at least one star of it; `status` those whose
@@ -71,16 +50,15 @@ def list_batches(
     parts = None
     if batch is not None:
         parts = parts_with(connection, selected.spacecraft, selected.run, batch)
-    return page_of(
-        connection,
-        ArchiveUse(archive, most_opened=MOST_OPENED, parts=parts),
+    listing = with_archive.Listing(
+        archive,
         summary_query().where(*chosen),
         selected,
-        limit,
-        summary_of,
         newest_first=True,
-        cursor=cursor,
+        most_opened=with_archive.MOST_OPENED,
+        parts=parts,
     )
+    return listing.page(connection, limit, cursor, summary_of)
 
 
 def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str | None:
@@ -94,7 +72,7 @@ def _conditions(selected: ResultFilter, batch: str | None) -> list[ColumnElement
         return selected.conditions()
     # The unique index begins with spacecraft and run: neither is left open.  Both are asked of the
     # batch alone: asked of its result, they lead SQLite through all results of the spacecraft.
-    in_runs = select(runs.c.name) if selected.run is None else [selected.run]
+    in_runs = select(tables.runs.c.name) if selected.run is None else [selected.run]
     ids = select(batches.c.id).where(
         batches.c.spacecraft == selected.spacecraft,
         batches.c.run.in_(in_runs),
@@ -130,8 +108,8 @@ def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) 
 
 def _archived(id: str) -> Select[tuple[str]]:
     """The query for the spacecraft of an archived result."""
-    what_if = select(archived_what_ifs.c.batch_id).where(archived_what_ifs.c.id == id)
-    c = archived_batches.c
+    what_if = select(tables.archived_what_ifs.c.batch_id).where(tables.archived_what_ifs.c.id == id)
+    c = tables.archived_batches.c
     return select(c.spacecraft).where(or_(c.id == id, c.id == what_if.scalar_subquery()))
 
 
@@ -144,7 +122,7 @@ def spacecraft_of(connection: Connection, id: str) -> str | None:
     return None
 
 
-def read_record(connection: Connection, id: str, *, archived: bool = False) -> Result:
+def read_record(connection: Connection, id: str, *, archived: bool = False) -> answers.Result:
     """A result with its input and the what-ifs of its batch; raises `NotFound`.
 
     `archived` says that the connection is to a batch of the archive.
@@ -155,11 +133,11 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> R
         .where(results.c.batch_id == row["batch_id"], results.c.parent_id.is_not(None))
         .order_by(results.c.id)
     )
-    of_frame = select(frames.c.summary, frames.c.detections).where(
-        frames.c.batch_id == row["batch_id"]
+    of_frame = select(tables.frames.c.summary, tables.frames.c.detections).where(
+        tables.frames.c.batch_id == row["batch_id"]
     )
     frame = connection.execute(of_frame).mappings().first()
-    return Result(
+    return answers.Result(
         answer=answer_from_json(row["answer"]),
         input=json.loads(row["input"]),
         options=json.loads(row["options"]),
@@ -175,17 +153,17 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> R
     )
 
 
-def answer_from_json(text: str | bytes) -> Answer:
+def answer_from_json(text: str | bytes) -> answers.Answer:
     """A stored answer, which may be of an earlier version of the service."""
     return _ANSWERS.decode(text)
 
 
-_ANSWERS = msgspec.json.Decoder(Answer)
+_ANSWERS = msgspec.json.Decoder(answers.Answer)
 
 
-def _frame_of(row: Any) -> FrameWithStars:
+def _frame_of(row: Any) -> answers.FrameWithStars:
     fields = json.loads(row["summary"]) | json.loads(row["detections"])
-    return msgspec.convert(fields, FrameWithStars)
+    return msgspec.convert(fields, answers.FrameWithStars)
 
 
 def frame_of_result(connection: Connection, id: str) -> Row:
@@ -199,15 +177,15 @@ def frame_of_result(connection: Connection, id: str) -> Row:
             results.c.answer,
             results.c.catalog_digest,
             batches.c.input,
-            frames.c.detections,
-            frames.c.preview,
-            frames.c.preview_step,
-            missions.c.settings,
+            tables.frames.c.detections,
+            tables.frames.c.preview,
+            tables.frames.c.preview_step,
+            tables.missions.c.settings,
         )
         .select_from(
             results.join(batches, results.c.batch_id == batches.c.id)
-            .join(frames, frames.c.batch_id == batches.c.id)
-            .join(missions, missions.c.digest == results.c.mission_digest)
+            .join(tables.frames, tables.frames.c.batch_id == batches.c.id)
+            .join(tables.missions, tables.missions.c.digest == results.c.mission_digest)
         )
         .where(results.c.id == id)
     )
@@ -224,9 +202,9 @@ def summary_query() -> Select[Any]:
     return select(*kept, *named).join_from(results, batches)
 
 
-def summary_of(row: Any) -> Summary:
+def summary_of(row: Any) -> answers.Summary:
     """A result in a list, without its stars and its attitude."""
-    return Summary(**summary_fields(row))
+    return answers.Summary(**summary_fields(row))
 
 
 def summary_fields(row: Any) -> Row:
@@ -235,7 +213,7 @@ def summary_fields(row: Any) -> Row:
     return {
         **{name: row[name] for name in taken},
         "options": json.loads(row["options"]),
-        "counts": StarCounts(**{name: row[name] for name in STARS}),
+        "counts": answers.StarCounts(**{name: row[name] for name in STARS}),
         "status": row["status"],
         "reason": row["reason"],
         "measures": measured(row),
@@ -267,28 +245,21 @@ def place_of(connection: Connection, id: str) -> ResultPlace:
     return ResultPlace(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
 
 
-def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> Neighbours:
+def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> answers.Neighbours:
     """The results before and after one in time, of its spacecraft and run."""
     sides = (_next(connection, archive, place, newest_first=side) for side in (True, False))
-    return Neighbours(place.current, *sides)
+    return answers.Neighbours(place.current, *sides)
 
 
 def _next(
     connection: Connection, archive: Archive, place: ResultPlace, *, newest_first: bool
-) -> Summary | None:
+) -> answers.Summary | None:
     selected = ResultFilter(place.run, place.spacecraft)
-    beyond = place.time_ns, FIRST_ID if newest_first else LAST_ID
+    beyond = place.time_ns, with_archive.FIRST_ID if newest_first else with_archive.LAST_ID
     query = summary_query().where(*selected.conditions())
+    listing = with_archive.Listing(archive, query, selected, newest_first)
     try:
-        found = first_rows(
-            connection,
-            ArchiveUse(archive),
-            query,
-            selected,
-            1,
-            newest_first=newest_first,
-            beyond=beyond,
-        )
+        found = listing.first_rows(connection, 1, beyond)
     except Busy:
         # Without the archive the page of a recorded batch is shown all the same.
         return None

@@ -1,48 +1,92 @@
 """The stars of a batch in each tracker's field of view, and its trackers side by side.
 
 Nothing is identified here: the outcomes are those of the answer that is shown, so
-that the chart of an old result shows that result.
+that the chart of an old result shows that result.  Directions are given as `h_deg`, `v_deg`:
+that of (tan h, tan v, 1) in the tracker's axes.
 """
 
 import math
 
 import numpy as np
-from erfa import ufunc
+from msgspec import Struct
 
+from service import vectors
+from service.acquire.choices import aberration_velocity
 from service.errors import BadBatch, Fault
 from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch, QuaternionPrior
 from service.observations.calibrate import CorrectedObservations, correct
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.ephemeris import observer_velocity, sun_distance_au
+from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.models.charts import (
-    Boresight,
-    CatalogStarPlace,
-    ObservedStarPlace,
-    StarField,
-    TrackerField,
-)
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    angle_between_deg,
-    matrix_from_quaternion,
-    to_ra_dec,
-    unit,
-)
+from service.vectors import Matrix, Vector
 
 MARGIN = 1.25
 """How far beyond the field of view stars are given, in fields of view."""
 WIDEST_DEG = 15.0
 """Where stars of the answer lie far outside, the picture grows, but no further than this."""
 EDGE_STEP_DEG = 0.5
+
+
+class Boresight(Struct, frozen=True, kw_only=True):
+    """The boresight in the inertial frame."""
+
+    ra_deg: float
+    dec_deg: float
+
+
+class CatalogStarPlace(Struct, frozen=True, kw_only=True):
+    """A catalog star in the field of view."""
+
+    id: str
+    magnitude: float
+    h_deg: float
+    v_deg: float
+
+
+class ObservedStarPlace(Struct, frozen=True, kw_only=True):
+    """An observed star with its outcome; `residual_arcsec` is observed minus predicted.
+
+    The residual is along h and along v, None if the attitude does not use the star.
+    """
+
+    outcome: str
+    star: str | None
+    rivals: list[str]
+    magnitude: float | None
+    h_deg: float
+    v_deg: float
+    residual_arcsec: tuple[float, float] | None
+
+
+class TrackerField(Struct, frozen=True, kw_only=True):
+    """The view of one tracker; `zone_edges` are lines of [h, v] in degrees."""
+
+    tracker: str
+    boresight: Boresight
+    field_of_view_radius_deg: float
+    radius_deg: float
+    magnitude_limit_mag: float
+    zone_edges: list[list[list[float]]]
+    catalog: list[CatalogStarPlace]
+    observed: list[ObservedStarPlace]
+
+
+class StarField(Struct, frozen=True, kw_only=True):
+    """The views of all trackers of a batch.
+
+    `through` is "quest", "triad" or "a_priori": the attitude by which catalog stars are drawn.
+    `same_catalog` says whether the run catalog is the one of the answer.
+    """
+
+    through: str
+    same_catalog: bool
+    trackers: list[TrackerField]
 
 
 def star_field_of(
@@ -54,15 +98,14 @@ def star_field_of(
     a priori attitude does, and the stars are displaced by its error.  Raises `BadInput`
     for a batch that does not fit the mission.
     """
-    solved, prior = answer.attitude, batch.a_priori
-    if solved is not None and answer.path != "zone":
-        # The whole sky gave the attitude that stars were looked for about.
-        prior = QuaternionPrior(np.array(solved.quaternion))
-    if prior is None:
+    solved = answer.attitude
+    presumed = presumed_attitude(batch, answer, mission)
+    if presumed is None:
         message = "nothing is known of the attitude, neither beforehand nor from the stars"
         raise BadBatch(Fault("a_priori", message, "null"))
-    presumed = prior_attitude(prior, batch.time, mission, batch.position_km)
-    attitude = presumed.attitude if solved is None else matrix_from_quaternion(solved.quaternion)
+    attitude = (
+        presumed.attitude if solved is None else vectors.matrix_from_quaternion(solved.quaternion)
+    )
     run_catalog = sky.run_catalog(mission, batch.time)
     rows = {name: row for row, name in enumerate(run_catalog.star_id)}
     trackers = zip(correct(batch, mission), answer.observations, strict=True)
@@ -74,6 +117,17 @@ def star_field_of(
             for index, (each, found) in enumerate(trackers)
         ],
     )
+
+
+def presumed_attitude(
+    batch: ObservationBatch, answer: Answer, mission: Mission
+) -> PriorAttitude | None:
+    """The attitude about which stars were searched for; None where nothing gave one."""
+    prior = batch.a_priori
+    if answer.attitude is not None and answer.path != "zone":
+        # The whole sky gave it.
+        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
+    return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
 
 
 def _tracker(
@@ -96,8 +150,9 @@ def _tracker(
     near = _near(run_catalog, region, to_tracker[2], radius_deg)
     shown = np.union1d(near, np.array(list(named.values()), np.int64))
     natural = run_catalog.direction_at(batch.time)[shown]
-    apparent = dict(zip(shown.tolist(), _apparent(natural, batch) @ to_tracker.T, strict=True))
-    ra_deg, dec_deg = to_ra_dec(to_tracker[2])
+    seen_at = apparent(natural, aberration_velocity(batch), batch.time) @ to_tracker.T
+    place_of = dict(zip(shown.tolist(), seen_at, strict=True))
+    ra_deg, dec_deg = vectors.to_ra_dec(to_tracker[2])
     return TrackerField(
         tracker=tracker.name,
         boresight=Boresight(ra_deg=float(ra_deg), dec_deg=float(dec_deg)),
@@ -111,7 +166,7 @@ def _tracker(
                 magnitude=float(run_catalog.magnitude_mag[row]),
                 **_angles(direction),
             )
-            for row, direction in apparent.items()
+            for row, direction in place_of.items()
             if direction[2] > 0
         ],
         observed=[
@@ -120,7 +175,7 @@ def _tracker(
                 star=None if star.star is None else star.star.id,
                 rivals=list(star.rivals or []),
                 magnitude=_number(corrected.magnitude_mag[k]),
-                residual_arcsec=_residual(seen[k], star, rows, apparent),
+                residual_arcsec=_residual(seen[k], star, rows, place_of),
                 **_angles(seen[k]),
             )
             for k, star in enumerate(found.stars)
@@ -136,7 +191,7 @@ def _radius_deg(tracker: Tracker, seen: Vector, named: Vector, to_tracker: Matri
     """How far from the boresight the picture reaches: all that the answer speaks of, if it can."""
     boresight = np.array([0.0, 0.0, 1.0])
     spoken_of = np.concatenate([seen, named @ to_tracker.T])
-    farthest = float(np.max(angle_between_deg(spoken_of, boresight), initial=0.0))
+    farthest = float(np.max(vectors.angle_between_deg(spoken_of, boresight), initial=0.0))
     wide = tracker.field_of_view_radius_deg * MARGIN
     return max(wide, min(farthest * 1.05, WIDEST_DEG))
 
@@ -147,18 +202,8 @@ def _near(
     """Rows of the stars of the zone within the picture, its corners included."""
     most = min(90.0, radius_deg * math.sqrt(2.0))
     near = np.flatnonzero(run_catalog.direction @ boresight >= math.cos(math.radians(most)))
-    angle = angle_between_deg(run_catalog.direction[near], region.axis)
+    angle = vectors.angle_between_deg(run_catalog.direction[near], region.axis)
     return np.asarray(near[(angle >= region.least_deg) & (angle <= region.most_deg)])
-
-
-def _apparent(natural: Vector, batch: ObservationBatch) -> Vector:
-    """Catalog directions as the moving observer sees them, where the batch asks for it."""
-    if batch.aberration != "to_correct":
-        return natural
-    velocity = observer_velocity(batch.time, batch.velocity_km_per_s)
-    inverse_lorentz = math.sqrt(1.0 - float(velocity @ velocity))
-    seen = ufunc.ab(natural, velocity, sun_distance_au(batch.time), inverse_lorentz)
-    return np.asarray(seen, dtype=np.float64)
 
 
 def _zone_edges(
@@ -166,7 +211,7 @@ def _zone_edges(
 ) -> list[list[list[float]]]:
     """The bounds of the zone where they cross the picture, as lines of [h, v] in degrees."""
     axis = to_tracker @ region.axis
-    first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
+    first = vectors.unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
     lines: list[list[list[float]]] = []
     for bound_deg in (region.least_deg, region.most_deg):
@@ -184,14 +229,14 @@ def _zone_edges(
 
 
 def _residual(
-    seen: Vector, star: Star, rows: dict[str, int], apparent: dict[int, Vector]
+    seen: Vector, star: Star, rows: dict[str, int], place_of: dict[int, Vector]
 ) -> tuple[float, float] | None:
     row = rows.get(star.star.id) if star.star else None
     if star.residual_arcsec is None or row is None:
         return None
-    along_h = unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
+    along_h = vectors.unit(np.array([1.0, 0.0, 0.0]) - seen[0] * seen)
     along_v = np.cross(seen, along_h)
-    off = (seen - apparent[row]) * ARCSEC_PER_RADIAN
+    off = (seen - place_of[row]) * vectors.ARCSEC_PER_RADIAN
     return float(off @ along_h), float(off @ along_v)
 
 

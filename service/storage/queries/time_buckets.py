@@ -5,31 +5,34 @@ days and hours come from the rollups; smaller buckets, and what a period cuts
 off at its ends, are summed up by the database from the batches themselves.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
 import numpy as np
-from sqlalchemy import BigInteger, Connection, Select, Table, bindparam, case, func, select
-
-from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
-from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTS,
-    ROLLED_UP,
-    archived_parts,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    tracker_rollups_daily,
-    tracker_rollups_hourly,
-    tracker_values,
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Connection,
+    Select,
+    Table,
+    bindparam,
+    case,
+    func,
+    select,
 )
-from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
-from service.vectors import Matrix, Vector
 
-Level = Literal["hour", "day"]
+from service.errors import BadInput, Fault
+from service.storage.models.spacecraft import Rates
+from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
+from service.storage.sql import tables
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import results
+from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, bucket_start, unix_seconds
+from service.vectors import Vector
+
+Bucket = Literal["hour", "day"]
 Columns = dict[str, Vector]
 """`unix_s`, at which each bucket begins, and columns of a rollup."""
 Names = tuple[str, ...]
@@ -37,11 +40,23 @@ Names = tuple[str, ...]
 MAX_BATCHES_SUMMED = 10_000
 """The most batches of a period of hours in one answer; a longer one is shown by the hour."""
 
-_WIDTH_S: dict[Level, int] = {"hour": HOUR_S, "day": DAY_S}
-_ROLLUPS: dict[Level, Table] = {"hour": rollups_hourly, "day": rollups_daily}
-_TRACKER_ROLLUPS: dict[Level, Table] = {
-    "hour": tracker_rollups_hourly,
-    "day": tracker_rollups_daily,
+
+MAX_RATES = 20_000
+"""The most buckets of one answer: two years of hours, or half a century of days."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """The rollups of one width: of spacecraft, and of their trackers."""
+
+    table: Table
+    tracker_table: Table
+    width_s: int
+
+
+TRENDS: dict[Bucket, Trend] = {
+    "hour": Trend(tables.rollups_hourly, tables.tracker_rollups_hourly, HOUR_S),
+    "day": Trend(tables.rollups_daily, tables.tracker_rollups_daily, DAY_S),
 }
 
 
@@ -61,7 +76,7 @@ class BucketFilter:
 
 def batches_about(connection: Connection, span: BucketFilter) -> int:
     """The batches of all hours that a span touches: at least as many as it holds."""
-    table = rollups_hourly.c
+    table = tables.rollups_hourly.c
     query = select(func.sum(table.batches)).where(
         table.spacecraft == span.spacecraft,
         table.run == span.run,
@@ -73,7 +88,7 @@ def batches_about(connection: Connection, span: BucketFilter) -> int:
 
 def has_archived(connection: Connection, span: BucketFilter) -> bool:
     """True if a span has archived batches, which only the rollups count."""
-    c = archived_parts.c
+    c = tables.archived_parts.c
     query = select(c.id).where(
         c.spacecraft == span.spacecraft,
         c.run == span.run,
@@ -84,11 +99,13 @@ def has_archived(connection: Connection, span: BucketFilter) -> bool:
 
 
 def read_buckets(
-    connection: Connection, span: BucketFilter, level: Level, names: Names = ROLLED_UP
+    connection: Connection, span: BucketFilter, level: Bucket, names: Names = tables.ROLLED_UP
 ) -> Columns:
     """The buckets of a span, in order of time; those without a batch are left out."""
-    width_s = _WIDTH_S[level]
-    first, last = (_at_or_after(span.start, width_s), span.end.bucket(width_s))
+    width_s = TRENDS[level].width_s
+    first = span.start.bucket(width_s)
+    first += bucket_start(first, width_s).tai_ns < span.start.tai_ns
+    last = span.end.bucket(width_s)
     if first > last:
         return _finer(connection, span, level, names)
     begin, end = bucket_start(first, width_s), bucket_start(last, width_s)
@@ -101,7 +118,7 @@ def read_buckets(
     )
 
 
-def _finer(connection: Connection, span: BucketFilter, level: Level, names: Names) -> Columns:
+def _finer(connection: Connection, span: BucketFilter, level: Bucket, names: Names) -> Columns:
     """Buckets of less than an hour or day, which the span does not fill or leave."""
     if level == "day":
         return read_buckets(connection, span, "hour", names)
@@ -109,7 +126,7 @@ def _finer(connection: Connection, span: BucketFilter, level: Level, names: Name
 
 
 def read_steps(
-    connection: Connection, span: BucketFilter, width_s: int, names: Names = ROLLED_UP
+    connection: Connection, span: BucketFilter, width_s: int, names: Names = tables.ROLLED_UP
 ) -> Columns:
     """Buckets of so much of a UTC day each, summed up by the database from the batches.
 
@@ -117,61 +134,86 @@ def read_steps(
     of them than a row for each bucket.
     """
     parts = [_steps_of([], span.start, width_s, names)]
-    day, begin = span.start.bucket(DAY_S), span.start
-    while begin.tai_ns < span.end.tai_ns:
-        # Each day by itself: between two of them there may be a leap second.
-        midnight, next_midnight = bucket_start(day, DAY_S), bucket_start(day + 1, DAY_S)
-        end = next_midnight if next_midnight.tai_ns < span.end.tai_ns else span.end
-        asked = _asked(replace(span, start=begin, end=end)) | {
-            "midnight_ns": midnight.tai_ns,
-            "width_ns": width_s * 10**9,
-            "last": DAY_S // width_s - 1,
-        }
-        query = _steps_query(names, span.tracker is not None)
-        rows = connection.execute(query, asked).all()
+    query = _steps_query(names, span.tracker is not None)
+    for midnight, asked in steps_by_day(span.start, span.end, width_s):
+        rows = connection.execute(query, _owner(span) | asked).all()
         parts.append(_steps_of(rows, midnight, width_s, names))
-        day, begin = day + 1, end
     return _joined(parts)
 
 
-@cache
-def _steps_query(names: Names, of_tracker: bool) -> Select[Any]:
+def steps_by_day(start: Utc, end: Utc, width_s: int) -> Iterator[tuple[Utc, Row]]:
+    """The midnight of each day of a period, and the values of `STEP` and `IN_PERIOD` for it.
+
+    Each day is read by itself: between two of them there may be a leap second.
+    """
+    day, begin_ns = start.bucket(DAY_S), start.tai_ns
+    while begin_ns < end.tai_ns:
+        midnight = bucket_start(day, DAY_S)
+        day += 1
+        end_ns = min(bucket_start(day, DAY_S).tai_ns, end.tai_ns)
+        yield (
+            midnight,
+            {
+                "start_ns": begin_ns,
+                "end_ns": end_ns,
+                "midnight_ns": midnight.tai_ns,
+                "width_ns": width_s * 10**9,
+                "last": DAY_S // width_s - 1,
+            },
+        )
+        begin_ns = end_ns
+
+
+def _step() -> ColumnElement[int]:
     since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
     number = since_ns // bindparam("width_ns", type_=BigInteger)
     # A leap second is of the step that it ends, as of its hour and day.
     last = bindparam("last", type_=BigInteger)
-    step = case((number > last, last), else_=number).label("step")
+    return case((number > last, last), else_=number).label("step")
+
+
+STEP = _step()
+"""The number of the step of its day that a result is in, as SQL."""
+IN_PERIOD = (
+    results.c.current,
+    results.c.run == bindparam("run"),
+    results.c.time_ns >= bindparam("start_ns"),
+    results.c.time_ns < bindparam("end_ns"),
+)
+"""The current results of a run and a period, as SQL."""
+
+
+@cache
+def _steps_query(names: Names, of_tracker: bool) -> Select[Any]:
     summed = SUMMED_OF_TRACKERS if of_tracker else SUMMED
-    query = select(step, *(summed[name] for name in names))
+    query = select(STEP, *(summed[name] for name in names))
     if of_tracker:
-        query = query.select_from(OF_TRACKERS).where(_OF_TRACKER)
-    return query.where(*_IN_SPAN).group_by(step).order_by(step)
+        of_one = tables.tracker_values.c.tracker == bindparam("tracker")
+        query = query.select_from(OF_TRACKERS).where(of_one)
+    own = results.c.spacecraft == bindparam("spacecraft")
+    return query.where(*IN_PERIOD, own).group_by(STEP).order_by(STEP)
 
 
 def _steps_of(rows: Sequence[Any], midnight: Utc, width_s: int, names: Names) -> Columns:
-    read = _table(rows, names)
-    begin_ns = midnight.tai_ns + read[0].astype(np.int64) * width_s * 10**9
-    return {"unix_s": unix_seconds(begin_ns), **dict(zip(names, read[1:], strict=True))}
+    columns = _columns(rows, names)
+    begin_ns = midnight.tai_ns + columns["unix_s"].astype(np.int64) * width_s * 10**9
+    return columns | {"unix_s": unix_seconds(begin_ns)}
 
 
 def _joined(parts: Sequence[Columns]) -> Columns:
     return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
 
-def _table(rows: Sequence[Any], names: Names) -> Matrix:
-    """Rows as columns, the key's first."""
+def _columns(rows: Sequence[Any], names: Names) -> Columns:
+    """Rows as columns; `unix_s` is the first, the number of the bucket."""
     # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
-    return np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names)).T
+    table = np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names))
+    return dict(zip(("unix_s", *names), table.T, strict=True))
 
 
 def totals(buckets: Columns) -> Row:
     """The counts of all buckets together."""
-    return {name: int(buckets[name].sum()) for name in COUNTS}
-
-
-def _at_or_after(moment: Utc, width_s: int) -> int:
-    number = moment.bucket(width_s)
-    return number + (bucket_start(number, width_s).tai_ns < moment.tai_ns)
+    return {name: int(buckets[name].sum()) for name in tables.COUNTS}
 
 
 @cache
@@ -193,33 +235,65 @@ def _whole_query(table: Table, names: Names) -> Select[Any]:
 
 
 def _whole(
-    connection: Connection, span: BucketFilter, level: Level, names: Names, first: int, last: int
+    connection: Connection, span: BucketFilter, level: Bucket, names: Names, first: int, last: int
 ) -> Columns:
-    table = (_ROLLUPS if span.tracker is None else _TRACKER_ROLLUPS)[level]
+    trend = TRENDS[level]
+    table = trend.table if span.tracker is None else trend.tracker_table
     asked = _owner(span) | {"first": first, "last": last}
-    read = _table(connection.execute(_whole_query(table, names), asked).all(), names)
-    return {
-        "unix_s": read[0] * _WIDTH_S[level] - UNIX_DAY * DAY_S,
-        **dict(zip(names, read[1:], strict=True)),
-    }
-
-
-_IN_SPAN = (
-    results.c.current,
-    results.c.spacecraft == bindparam("spacecraft"),
-    results.c.run == bindparam("run"),
-    results.c.time_ns >= bindparam("start_ns"),
-    results.c.time_ns < bindparam("end_ns"),
-)
-
-
-_OF_TRACKER = tracker_values.c.tracker == bindparam("tracker")
-
-
-def _asked(span: BucketFilter) -> Row:
-    return _owner(span) | {"start_ns": span.start.tai_ns, "end_ns": span.end.tai_ns}
+    columns = _columns(connection.execute(_whole_query(table, names), asked).all(), names)
+    return columns | {"unix_s": columns["unix_s"] * trend.width_s - UNIX_DAY * DAY_S}
 
 
 def _owner(span: BucketFilter) -> Row:
     owner = {"spacecraft": span.spacecraft, "run": span.run}
     return owner if span.tracker is None else owner | {"tracker": span.tracker}
+
+
+def buckets_between(
+    bucket: ColumnElement[int], start: Utc | None, end: Utc | None, width_s: int
+) -> list[ColumnElement[bool]]:
+    """The buckets of a width that a period from `start` to before `end` touches, as SQL."""
+    chosen = []
+    if start is not None:
+        chosen.append(bucket >= start.bucket(width_s))
+    if end is not None:
+        last = end.bucket(width_s)
+        # A bucket that begins just where the period ends lies outside it.
+        last -= bucket_start(last, width_s).tai_ns == end.tai_ns
+        chosen.append(bucket <= last)
+    return chosen
+
+
+def rates(
+    connection: Connection,
+    spacecraft: str,
+    *,
+    run: str,
+    start: Utc | None,
+    end: Utc | None,
+    bucket: Bucket,
+) -> list[Rates]:
+    """The buckets that begin at or after `start`'s own and before `end`, oldest first.
+
+    Raises `BadInput` where there are more than `MAX_RATES`.
+    """
+    trend = TRENDS[bucket]
+    table = trend.table
+    query = select(table.c.bucket, *(table.c[name] for name in tables.COUNTS)).where(
+        table.c.spacecraft == spacecraft,
+        table.c.run == run,
+        *buckets_between(table.c.bucket, start, end, trend.width_s),
+    )
+    rows = connection.execute(query.order_by(table.c.bucket).limit(MAX_RATES + 1)).all()
+    if len(rows) > MAX_RATES:
+        value = "nothing" if start is None else start.text
+        shorter = "ask for a shorter stretch" + (", or for days" if bucket == "hour" else "")
+        wrong = f"from then on more than {MAX_RATES} {bucket}s hold batches: {shorter}"
+        raise BadInput(Fault("start", wrong, value))
+    return [
+        Rates(
+            start=bucket_start(number, trend.width_s).text,
+            **dict(zip(tables.COUNTS, counts, strict=True)),
+        )
+        for number, *counts in rows
+    ]

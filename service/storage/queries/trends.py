@@ -2,12 +2,12 @@
 
 from collections.abc import Callable, Collection, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
-from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select
+from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select, tuple_
 
 from service.alarms.quantities import (
     QUANTITIES,
@@ -18,44 +18,15 @@ from service.alarms.quantities import (
     StarShare,
 )
 from service.storage.models.spacecraft import History, Numbers, RankedBatch, Series
-from service.storage.queries.pages import (
-    PLACE,
-    ResultFilter,
-    newest,
-    newest_first,
-    oldest_first,
-    page_of,
-)
+from service.storage.queries import time_buckets
+from service.storage.queries.pages import PLACE, ResultFilter, latest_time, newest_first
 from service.storage.queries.results import summary_fields, summary_query
-from service.storage.queries.time_buckets import (
-    MAX_BATCHES_SUMMED,
-    BucketFilter,
-    Columns,
-    batches_about,
-    has_archived,
-    read_buckets,
-    read_steps,
-)
+from service.storage.queries.time_buckets import BucketFilter, Columns
 from service.storage.recording.result_metrics import OF_TRACKERS, value_sql
-from service.storage.sql.tables import (
-    COUNTED,
-    MEASURED,
-    batches,
-    results,
-    rollups_hourly,
-    tracker_rollups_hourly,
-    tracker_values,
-)
-from service.times import (
-    DAY_S,
-    HOUR_S,
-    Utc,
-    bucket_start,
-    parse_utc,
-    shifted,
-    unix_seconds,
-    utc_now,
-)
+from service.storage.sql import tables
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import batches, results, tracker_values
+from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.intp]
@@ -79,77 +50,59 @@ WIDTHS_S = (
 
 @dataclass(frozen=True)
 class HistoryRequest:
-    """The wanted history: the quantities, how they are thinned out, and to how many points."""
+    """The wanted history: of what, which quantities, and how they are thinned out.
 
+    Without an end it ends just after the latest batch, without a start it begins a day before
+    its end.
+    """
+
+    spacecraft: str
+    run: str
+    start: Utc | None
+    end: Utc | None
     quantities: Sequence[QuantityName]
-    strategy: Strategy
-    size: int
+    strategy: Strategy = "latest"
+    size: int = PAGE
+    """The most points."""
     tracker: str | None = None
     """The tracker whose values they are, of a spacecraft with several."""
 
 
-def history(
-    connection: Connection,
-    spacecraft: str,
-    *,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    request: HistoryRequest,
-) -> History:
-    """A history, its buckets or batches in columns, oldest first.
-
-    Without an end it ends just after the latest batch, without a start it
-    begins a day before its end.
-    """
-    span = _span(connection, spacecraft, run, start, end, request.tracker)
+def history(connection: Connection, request: HistoryRequest) -> History:
+    """A history, its buckets or batches in columns, oldest first."""
+    span = _span(connection, request)
     if span is None:
-        return _empty(spacecraft, run, start, end, request)
+        return _empty(request)
     if request.strategy == "latest":
         return _latest(connection, span, request)
     width_s, source = _resolution(connection, span, request.size)
     if source == "batch":
-        cells = read_steps(connection, span, width_s)
+        cells = time_buckets.read_steps(connection, span, width_s)
     else:
-        cells = read_buckets(connection, span, source)
+        cells = time_buckets.read_buckets(connection, span, source)
     return _thinned(cells, span, width_s, source, request)
-
-
-def latest_time(
-    connection: Connection, run: str, spacecraft: str | None = None, *, now: Utc
-) -> Utc | None:
-    """The time of the latest batch of a run, or of one spacecraft in it (see `pages.newest`)."""
-    query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
-    row = newest(connection, query, ResultFilter(run, spacecraft), now)
-    return None if row is None else parse_utc(row["time"])
 
 
 def latest_time_of(
     connection: Connection, run: str, spacecraft: Collection[str] | None, *, now: Utc
 ) -> Utc | None:
     """The time of the latest batch of some spacecraft in a run; None: of any."""
-    if spacecraft is None:
-        return latest_time(connection, run, now=now)
-    found = (latest_time(connection, run, name, now=now) for name in spacecraft)
+    names = [None] if spacecraft is None else spacecraft
+    found = (latest_time(connection, ResultFilter(run, name), now) for name in names)
     return max(filter(None, found), key=lambda moment: moment.tai_ns, default=None)
 
 
-def _span(
-    connection: Connection,
-    spacecraft: str,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    tracker: str | None,
-) -> BucketFilter | None:
+def _span(connection: Connection, request: HistoryRequest) -> BucketFilter | None:
+    spacecraft, run, end = request.spacecraft, request.run, request.end
     if end is None:
-        latest = latest_time(connection, run, spacecraft, now=utc_now())
+        latest = latest_time(connection, ResultFilter(run, spacecraft), utc_now())
         if latest is None:
             return None
         end = shifted(latest, 1e-6)
-    begin = shifted(end, -DAY_S) if start is None else start
-    span = BucketFilter(spacecraft, run, begin, end, tracker)
-    return span if span.start.tai_ns <= end.tai_ns else replace(span, end=span.start)
+    begin = shifted(end, -DAY_S) if request.start is None else request.start
+    if begin.tai_ns > end.tai_ns:
+        end = begin
+    return BucketFilter(spacecraft, run, begin, end, request.tracker)
 
 
 def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[int, Source]:
@@ -160,8 +113,11 @@ def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[
         # Longer than the widest of them: as many months of thirty days as it takes.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
-        are_few = end_s - first_s <= HOUR_S or batches_about(connection, span) <= MAX_BATCHES_SUMMED
-        if are_few and not has_archived(connection, span):
+        are_few = (
+            end_s - first_s <= HOUR_S
+            or time_buckets.batches_about(connection, span) <= time_buckets.MAX_BATCHES_SUMMED
+        )
+        if are_few and not time_buckets.has_archived(connection, span):
             return width_s, "batch"
         width_s = HOUR_S
     if width_s < DAY_S and end_s - first_s > MAX_HOURS_READ * HOUR_S:
@@ -183,10 +139,7 @@ def _thinned(
     reduced = _Reduced(cells, first, _covered_h(unix_s, width_s, span, number_of))
     counts = number_of.astype(int).tolist()
     return History(
-        spacecraft=span.spacecraft,
-        run=span.run,
-        start=span.start.text,
-        end=span.end.text,
+        **_about(span),
         strategy=request.strategy,
         bucket_s=width_s,
         source=source,
@@ -275,7 +228,7 @@ def _listed(values: Vector) -> Numbers:
     return list(values.tolist())
 
 
-_VALUES = (*COUNTED, "status", *MEASURED)
+_VALUES = (*tables.COUNTED, "status", *tables.MEASURED)
 _SHOWN = (results.c.id, *PLACE, batches.c.batch, batches.c.time)
 _OF_BATCHES = select(*(results.c[name] for name in _VALUES), *_SHOWN).join_from(
     results, batches, results.c.batch_id == batches.c.id
@@ -296,35 +249,29 @@ def _values_query(span: BucketFilter) -> Select[Any]:
 
 
 def every_batch(
-    reading: Callable[[], AbstractContextManager[Connection]],
-    spacecraft: str,
-    *,
-    run: str,
-    start: Utc | None,
-    end: Utc | None,
-    quantities: Sequence[QuantityName],
-    tracker: str | None = None,
+    reading: Callable[[], AbstractContextManager[Connection]], request: HistoryRequest
 ) -> Iterator[History]:
     """The batches of a period as `history` gives the latest, oldest first, in pages.
 
     At least one page is given, which may hold none.  Between two pages no
     connection is held, so that a slow reader keeps none from others.
     """
-    request = HistoryRequest(quantities, "latest", PAGE, tracker)
     with reading() as connection:
-        span = _span(connection, spacecraft, run, start, end, tracker)
+        span = _span(connection, request)
     if span is None:
-        yield _empty(spacecraft, run, start, end, request)
+        yield _empty(request)
         return
-    query = _values_query(span)
-    cursor: str | None = None
+    query = _values_query(span).order_by(*PLACE).limit(request.size)
+    beyond = query
     while True:
         with reading() as connection:
-            page = page_of(connection, oldest_first(query, cursor), PAGE, dict)
-        yield _of_batches(page.items, span, request)
-        cursor = page.next_cursor
-        if cursor is None:
+            rows = connection.execute(beyond).mappings().all()
+        if rows or beyond is query:
+            yield _of_batches(rows, _about(span), request)
+        if len(rows) < request.size:
             return
+        last = rows[-1]["time_ns"], rows[-1]["batch_id"]
+        beyond = query.where(tuple_(*PLACE) > tuple_(*last))
 
 
 def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> History:
@@ -332,17 +279,24 @@ def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest)
     query = newest_first(_values_query(span)).limit(request.size + 1)
     rows = list(connection.execute(query).mappings())
     thinned = len(rows) > request.size
-    return _of_batches(rows[: request.size][::-1], span, request, thinned=thinned)
+    return _of_batches(rows[: request.size][::-1], _about(span), request, thinned=thinned)
+
+
+def _about(span: BucketFilter) -> Row:
+    """The fields of a history that tell what it is of."""
+    return {
+        "spacecraft": span.spacecraft,
+        "run": span.run,
+        "start": span.start.text,
+        "end": span.end.text,
+    }
 
 
 def _of_batches(
-    rows: Sequence[Any], span: BucketFilter, request: HistoryRequest, *, thinned: bool = False
+    rows: Sequence[Any], about: Row, request: HistoryRequest, *, thinned: bool = False
 ) -> History:
     return History(
-        spacecraft=span.spacecraft,
-        run=span.run,
-        start=span.start.text,
-        end=span.end.text,
+        **about,
         strategy=request.strategy,
         bucket_s=None,
         source="batch",
@@ -360,33 +314,25 @@ def _of_batches(
     )
 
 
-def _empty(
-    spacecraft: str, run: str, start: Utc | None, end: Utc | None, request: HistoryRequest
-) -> History:
-    """The history of a run without batches of the spacecraft."""
-    is_latest = request.strategy == "latest"
-    columns: tuple[str, ...] = ("value",) if is_latest else ("count", "mean", "min", "max")
-    lists: tuple[str, ...] = ("time", "id", "batch") if is_latest else ("batches",)
+def _empty(request: HistoryRequest) -> History:
+    """The history, without an end, of a run without batches of the spacecraft."""
+    start = None if request.start is None else request.start.text
+    about: Row = {"spacecraft": request.spacecraft, "run": request.run, "start": start, "end": None}
+    if request.strategy == "latest":
+        return _of_batches([], about, request)
+    nothing = np.empty(0)
     return History(
-        spacecraft=spacecraft,
-        run=run,
-        start=None if start is None else start.text,
-        end=None if end is None else end.text,
+        **about,
         strategy=request.strategy,
         bucket_s=None,
         source="batch",
         thinned=False,
         unix_s=[],
-        **_no_rows(lists),
+        batches=[],
         series={
-            name: Series(unit=QUANTITIES[name].unit, **{column: [] for column in columns})
-            for name in request.quantities
+            name: _series(name, nothing, nothing, nothing, nothing) for name in request.quantities
         },
     )
-
-
-def _no_rows(names: Sequence[str]) -> dict[str, Any]:
-    return {name: [] for name in names}
 
 
 # The worst batches of a period by a quantity, found without reading all batches.
@@ -442,44 +388,34 @@ def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
 
 
 def _hours(
-    connection: Connection,
-    selected: ResultFilter,
-    by: RankedName,
-    limit: int,
-    tracker: str | None,
+    connection: Connection, selected: ResultFilter, by: RankedName, limit: int, tracker: str | None
 ) -> Iterator[tuple[int, int, float]]:
     """The hours of a period as (begin, end, the greatest value in it), the greatest first.
 
     An hour that the period cuts is narrowed; its greatest value may lie outside.
     """
-    rollup = rollups_hourly if tracker is None else tracker_rollups_hourly
+    rollup = tables.rollups_hourly if tracker is None else tables.tracker_rollups_hourly
     table = rollup.c
     most = _greatest(by, rollup)
     query = select(table.bucket, most).where(
-        table.spacecraft == selected.spacecraft, table.run == selected.run, most.is_not(None)
+        table.spacecraft == selected.spacecraft,
+        table.run == selected.run,
+        most.is_not(None),
+        *time_buckets.buckets_between(table.bucket, selected.start, selected.end, HOUR_S),
     )
     if tracker is not None:
         query = query.where(table.tracker == tracker)
-    if selected.start is not None:
-        query = query.where(table.bucket >= selected.start.bucket(HOUR_S))
-    if selected.end is not None:
-        query = query.where(table.bucket <= selected.end.bucket(HOUR_S))
     # Of `limit` whole hours each holds a batch at least as bad as any in the hours beyond them;
     # two more, because the ends of the period may cut away what made an hour one of the worst.
     query = query.order_by(most.desc(), table.bucket.desc()).limit(limit + 2)
-    rows = connection.execute(query).all()
-    return _narrowed(rows, selected.start, selected.end)
-
-
-def _narrowed(rows: Any, start: Utc | None, end: Utc | None) -> Iterator[tuple[int, int, float]]:
-    for bucket, most in rows:
+    for bucket, greatest in connection.execute(query).all():
         begin, over = (bucket_start(bucket + ahead, HOUR_S).tai_ns for ahead in (0, 1))
-        if start is not None:
-            begin = max(begin, start.tai_ns)
-        if end is not None:
-            over = min(over, end.tai_ns)
+        if selected.start is not None:
+            begin = max(begin, selected.start.tai_ns)
+        if selected.end is not None:
+            over = min(over, selected.end.tai_ns)
         if begin < over:
-            yield begin, over, float(most)
+            yield begin, over, float(greatest)
 
 
 def _badness(by: RankedName, of: Table) -> ColumnElement[Any]:

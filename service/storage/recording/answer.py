@@ -2,8 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec import UNSET, Struct, UnsetType, structs
@@ -13,22 +12,7 @@ from service.acquire.result import RivalAttitude, TrackerResult
 from service.identify.identification import Outcome
 from service.observations.batch import PredictedPrior
 from service.sky.catalog.run_catalog import RunCatalog
-from service.storage.models.answers import (
-    Answer,
-    Attitude,
-    FrameSummary,
-    Prediction,
-    Provenance,
-    Rival,
-    SearchedZone,
-    Star,
-    StarCounts,
-    StarRef,
-    Timings,
-    TrackerFit,
-    TrackerStars,
-    Tracking,
-)
+from service.storage.models import answers
 from service.vectors import ra_dec_of
 
 FRAME = "EME2000"
@@ -36,17 +20,13 @@ WORDS = {int(outcome): outcome.word for outcome in Outcome}
 _AMBIGUOUS = int(Outcome.AMBIGUOUS)
 
 
-@dataclass(frozen=True)
-class StarRow:
-    """The columns of one observed star."""
+class StarRow(NamedTuple):
+    """One observed star, and what it was identified as."""
 
     tracker: str
     position: int
     outcome: str
     star_id: str | None
-    votes: int
-    runner_up: int
-    probability: float | None
     residual_arcsec: float | None
 
 
@@ -56,16 +36,16 @@ def answer_of(
     id: str | None,
     parent: str | UnsetType = UNSET,
     recorded: bool | UnsetType = UNSET,
-    frame: FrameSummary | UnsetType = UNSET,
+    frame: answers.FrameSummary | UnsetType = UNSET,
     warnings: Sequence[str] = (),
-) -> Answer:
+) -> answers.Answer:
     """The answer to a batch; `id` is None for what is not recorded.
 
     `warnings` follow those of the acquisition.  The time of recording stays None: it
     is known when the rows are handed over.
     """
     batch, run_catalog = acquisition.batch, acquisition.run_catalog
-    return Answer(
+    return answers.Answer(
         id=id,
         spacecraft=batch.spacecraft,
         batch=batch.batch,
@@ -74,12 +54,12 @@ def answer_of(
         identifier=acquisition.choices.identifier,
         path=str(acquisition.path),
         observations=[_tracker_answer(each, run_catalog) for each in acquisition.trackers],
-        counts=StarCounts(**acquisition.counts),
+        counts=answers.StarCounts(**acquisition.counts),
         attitude=_attitude(acquisition),
         reason=None if acquisition.reason is None else str(acquisition.reason),
         warnings=[*acquisition.warnings, *warnings],
-        timings_us=Timings(**acquisition.timings_us, record=None),
-        provenance=Provenance(**structs.asdict(acquisition.provenance)),
+        timings_us=answers.Timings(**acquisition.timings_us, record=None),
+        provenance=answers.Provenance(**structs.asdict(acquisition.provenance)),
         parent=parent,
         recorded=recorded,
         frame=frame,
@@ -95,9 +75,6 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
             position=k,
             outcome=Outcome(outcome).word,
             star_id=_star_id(acquisition.run_catalog, int(each.identification.star[k])),
-            votes=int(each.identification.votes[k]),
-            runner_up=int(each.identification.runner_up[k]),
-            probability=_number(float(each.identification.probability[k])),
             residual_arcsec=_number(float(each.residual_arcsec[k])),
         )
         for each in acquisition.trackers
@@ -105,8 +82,8 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
     ]
 
 
-def rows_of_stars(answer: Answer) -> list[dict[str, Any]]:
-    """`star_rows` as rows of the table, from the answer itself."""
+def rows_of_stars(answer: answers.Answer) -> list[dict[str, Any]]:
+    """Every star of an answer as a row of the table."""
     return [
         {
             "result_id": answer.id,
@@ -124,11 +101,11 @@ def rows_of_stars(answer: Answer) -> list[dict[str, Any]]:
     ]
 
 
-def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> TrackerStars:
+def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> answers.TrackerStars:
     region, zone = result.region, None
     if region is not None:
         ra_deg, dec_deg = ra_dec_of(region.axis)
-        zone = SearchedZone(
+        zone = answers.SearchedZone(
             kind=region.kind,
             ra_deg=ra_deg,
             dec_deg=dec_deg,
@@ -137,10 +114,10 @@ def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> TrackerSt
             cached=result.zone_cached,
         )
     stars = _stars(result, run_catalog)
-    return TrackerStars(tracker=result.corrected.tracker.name, zone=zone, stars=stars)
+    return answers.TrackerStars(tracker=result.corrected.tracker.name, zone=zone, stars=stars)
 
 
-def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[Star]:
+def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[answers.Star]:
     found, seen = result.identification, result.corrected
     # Plain numbers: taking single ones out of arrays costs more than all the rest.
     rows = found.star.tolist()
@@ -171,9 +148,11 @@ def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[Star]:
         if row >= 0 and rows.count(row) > 1:
             flags.append("same_star_twice")
         stars.append(
-            Star(
+            answers.Star(
                 outcome=WORDS[outcome],
-                star=None if name is None else StarRef(catalog=name.partition(" ")[0], id=name),
+                star=None
+                if name is None
+                else answers.StarRef(catalog=name.partition(" ")[0], id=name),
                 votes=votes,
                 runner_up=second,
                 rivals=rivals,
@@ -186,12 +165,12 @@ def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[Star]:
     return stars
 
 
-def _attitude(acquisition: Acquisition) -> Attitude | None:
+def _attitude(acquisition: Acquisition) -> answers.Attitude | None:
     solution, rival = acquisition.solution, acquisition.rival
     if solution is None:
         return None
     several, has_stars = solution.trackers, len(solution.residual_arcsec) > 0
-    return Attitude(
+    return answers.Attitude(
         quaternion=solution.quaternion.tolist(),
         frame=FRAME,
         covariance_arcsec2=solution.covariance_arcsec2.tolist(),
@@ -205,7 +184,9 @@ def _attitude(acquisition: Acquisition) -> Attitude | None:
         quest=solution.quest.tolist() if has_stars else None,
         triad_quest_angle_arcsec=_number(solution.triad_quest_angle_arcsec),
         trackers=[
-            TrackerFit(tracker=fit.tracker, stars=fit.stars, taste=fit.taste, outlier=fit.outlier)
+            answers.TrackerFit(
+                tracker=fit.tracker, stars=fit.stars, taste=fit.taste, outlier=fit.outlier
+            )
             for fit in several
         ]
         if several
@@ -215,7 +196,7 @@ def _attitude(acquisition: Acquisition) -> Attitude | None:
     )
 
 
-def _tracking(acquisition: Acquisition) -> Tracking | UnsetType:
+def _tracking(acquisition: Acquisition) -> answers.Tracking | UnsetType:
     asked = acquisition.batch.tracking
     if asked is None:
         return UNSET
@@ -224,7 +205,7 @@ def _tracking(acquisition: Acquisition) -> Tracking | UnsetType:
     predicted = acquisition.batch.a_priori
     prediction = None
     if isinstance(predicted, PredictedPrior):
-        prediction = Prediction(
+        prediction = answers.Prediction(
             quaternion=predicted.quaternion.tolist(),
             covariance_arcsec2=predicted.covariance_arcsec2.tolist(),
             margin_deg=predicted.margin_deg,
@@ -232,13 +213,13 @@ def _tracking(acquisition: Acquisition) -> Tracking | UnsetType:
             age_s=asked.age_s,
             rate=asked.rate,
         )
-    return Tracking(
+    return answers.Tracking(
         state=state, by_default=asked.by_default, prediction=prediction, reason=asked.reason
     )
 
 
-def _rival(rival: RivalAttitude, run_catalog: RunCatalog) -> Rival:
-    return Rival(
+def _rival(rival: RivalAttitude, run_catalog: RunCatalog) -> answers.Rival:
+    return answers.Rival(
         quaternion=rival.solution.quaternion.tolist(),
         covariance_arcsec2=rival.solution.covariance_arcsec2.tolist(),
         probability=rival.probability,

@@ -23,7 +23,7 @@ from service.storage.models.base import Page
 from service.storage.recording.ids import is_ulid
 from service.storage.sql.alarm_tables import annotations
 from service.storage.sql.columns import Row
-from service.storage.sql.statements import execute, insert_all
+from service.storage.sql.statements import execute, insert_all, rows_of
 from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
 
@@ -138,7 +138,7 @@ def events_after(connection: Connection, last: int, limit: int) -> Sequence[Even
     None too for a number that was never assigned: it is another database's.
     """
     query = select(events).where(events.c.id > last).order_by(events.c.id).limit(limit)
-    found = [_event(row) for row in connection.execute(query).mappings()]
+    found = [Event(**row) for row in rows_of(connection, query)]
     if found:
         return found if found[0].id == last + 1 else None
     return [] if last_event(connection) == last else None
@@ -154,11 +154,7 @@ def events_between(connection: Connection, since: Utc, until: Utc) -> Sequence[E
     """The kept events that were recorded from `since` to before `until`, oldest first."""
     recorded = events.c.at >= since.text, events.c.at < until.text
     query = select(events).where(*recorded).order_by(events.c.id)
-    return [_event(row) for row in connection.execute(query).mappings()]
-
-
-def _event(row: Any) -> Event:
-    return Event(**row)
+    return [Event(**row) for row in rows_of(connection, query)]
 
 
 _SHOWN = ("id", "spacecraft", "start", "end", "text", "who", "created")

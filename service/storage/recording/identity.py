@@ -19,19 +19,9 @@ from sqlalchemy import Connection, Double, Table, insert
 
 from service.errors import Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
+from service.storage.sql import tables
 from service.storage.sql.columns import Row, unpack
 from service.storage.sql.statements import execute
-from service.storage.sql.tables import (
-    batches,
-    catalogs,
-    frames,
-    idempotency_keys,
-    mission_uses,
-    missions,
-    results,
-    solutions,
-    star_results,
-)
 
 Identity = tuple[str, str, str]
 """(spacecraft, run, batch): unique among submissions."""
@@ -185,7 +175,7 @@ def remember_key(
     if isinstance(holder, KeyReused | Conflict):
         raise holder
     if holder is None:
-        connection.execute(insert(idempotency_keys), key_row(key, taken))
+        connection.execute(insert(tables.idempotency_keys), key_row(key, taken))
 
 
 def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
@@ -208,7 +198,7 @@ def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, by
 # ---- digests ----------------------------------------------------------------------------------
 
 BYTES = 8
-SETTINGS = (missions, catalogs, mission_uses)
+SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
 """The tables whose rows have a digest each, `row_digest`."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
 """Columns without content: the mark of the current result, places in an order, digests."""
@@ -229,10 +219,14 @@ def digest_of(
     `batch` and `frame` are given for the first result of a batch, and not for a what-if.
     """
     content: list[object] = [
-        _content(results)(result),
-        sorted(map(_content(star_results), stars), key=_in_order),
+        _content(tables.results)(result),
+        sorted(map(_content(tables.star_results), stars), key=_in_order),
     ]
-    for table, row in ((solutions, solution), (batches, batch), (frames, frame)):
+    for table, row in (
+        (tables.solutions, solution),
+        (tables.batches, batch),
+        (tables.frames, frame),
+    ):
         content.append(None if row is None else _content(table)(row))
     return _digest(content)
 

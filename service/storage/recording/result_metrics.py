@@ -32,22 +32,8 @@ from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.models.answers import Answer, Star
 from service.storage.recording.identity import digest_of_row
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    COUNTED,
-    COUNTS,
-    MAXIMA,
-    MEASURED,
-    MINIMA,
-    ROLLED_UP,
-    SHARES,
-    SUMS,
-    VALUES,
-    results,
-    rollups_daily,
-    tracker_splits,
-    tracker_values,
-)
 from service.vectors import Vector
 
 
@@ -60,41 +46,41 @@ def metrics_of(acquisition: Acquisition) -> Row:
     }
 
 
-_SHARES_OF = [QUANTITIES[name].value_of for name in SHARES]
-_VALUES_OF = [QUANTITIES[name].value_of for name in VALUES]
+_SHARES_OF = [QUANTITIES[name].value_of for name in tables.SHARES]
+_VALUES_OF = [QUANTITIES[name].value_of for name in tables.VALUES]
 
 
-def rolled_up(results: Sequence[Row]) -> Row:
+def rolled_up(current: Sequence[Row]) -> Row:
     """The columns of a rollup of current results."""
-    observed = [row["observed"] for row in results]
-    status = [row["status"] for row in results]
+    observed = [row["observed"] for row in current]
+    status = [row["status"] for row in current]
     counts = (
-        len(results),
+        len(current),
         sum(observed),
-        sum([row["unique"] for row in results]),
-        sum([row["ambiguous"] for row in results]),
-        sum([row["unmatched"] for row in results]),
+        sum([row["unique"] for row in current]),
+        sum([row["ambiguous"] for row in current]),
+        sum([row["unmatched"] for row in current]),
         len(status) - status.count(None),
         status.count("suspect"),
     )
-    shares = [[value for value in map(of, results) if value is not None] for of in _SHARES_OF]
-    values = [[value for value in map(of, results) if value is not None] for of in _VALUES_OF]
+    shares = [[value for value in map(of, current) if value is not None] for of in _SHARES_OF]
+    values = [[value for value in map(of, current) if value is not None] for of in _VALUES_OF]
     sums = chain.from_iterable((len(present), sum(present, 0.0)) for present in values)
     extremes = shares + values
     least = [min(present, default=None) for present in extremes]
     most = [max(present, default=None) for present in extremes]
     # In the order of the columns: to put their names together takes longer than all of this.
-    return dict(zip(ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
+    return dict(zip(tables.ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
 
 
 def merge(into: Row, row: Row) -> None:
     """Add one rollup to another: sums add up, of the extremes the outer ones stay."""
-    for name in (*COUNTS, *SUMS):
+    for name in (*tables.COUNTS, *tables.SUMS):
         into[name] += row[name]
-    for name in MINIMA:
+    for name in tables.MINIMA:
         if into[name] is None or (row[name] is not None and row[name] < into[name]):
             into[name] = row[name]
-    for name in MAXIMA:
+    for name in tables.MAXIMA:
         if into[name] is None or (row[name] is not None and row[name] > into[name]):
             into[name] = row[name]
 
@@ -106,12 +92,12 @@ def merge(into: Row, row: Row) -> None:
 
 
 def _counts(of: Table) -> Mapping[str, ColumnElement[Any]]:
-    stars = {name: of.c[name] for name in COUNTED if name != "observed"}
+    stars = {name: of.c[name] for name in tables.COUNTED if name != "observed"}
     # The sum of the others, which the index has.
     return {"observed": stars["unique"] + stars["ambiguous"] + stars["unmatched"], **stars}
 
 
-def value_sql(quantity: Quantity, of: Table = results) -> ColumnElement[Any]:
+def value_sql(quantity: Quantity, of: Table = tables.results) -> ColumnElement[Any]:
     """The value of one result, or of one tracker in it; null where it has none."""
     match quantity.source:
         case StarShare(part):
@@ -139,21 +125,23 @@ def _summed(of: Table) -> Mapping[str, ColumnElement[Any]]:
         "solved": func.count(of.c.status),
         "suspect": _sum(case((of.c.status == "suspect", 1), else_=0)),
     }
-    for name in VALUES:
+    for name in tables.VALUES:
         value = value_sql(QUANTITIES[name], of)
         columns[f"{name}_n"] = func.count(value)
         columns[f"{name}_sum"] = func.coalesce(func.sum(value), 0.0)
-    for name in (*SHARES, *VALUES):
+    for name in (*tables.SHARES, *tables.VALUES):
         value = value_sql(QUANTITIES[name], of)
         columns[f"{name}_min"], columns[f"{name}_max"] = func.min(value), func.max(value)
     return {name: column.label(name) for name, column in columns.items()}
 
 
-SUMMED = _summed(results)
+SUMMED = _summed(tables.results)
 """Each column as SQL over `results`, for a query that groups them or sums up all."""
-SUMMED_OF_TRACKERS = _summed(tracker_values)
+SUMMED_OF_TRACKERS = _summed(tables.tracker_values)
 """The same over `tracker_values`."""
-OF_TRACKERS = results.join(tracker_values, tracker_values.c.batch_id == results.c.batch_id)
+OF_TRACKERS = tables.results.join(
+    tables.tracker_values, tables.tracker_values.c.batch_id == tables.results.c.batch_id
+)
 """The source of a query over `tracker_values`, so that it can choose current results."""
 
 
@@ -212,7 +200,7 @@ def tracker_rows(
         used = list(_residuals(stars.stars))
         predicted = scale * math.fsum(squares[k] for k, _ in used)
         offsets = (seen.magnitude_mag - magnitudes)[np.isfinite(seen.magnitude_mag - magnitudes)]
-        row = dict.fromkeys(MEASURED) | {
+        row = dict.fromkeys(tables.MEASURED) | {
             "batch_id": batch_id,
             "tracker": stars.tracker,
             "observed": len(outcomes),
@@ -226,7 +214,7 @@ def tracker_rows(
             "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
             "alignment_offset_arcsec": alignment[k],
         }
-        rows.append(row | {"row_digest": digest_of_row(tracker_values, row)})
+        rows.append(row | {"row_digest": digest_of_row(tables.tracker_values, row)})
     return rows
 
 
@@ -281,19 +269,21 @@ def _rms(squares: float, count: int) -> float | None:
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
     """True if batches of a spacecraft's run are still to be split."""
-    query = select(tracker_splits.c.run).where(
-        tracker_splits.c.spacecraft == spacecraft, tracker_splits.c.run == run
+    query = select(tables.tracker_splits.c.run).where(
+        tables.tracker_splits.c.spacecraft == spacecraft, tables.tracker_splits.c.run == run
     )
     return connection.execute(query).first() is not None
 
 
 def split_anew(connection: Connection, spacecraft: str) -> None:
     """Have all batches of a spacecraft looked at: from now on it has several trackers."""
-    connection.execute(delete(tracker_splits).where(tracker_splits.c.spacecraft == spacecraft))
+    connection.execute(
+        delete(tables.tracker_splits).where(tables.tracker_splits.c.spacecraft == spacecraft)
+    )
     recorded, trends = (
         select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
-        for table in (results, rollups_daily)
+        for table in (tables.results, tables.rollups_daily)
     )
     # Archived batches are in the trends alone, and the latest ones in the record alone.
     runs = recorded.union(trends)
-    connection.execute(insert(tracker_splits).from_select(["spacecraft", "run"], runs))
+    connection.execute(insert(tables.tracker_splits).from_select(["spacecraft", "run"], runs))

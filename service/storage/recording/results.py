@@ -19,22 +19,10 @@ from service.storage.recording.identity import (
 )
 from service.storage.recording.result_metrics import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
+from service.storage.sql import tables
 from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
-from service.storage.sql.tables import (
-    batches,
-    catalogs,
-    frames,
-    idempotency_keys,
-    mission_uses,
-    missions,
-    results,
-    runs,
-    solutions,
-    star_results,
-    tracker_values,
-)
 
 RecordOutcome = Answered | AcquisitionError
 
@@ -49,30 +37,22 @@ _REMEMBERED = 1_000
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
     """Note the settings and the catalog that results will name, unless they are known already."""
-    for table, rows in ((missions, mission_rows), (catalogs, [catalog_row])):
-        insert_missing(
-            connection, table, [row | {"row_digest": digest_of_row(table, row)} for row in rows]
-        )
+    for table, rows in ((tables.missions, mission_rows), (tables.catalogs, [catalog_row])):
+        digested = [row | {"row_digest": digest_of_row(table, row)} for row in rows]
+        insert_missing(connection, table, digested)
+    uses, mission = tables.mission_uses.c, tables.missions.c
     for row in mission_rows:
-        latest = (
-            select(mission_uses.c.digest)
-            .where(mission_uses.c.spacecraft == row["spacecraft"])
-            .order_by(mission_uses.c.id.desc())
-            .limit(1)
-        )
-        before = connection.execute(latest).scalar()
-        if before != row["digest"]:
-            if before is not None and _trackers(row["settings"]) > 1:
-                query = select(missions.c.settings).where(missions.c.digest == before)
-                if _trackers(connection.execute(query).scalar_one()) == 1:
-                    split_anew(connection, row["spacecraft"])
-            use = {
-                "spacecraft": row["spacecraft"],
-                "digest": row["digest"],
-                "since": row["first_used"],
-            }
-            use["row_digest"] = digest_of_row(mission_uses, use)
-            connection.execute(insert(mission_uses), use)
+        latest = select(uses.digest).where(uses.spacecraft == row["spacecraft"])
+        before = connection.scalar(latest.order_by(uses.id.desc()).limit(1))
+        if before == row["digest"]:
+            continue
+        if before is not None and _trackers(row["settings"]) > 1:
+            query = select(mission.settings).where(mission.digest == before)
+            if _trackers(connection.execute(query).scalar_one()) == 1:
+                split_anew(connection, row["spacecraft"])
+        use = {"spacecraft": row["spacecraft"], "digest": row["digest"], "since": row["first_used"]}
+        use["row_digest"] = digest_of_row(tables.mission_uses, use)
+        connection.execute(insert(tables.mission_uses), use)
 
 
 def _trackers(settings: str) -> int:
@@ -83,7 +63,7 @@ def _trackers(settings: str) -> int:
 def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) -> None:
     """Let limits be held against a run, or no longer; the run is made where there is none."""
     insert_runs(connection, {run: now}, alarms=watched)
-    connection.execute(update(runs).where(runs.c.name == run).values(alarms=watched))
+    connection.execute(update(tables.runs).where(tables.runs.c.name == run).values(alarms=watched))
 
 
 def record(
@@ -117,21 +97,18 @@ def record(
         outdated.get(unsaved.id) or _holder(unsaved, registry) for unsaved in unsaved_results
     ]
     fresh = [
-        (unsaved, unsaved.to_json(len(unsaved_results)))
+        unsaved
         for unsaved, holder in zip(unsaved_results, holders, strict=True)
         if isinstance(holder, ExistingResult) and holder.result_id == unsaved.id
     ]
-    _insert(connection, fresh, assume_new)
-    insert_all(
-        connection,
-        idempotency_keys,
-        [
-            key_row(key, taken)
-            for key, taken in sorted(registry.keys.items())
-            if key not in keys_before and not taken.archived
-        ],
-    )
-    answers = {unsaved.id: body for unsaved, body in fresh}
+    answers = {unsaved.id: unsaved.to_json(len(unsaved_results)) for unsaved in fresh}
+    _insert(connection, fresh, answers, assume_new)
+    new_keys = [
+        key_row(key, taken)
+        for key, taken in sorted(registry.keys.items())
+        if key not in keys_before and not taken.archived
+    ]
+    insert_all(connection, tables.idempotency_keys, new_keys)
     missing = {h.result_id for h in holders if isinstance(h, ExistingResult)} - answers.keys()
     if missing:
         answers |= stored_answers(connection, missing)
@@ -188,16 +165,17 @@ def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | Acqu
 
 
 def _insert(
-    connection: Connection, fresh: Sequence[tuple[UnsavedResult, bytes]], assume_new: bool
+    connection: Connection,
+    fresh: Sequence[UnsavedResult],
+    answers: Mapping[str, bytes],
+    assume_new: bool,
 ) -> None:
     # Sorted, so that two processes that insert the same batches do not wait in a circle.
     firsts = sorted(
-        ((unsaved, body) for unsaved, body in fresh if unsaved.batch is not None),
-        key=lambda each: each[0].identity,
+        (unsaved for unsaved in fresh if unsaved.batch is not None), key=lambda each: each.identity
     )
-    names = {
-        unsaved.identity[1]: unsaved.batch["received"] for unsaved, _ in firsts if unsaved.batch
-    }
+    rows = [unsaved.batch for unsaved in firsts if unsaved.batch is not None]
+    names = {row["run"]: row["received"] for row in rows}
     # Also those of a transaction that was taken back.  The foreign key then refuses their batches,
     # and `transact`, to which nothing is `assume_new`, inserts the run.
     known: set[str] = connection.info.setdefault(_RUNS, set())
@@ -207,45 +185,45 @@ def _insert(
     if missing:
         insert_runs(connection, {name: names[name] for name in missing})
         known.update(missing)
-    insert_all(connection, batches, [unsaved.batch for unsaved, _ in firsts if unsaved.batch])
-    require_not_archived(connection, [unsaved.identity for unsaved, _ in firsts])
-    insert_all(connection, frames, [unsaved.frame for unsaved, _ in firsts if unsaved.frame])
-    _insert_results(connection, firsts)
-    insert_all(connection, tracker_values, [row for each, _ in firsts for row in each.trackers])
+    insert_all(connection, tables.batches, rows)
+    require_not_archived(connection, [unsaved.identity for unsaved in firsts])
+    insert_all(connection, tables.frames, [each.frame for each in firsts if each.frame is not None])
+    _insert_results(connection, firsts, answers)
+    trackers = [row for unsaved in firsts for row in unsaved.trackers]
+    insert_all(connection, tables.tracker_values, trackers)
     # What-ifs go one by one: of two that are adopted, the second supersedes the first.
-    for unsaved, body in fresh:
+    for unsaved in fresh:
         if unsaved.batch is None:
             if unsaved.result["current"]:
                 _supersede(connection, unsaved)
-            _insert_results(connection, [(unsaved, body)])
-    insert_all(
-        connection, audit, [unsaved.audit for unsaved, _ in fresh if unsaved.audit is not None]
-    )
+            _insert_results(connection, [unsaved], answers)
+    insert_all(connection, audit, [each.audit for each in fresh if each.audit is not None])
 
 
 def _insert_results(
-    connection: Connection, unsaved_results: Sequence[tuple[UnsavedResult, bytes]]
+    connection: Connection, unsaved_results: Sequence[UnsavedResult], answers: Mapping[str, bytes]
 ) -> None:
     # In order of their ids, which rise: each goes to the end of its table.
-    in_order = sorted(unsaved_results, key=lambda each: each[0].id)
-    places = next_seqs(connection, len(in_order))
-    rows = [
-        unsaved.result_row(body, seq) for (unsaved, body), seq in zip(in_order, places, strict=True)
-    ]
-    insert_all(connection, results, rows)
-    insert_all(connection, star_results, [row for unsaved, _ in in_order for row in unsaved.stars])
-    insert_all(connection, solutions, [d.solution for d, _ in in_order if d.solution is not None])
+    in_order = sorted(unsaved_results, key=lambda each: each.id)
+    places = zip(in_order, next_seqs(connection, len(in_order)), strict=True)
+    rows = [unsaved.result_row(answers[unsaved.id], seq) for unsaved, seq in places]
+    stars = [row for unsaved in in_order for row in unsaved.stars]
+    insert_all(connection, tables.results, rows)
+    insert_all(connection, tables.star_results, stars)
+    attitudes = [each.solution for each in in_order if each.solution is not None]
+    insert_all(connection, tables.solutions, attitudes)
 
 
 def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
     """Mark the current result of a batch as superseded by an unsaved one, tracker by tracker."""
-    batch_id = unsaved.result["batch_id"]
+    batch_id, batch = unsaved.result["batch_id"], tables.batches.c
     # The lock on the batch orders the adoptions of several processes.
-    connection.execute(select(batches.c.id).where(batches.c.id == batch_id).with_for_update())
-    current = and_(results.c.batch_id == batch_id, results.c.current)
-    connection.execute(update(results).where(current).values(current=False))
-    connection.execute(delete(tracker_values).where(tracker_values.c.batch_id == batch_id))
-    insert_all(connection, tracker_values, unsaved.trackers)
+    connection.execute(select(batch.id).where(batch.id == batch_id).with_for_update())
+    current = and_(tables.results.c.batch_id == batch_id, tables.results.c.current)
+    connection.execute(update(tables.results).where(current).values(current=False))
+    of_batch = tables.tracker_values.c.batch_id == batch_id
+    connection.execute(delete(tables.tracker_values).where(of_batch))
+    insert_all(connection, tables.tracker_values, unsaved.trackers)
     spacecraft, run, _ = unsaved.identity
     about = {"spacecraft": spacecraft, "run": run, "id": unsaved.id, "batch_id": batch_id}
     events.add_event(connection, "adopted", about, run=run, spacecraft=spacecraft)

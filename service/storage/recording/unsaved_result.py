@@ -17,7 +17,7 @@ from sqlalchemy import Connection
 from service.acquire import Acquisition
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
-from service.storage.models.answers import Answer, FrameSummary, FrameTimings
+from service.storage.models.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.identity import digest_of
 from service.storage.recording.result_metrics import metrics_of, values_of_trackers
@@ -133,8 +133,9 @@ def unsaved_submission(
         warnings=[warning] if is_ahead else (),
     )
     unsaved = _unsaved_result(
-        acquisition, answer, row, key, batch_id=id, parent=None, current=True, created=received
+        acquisition, answer, batch_id=id, parent=None, current=True, created=received
     )
+    unsaved.batch, unsaved.key = row, key
     if submission.frame is not None:
         unsaved.frame = _frame_row(submission.frame, id)
     return unsaved
@@ -152,19 +153,13 @@ def unsaved_what_if(
     """A further result of a batch, current if it is to be adopted."""
     answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
     return _unsaved_result(
-        *(acquisition, answer, None, None),
-        batch_id=batch_id,
-        parent=parent,
-        current=adopt,
-        created=created,
+        acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
     )
 
 
 def _unsaved_result(
     acquisition: Acquisition,
     answer: Answer,
-    batch_row: Row | None,
-    key: tuple[str, str] | None,
     *,
     batch_id: str,
     parent: str | None,
@@ -172,6 +167,7 @@ def _unsaved_result(
     created: Utc,
 ) -> UnsavedResult:
     batch, attitude = acquisition.batch, answer.attitude
+    named = structs.asdict(batch.options)
     result = {
         "id": answer.id,
         "batch_id": batch_id,
@@ -182,7 +178,8 @@ def _unsaved_result(
         "run": batch.run,
         "time_ns": batch.time.tai_ns,
         "identifier": answer.identifier,
-        "options": options_text(acquisition),
+        # What was not named is left out.
+        "options": json.dumps({k: value for k, value in named.items() if value not in (None, {})}),
         "mission_digest": answer.provenance.mission,
         "catalog_digest": answer.provenance.catalog,
         **structs.asdict(answer.counts),
@@ -191,13 +188,13 @@ def _unsaved_result(
         **metrics_of(acquisition),
     }
     return UnsavedResult(
-        (batch.spacecraft, batch.run, batch.batch),
-        msgspec.json.encode(answer),
-        batch_row,
-        result,
-        rows_of_stars(answer),
-        _solution_row(acquisition, answer, result["id"]),
-        key,
+        identity=(batch.spacecraft, batch.run, batch.batch),
+        answer=msgspec.json.encode(answer),
+        batch=None,
+        result=result,
+        stars=rows_of_stars(answer),
+        solution=None if attitude is None else _solution_row(attitude, answer.id),
+        key=None,
         trackers=values_of_trackers(acquisition, answer, batch_id),
     )
 
@@ -219,31 +216,13 @@ def _frame_row(frame: FrameRecord, batch_id: str) -> Row:
     }
 
 
-def options_text(acquisition: Acquisition) -> str:
-    """The options that a result was computed with, as JSON, what was not named left out."""
-    named = structs.asdict(acquisition.batch.options)
-    return json.dumps({name: value for name, value in named.items() if value not in (None, {})})
-
-
-def _solution_row(acquisition: Acquisition, answer: Answer, result_id: str) -> Row | None:
-    attitude, solution = answer.attitude, acquisition.solution
-    if attitude is None or solution is None:
-        return None
-    q1, q2, q3, qc = attitude.quaternion
-    (p11, p12, p13), (_, p22, p23), (_, _, p33) = attitude.covariance_arcsec2
+def _solution_row(attitude: Attitude, result_id: str | None) -> Row:
+    covariance = attitude.covariance_arcsec2
     return {
         "result_id": result_id,
-        "q1": q1,
-        "q2": q2,
-        "q3": q3,
-        "qc": qc,
+        **dict(zip(("q1", "q2", "q3", "qc"), attitude.quaternion, strict=True)),
         "frame": attitude.frame,
-        "p11": p11,
-        "p12": p12,
-        "p13": p13,
-        "p22": p22,
-        "p23": p23,
-        "p33": p33,
+        **{f"p{i + 1}{k + 1}": covariance[i][k] for i in range(3) for k in range(i, 3)},
         # Of a measured attitude they are unknown; the columns take no null.
         "residual_rms_arcsec": attitude.residual_rms_arcsec or 0.0,
         "predicted_rms_arcsec": attitude.predicted_rms_arcsec or 0.0,

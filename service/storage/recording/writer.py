@@ -17,15 +17,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine, update
-from sqlalchemy.exc import (
-    DataError,
-    DBAPIError,
-    IntegrityError,
-    InterfaceError,
-    OperationalError,
-    ProgrammingError,
-)
+from sqlalchemy import Connection, Engine, exc, update
 
 from service.errors import AcquisitionError, Busy, Stopping
 from service.storage.recording import events
@@ -289,7 +281,7 @@ class Writer:
         try:
             outcomes = self._write(jobs)
         except BaseException as error:
-            cause = error.orig if isinstance(error, DBAPIError) else repr(error)
+            cause = error.orig if isinstance(error, exc.DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
             shown = _error_for_client(error)
             is_trouble = isinstance(shown, Busy) and not isinstance(shown, NotProjecting | Stopping)
@@ -373,7 +365,7 @@ class Writer:
                 return outcomes
             except RolledBack:
                 pass
-            except DBAPIError as error:
+            except exc.DBAPIError as error:
                 if getattr(error.orig, "sqlstate", None) not in _CROSSED or attempt == MAX_ATTEMPTS:
                     raise
             attempt += 1
@@ -426,7 +418,7 @@ def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) ->
         try:
             with _savepoint(connection):
                 return list(record(connection, unsaved_results))
-        except (IntegrityError, ArchivedMeanwhile) as error:
+        except (exc.IntegrityError, ArchivedMeanwhile) as error:
             failure = error  # perhaps another process was faster: look again
         except Exception as error:
             if is_of_the_database(error):
@@ -472,11 +464,11 @@ def _savepoint(connection: Connection) -> Iterator[None]:
 
 def is_of_the_database(error: BaseException) -> bool:
     """True if an error is the database's, its disk's or its connection's, and no single row's."""
-    about_a_row = (IntegrityError, DataError, ProgrammingError)
-    return isinstance(error, DBAPIError) and not isinstance(error, about_a_row)
+    about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
+    return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
 
 
-def may_pass(error: DBAPIError) -> bool:
+def may_pass(error: exc.DBAPIError) -> bool:
     """True if the trouble is with the database's disk or connection, and not with what was asked.
 
     SQLite says of a table that is missing, and of a write through a connection
@@ -484,7 +476,7 @@ def may_pass(error: DBAPIError) -> bool:
     """
     code = getattr(error.orig, "sqlite_errorcode", None)
     ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
-    return isinstance(error, OperationalError | InterfaceError) and not ours
+    return isinstance(error, exc.OperationalError | exc.InterfaceError) and not ours
 
 
 def _settling(done: "Future[Any]") -> Callable[[Any], None]:
@@ -528,7 +520,7 @@ def _error_for_client(error: BaseException) -> Exception:
 
     Its words name files and hosts, which are for the log alone.
     """
-    if isinstance(error, DBAPIError) and is_of_the_database(error):
+    if isinstance(error, exc.DBAPIError) and is_of_the_database(error):
         shown: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
     elif isinstance(error, Exception):
         return error

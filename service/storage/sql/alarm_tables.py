@@ -1,127 +1,107 @@
 """The tables of limits, alarms and annotations: what the service watches and what people note."""
 
-from typing import Any
+import sqlalchemy as sa
 
-from sqlalchemy import (
-    BigInteger,
-    Column,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    String,
-    Table,
-    Text,
-    text,
-)
+from service.storage.sql.columns import Id, Moment, Name, RunName, metadata, rows_where
 
-from service.storage.sql.columns import Id, Moment, Name, RunName, metadata
-
-limits = Table(
+limits = sa.Table(
     "limits",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("quantity", String(32), nullable=False),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("quantity", sa.String(32), nullable=False),
     # Empty: of the spacecraft as a whole.
-    Column("tracker", Name, nullable=False, server_default=text("''")),
+    sa.Column("tracker", Name, nullable=False, server_default=sa.text("''")),
     # JSON; null: the shipped ones hold again.
-    Column("settings", Text),
-    Column("who", String(64), nullable=False),
-    Column("comment", Text),
-    Column("since", Moment, nullable=False),
-    Column("until", Moment),
+    sa.Column("settings", sa.Text),
+    sa.Column("who", sa.String(64), nullable=False),
+    sa.Column("comment", sa.Text),
+    sa.Column("since", Moment, nullable=False),
+    sa.Column("until", Moment),
+    sa.Index(
+        "uq_limits_open",
+        *("spacecraft", "quantity", "tracker"),
+        unique=True,
+        **rows_where("until IS NULL"),
+    ),
+    sa.Index("ix_limits_history", "spacecraft", "quantity", "tracker", "id"),
 )
-_OPEN_LIMIT: dict[str, Any] = {
-    "sqlite_where": limits.c.until.is_(None),
-    "postgresql_where": limits.c.until.is_(None),
-}
-_LIMITED = (limits.c.spacecraft, limits.c.quantity, limits.c.tracker)
-Index("uq_limits_open", *_LIMITED, unique=True, **_OPEN_LIMIT)
-Index("ix_limits_history", *_LIMITED, limits.c.id)
 
-watches = Table(
+watches = sa.Table(
     "watches",
     metadata,
-    Column("spacecraft", Name, primary_key=True),
-    Column("run", RunName, primary_key=True),
+    sa.Column("spacecraft", Name, primary_key=True),
+    sa.Column("run", RunName, primary_key=True),
     # The latest batch looked at: its time, its id, and when it came.
-    Column("time", Moment, nullable=False),
-    Column("time_ns", BigInteger, nullable=False),
-    Column("batch_id", Id, nullable=False),
-    Column("received", Moment, nullable=False),
+    sa.Column("time", Moment, nullable=False),
+    sa.Column("time_ns", sa.BigInteger, nullable=False),
+    sa.Column("batch_id", Id, nullable=False),
+    sa.Column("received", Moment, nullable=False),
     # The latest batches' values, and since when each quantity is out of its limits.
-    Column("state", Text, nullable=False),
+    sa.Column("state", sa.Text, nullable=False),
 )
 
-alarms = Table(
+alarms = sa.Table(
     "alarms",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, nullable=False),
-    Column("quantity", String(32), nullable=False),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, nullable=False),
+    sa.Column("quantity", sa.String(32), nullable=False),
     # Empty: of the spacecraft as a whole.
-    Column("tracker", Name, nullable=False, server_default=text("''")),
+    sa.Column("tracker", Name, nullable=False, server_default=sa.text("''")),
     # The worst so far, and that of now: null is back in limits.
-    Column("severity", String(16), nullable=False),
-    Column("current_severity", String(16)),
-    Column("raised_at", Moment, nullable=False),
-    Column("bound", Double, nullable=False),
+    sa.Column("severity", sa.String(16), nullable=False),
+    sa.Column("current_severity", sa.String(16)),
+    sa.Column("raised_at", Moment, nullable=False),
+    sa.Column("bound", sa.Double, nullable=False),
     *(
-        Column(f"{which}_{name}", kind, nullable=name == "batch_id")
+        sa.Column(f"{which}_{name}", kind, nullable=name == "batch_id")
         for which in ("raised", "worst", "latest")
-        for name, kind in (("value", Double), ("time", Moment), ("batch_id", Id))
+        for name, kind in (("value", sa.Double), ("time", Moment), ("batch_id", Id))
     ),
-    Column("returned_at", Moment),
-    Column("acknowledged_at", Moment),
-    Column("acknowledged_by", String(64)),
-    Column("shelved_at", Moment),
-    Column("shelved_by", String(64)),
-    Column("shelved_until", Moment),
-    Column("cleared_at", Moment),
+    sa.Column("returned_at", Moment),
+    sa.Column("acknowledged_at", Moment),
+    sa.Column("acknowledged_by", sa.String(64)),
+    sa.Column("shelved_at", Moment),
+    sa.Column("shelved_by", sa.String(64)),
+    sa.Column("shelved_until", Moment),
+    sa.Column("cleared_at", Moment),
+    sa.Index(
+        "uq_alarms_active",
+        *("run", "spacecraft", "quantity", "tracker"),
+        unique=True,
+        **rows_where("cleared_at IS NULL"),
+    ),
+    sa.Index("ix_alarms_run", "run", "id"),
 )
-_ACTIVE: dict[str, Any] = {
-    "sqlite_where": alarms.c.cleared_at.is_(None),
-    "postgresql_where": alarms.c.cleared_at.is_(None),
-}
-Index(
-    "uq_alarms_active",
-    alarms.c.run,
-    alarms.c.spacecraft,
-    alarms.c.quantity,
-    alarms.c.tracker,
-    unique=True,
-    **_ACTIVE,
-)
-Index("ix_alarms_run", alarms.c.run, alarms.c.id)
 
-alarm_actions = Table(
+alarm_actions = sa.Table(
     "alarm_actions",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("alarm_id", Id, ForeignKey(alarms.c.id), nullable=False, index=True),
-    Column("at", Moment, nullable=False),
-    Column("action", String(16), nullable=False),
-    Column("who", String(64)),
-    Column("comment", Text),
-    Column("severity", String(16)),
-    Column("value", Double),
-    Column("time", Moment),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("alarm_id", Id, sa.ForeignKey(alarms.c.id), nullable=False, index=True),
+    sa.Column("at", Moment, nullable=False),
+    sa.Column("action", sa.String(16), nullable=False),
+    sa.Column("who", sa.String(64)),
+    sa.Column("comment", sa.Text),
+    sa.Column("severity", sa.String(16)),
+    sa.Column("value", sa.Double),
+    sa.Column("time", Moment),
 )
 
-annotations = Table(
+annotations = sa.Table(
     "annotations",
     metadata,
-    Column("id", Id, primary_key=True),
+    sa.Column("id", Id, primary_key=True),
     # Null: about every spacecraft.
-    Column("spacecraft", Name),
+    sa.Column("spacecraft", Name),
     # In telemetry time, as a batch has it; without an end it is about a moment.
-    Column("start", Moment, nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
-    Column("end", Moment),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("text", Text, nullable=False),
-    Column("who", String(64), nullable=False),
-    Column("created", Moment, nullable=False),
+    sa.Column("start", Moment, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end", Moment),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("text", sa.Text, nullable=False),
+    sa.Column("who", sa.String(64), nullable=False),
+    sa.Column("created", Moment, nullable=False),
 )

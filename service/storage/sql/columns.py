@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import zstandard
-from sqlalchemy import Dialect, MetaData, String, Text
+from sqlalchemy import Dialect, MetaData, String, Text, text
 from sqlalchemy.types import TypeDecorator
 
 Row = dict[str, Any]
@@ -26,6 +26,17 @@ Name = String(128)
 RunName = String(64)
 Digest = String(80)
 Moment = String(30)
+
+
+def rows_where(sqlite: str, postgresql: str = "") -> dict[str, Any]:
+    """The arguments of an index of some rows only, by the condition that both dialects have.
+
+    SQLite uses such an index only where the query repeats its words.
+    """
+    return {"sqlite_where": text(sqlite), "postgresql_where": text(postgresql or sqlite)}
+
+
+CURRENT = rows_where("current = 1", "current")
 
 
 # Long texts of the record, compressed on SQLite; PostgreSQL compresses such texts itself.

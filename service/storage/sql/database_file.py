@@ -190,19 +190,6 @@ class FileLock:
             self._descriptor, self._is_held = None, False
 
 
-def is_written(file: DatabaseFile) -> bool:
-    """True if a process holds the lock of a file that exists; this one must have it not open."""
-    lock = FileLock(file)
-    file.require_there()
-    try:
-        lock.take()
-    except BadConfiguration:
-        return True
-    finally:
-        lock.release()
-    return False
-
-
 @contextmanager
 def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
     """Hold the lock of a file, for changes without a `Store`; None: a database server."""
@@ -215,6 +202,16 @@ def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+def is_written(file: DatabaseFile) -> bool:
+    """True if a process holds the lock of a file that exists; this one must have it not open."""
+    file.require_there()
+    try:
+        with writing_alone(file):
+            return False
+    except BadConfiguration:
+        return True
 
 
 def _holder(descriptor: int) -> str:

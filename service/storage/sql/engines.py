@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from sqlalchemy import URL, Connection, Engine, create_engine, event, make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError
@@ -21,6 +21,11 @@ from sqlalchemy.pool import QueuePool
 from service.errors import BadConfiguration
 from service.storage.sql.connections import driver_of, run_by_driver
 from service.storage.sql.database_file import DatabaseFile
+
+if TYPE_CHECKING:
+    from psycopg.abc import PQGen
+
+RV = TypeVar("RV")
 
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
@@ -60,6 +65,8 @@ TO_SHOW = Timeouts(lock_s=2.0, statement_s=12.0)
 PATIENT_S = 60.0
 """The timeout of a statement of a bulk load, which has time: posts do not wait for it."""
 MORE_S = 1.0
+PING_S = 2.0
+"""The timeout of the question whether a pooled connection is still there."""
 CONNECT_S, TCP_USER_TIMEOUT_S = 2, 8
 FREE_S = 10.0
 """The longest wait for a reader's connection that is free."""
@@ -169,7 +176,28 @@ def _postgresql(url: URL, timeouts: Timeouts | None, **pool: Any) -> Engine:
 
 def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
     """An engine whose connections wait no longer than the timeouts; what the URL says holds."""
-    from service.storage.sql.postgresql import BoundedConnection
+    import psycopg
+
+    class BoundedConnection(psycopg.Connection[tuple[object, ...]]):
+        """A connection that is closed once an answer takes longer than `answer_s`.
+
+        A server's own time-outs hold as long as it runs.  A server that is stopped, or a
+        proxy before it, acknowledges every packet and never answers.
+        """
+
+        answer_s = timeouts.statement_s + MORE_S
+
+        def wait(self, gen: "PQGen[RV]", interval: float = 0.1, timeout: float | None = None) -> RV:
+            """Let a statement run to its end; raises `OperationalError` where it takes long."""
+            if timeout is None:
+                # SQLAlchemy asks whether the connection is there outside of any transaction.
+                timeout = min(PING_S, self.answer_s) if self.autocommit else self.answer_s
+            try:
+                return super().wait(gen, interval, timeout)
+            except psycopg.errors._WaitTimeout as error:
+                # The state of the server is unknown: the connection is not used again.
+                self.pgconn.finish()
+                raise psycopg.OperationalError(f"no answer within {timeout:g} s") from error
 
     seconds = {
         "lock_timeout": timeouts.lock_s,
@@ -193,9 +221,7 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
 
     @event.listens_for(engine, "do_connect")
     def _connect(_dialect: Any, _record: Any, cargs: Any, cparams: Any) -> Any:
-        connection = BoundedConnection.connect(*cargs, **cparams)
-        connection.answer_s = timeouts.statement_s + MORE_S
-        return connection
+        return BoundedConnection.connect(*cargs, **cparams)
 
     return engine
 

@@ -4,109 +4,80 @@ A day that is computed again from other facts gets a new row with the next revis
 then the current one.  Rows of earlier revisions stay, without their samples.
 """
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Column,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    SmallInteger,
-    String,
-    Table,
-    Text,
-    UniqueConstraint,
-    text,
-)
+import sqlalchemy as sa
 
-from service.storage.sql.columns import Digest, Id, Moment, Name, RunName, metadata
+from service.storage.sql.columns import CURRENT, Digest, Id, Moment, Name, RunName, metadata
 from service.storage.sql.tables import runs
 
 INNOVATIONS = "innovations"
 """In the place of a grade: the block has measurements, as they met the filter."""
 
-graded_days = Table(
+graded_days = sa.Table(
     "graded_days",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, ForeignKey(runs.c.name), nullable=False),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
     # The UTC day, counted as `Utc.bucket`, and its bounds.
-    Column("day", Integer, nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("revision", Integer, nullable=False),
-    Column("current", Boolean, nullable=False),
-    Column("created", Moment, nullable=False),
+    sa.Column("day", sa.Integer, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("revision", sa.Integer, nullable=False),
+    sa.Column("current", sa.Boolean, nullable=False),
+    sa.Column("created", Moment, nullable=False),
     # Of all that it was computed from, and of what was computed.
-    Column("inputs", Digest, nullable=False),
-    Column("digest", Digest, nullable=False),
+    sa.Column("inputs", Digest, nullable=False),
+    sa.Column("digest", Digest, nullable=False),
     # Of one grade.
-    Column("samples", Integer, nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
     # JSON: what became of the measurements and of the gyro.
-    Column("summary", Text, nullable=False),
-    UniqueConstraint("spacecraft", "run", "day", "revision"),
+    sa.Column("summary", sa.Text, nullable=False),
+    sa.UniqueConstraint("spacecraft", "run", "day", "revision"),
+    sa.Index("uq_graded_days_current", "spacecraft", "run", "day", unique=True, **CURRENT),
+    sa.Index("ix_graded_days_by_end", "end_ns"),
 )
-Index(
-    "uq_graded_days_current",
-    graded_days.c.spacecraft,
-    graded_days.c.run,
-    graded_days.c.day,
-    unique=True,
-    sqlite_where=text("current = 1"),
-    postgresql_where=text("current"),
-)
-Index("ix_graded_days_by_end", graded_days.c.end_ns)
 
-graded_blocks = Table(
+graded_blocks = sa.Table(
     "graded_blocks",
     metadata,
-    Column("day_id", Id, ForeignKey(graded_days.c.id), primary_key=True),
+    sa.Column("day_id", Id, sa.ForeignKey(graded_days.c.id), primary_key=True),
     # filtered, smoothed, or innovations.
-    Column("grade", String(16), primary_key=True),
-    Column("position", SmallInteger, primary_key=True),
+    sa.Column("grade", sa.String(16), primary_key=True),
+    sa.Column("position", sa.SmallInteger, primary_key=True),
     # gyro or constant_rate.
-    Column("model", String(16), nullable=False),
+    sa.Column("model", sa.String(16), nullable=False),
     # Of the first sample and of the last.
-    Column("start_ns", BigInteger, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("samples", Integer, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
     # See service/grades/day.py.
-    Column("packed", LargeBinary, nullable=False),
+    sa.Column("packed", sa.LargeBinary, nullable=False),
 )
 
 
-gyro_blocks = Table(
+gyro_blocks = sa.Table(
     "gyro_blocks",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, ForeignKey(runs.c.name), nullable=False),
-    Column("block", Name, nullable=False),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
+    sa.Column("block", Name, nullable=False),
     # Of the first sample and of the last.
-    Column("start", Moment, nullable=False),
-    Column("end", Moment, nullable=False),
-    Column("start_ns", BigInteger, nullable=False),
-    Column("end_ns", BigInteger, nullable=False),
-    Column("received", Moment, nullable=False),
-    Column("fingerprint", String(64), nullable=False),
-    Column("samples", Integer, nullable=False),
+    sa.Column("start", Moment, nullable=False),
+    sa.Column("end", Moment, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("received", Moment, nullable=False),
+    sa.Column("fingerprint", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
     # Null where the block has times of its own.
-    Column("step_s", Double),
+    sa.Column("step_s", sa.Double),
     # Packed: see service/gyro.py.
-    Column("times_s", LargeBinary),
-    Column("rates_rad_per_s", LargeBinary, nullable=False),
-    UniqueConstraint("spacecraft", "run", "block"),
+    sa.Column("times_s", sa.LargeBinary),
+    sa.Column("rates_rad_per_s", sa.LargeBinary, nullable=False),
+    sa.UniqueConstraint("spacecraft", "run", "block"),
+    # Periods, and blocks that may share a time with another: no block spans more than a day.
+    sa.Index("ix_gyro_blocks_by_start", "spacecraft", "run", "start_ns", "end_ns"),
+    # What is pruned is found by its end, in all runs or in one.
+    sa.Index("ix_gyro_blocks_by_end", "end_ns"),
 )
-# Periods, and blocks that may share a time with another: no block spans more than a day.
-Index(
-    "ix_gyro_blocks_by_start",
-    gyro_blocks.c.spacecraft,
-    gyro_blocks.c.run,
-    gyro_blocks.c.start_ns,
-    gyro_blocks.c.end_ns,
-)
-# What is pruned is found by its end, in all runs or in one.
-Index("ix_gyro_blocks_by_end", gyro_blocks.c.end_ns)

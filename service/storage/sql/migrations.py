@@ -18,15 +18,9 @@ from sqlalchemy.exc import SQLAlchemyError
 from service import __version__
 from service.errors import BadConfiguration
 from service.resources import shipped
+from service.storage.sql import engines
 from service.storage.sql.columns import metadata, unpack
 from service.storage.sql.database_file import writing_alone
-from service.storage.sql.engines import (
-    database_file,
-    database_url,
-    reading_engine,
-    shown_url,
-    writing_engine,
-)
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -45,22 +39,31 @@ def upgrade(database: str) -> None:
     Raises `BadConfiguration` for a database that cannot be reached, is none,
     or was written by a newer version.
     """
-    url = database_url(database)
-    with writing_alone(database_file(url)), disposed(writing_engine(url)) as engine:
+    url = engines.database_url(database)
+    with writing_alone(engines.database_file(url)), disposed(engines.writing_engine(url)) as engine:
         bring_up_to_date(engine)
 
 
-def require_there(database: str) -> None:
-    """Raise `BadConfiguration` where a SQLite file is missing.
+@contextmanager
+def reading(database: str) -> Iterator[Connection]:
+    """A connection that reads a database as of one moment, and creates nothing.
 
-    To open it would create it; a command that reads must not.
+    Raises `BadConfiguration` where the database is missing or cannot be reached.
     """
-    url = database_url(database)
-    if url.drivername != "sqlite":
-        return
+    url = engines.database_url(database)
     file = Path(url.database or "")
-    if not file.is_file():
+    if url.drivername == "sqlite" and not file.is_file():
         raise BadConfiguration(f"ACQUIRE_DATABASE: {file}: there is no such file")
+    with connected(url) as connection:
+        yield connection
+
+
+@contextmanager
+def connected(url: URL) -> Iterator[Connection]:
+    """A connection that reads the database of a URL as of one moment."""
+    engine = engines.reading_engine(url)
+    with disposed(engine), reported(url), engine.begin() as connection:
+        yield connection
 
 
 def require_records(database: str) -> None:
@@ -68,19 +71,16 @@ def require_records(database: str) -> None:
 
     What opens a database to write would make the service's tables in it.
     """
-    require_there(database)
-    url = database_url(database)
+    url = engines.database_url(database)
     if url.drivername == "sqlite" and revision_of(database) is None:
         raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {shown_url(url)}: holds no records of this service"
+            f"ACQUIRE_DATABASE: {engines.shown_url(url)}: holds no records of this service"
         )
 
 
 def revision_of(database: str) -> str | None:
     """The revision of a database's schema; None where it holds no records of the service."""
-    require_there(database)
-    url = database_url(database)
-    with disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+    with reading(database) as connection:
         return revision_in(connection)
 
 
@@ -90,9 +90,7 @@ def check(database: str) -> list[str]:
     Nothing is written and nothing created: raises `BadConfiguration` where
     there is no database.
     """
-    require_there(database)
-    url = database_url(database)
-    with disposed(reading_engine(url)) as engine, reported(url), engine.begin() as connection:
+    with reading(database) as connection:
         differs = _difference(connection)
         if differs is not None:
             return [differs]
@@ -107,13 +105,7 @@ def check(database: str) -> list[str]:
 def all_tables() -> list[Table]:
     """All tables of the code, each after those that it refers to."""
     # A table is known to the metadata when its module is loaded.
-    from service.storage.sql import (  # noqa: F401
-        access_tables,
-        alarm_tables,
-        calibration_tables,
-        grade_tables,
-        tables,
-    )
+    from service.storage.sql import access_tables, alarm_tables, grade_tables, tables  # noqa: F401
 
     return metadata.sorted_tables
 
@@ -141,11 +133,11 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
         try:
             command.upgrade(config, "head")
             what = "made with" if found is None else f"brought from {found} to"
-            log.info("%s: %s the schema %s", shown_url(engine.url), what, HEAD)
+            log.info("%s: %s the schema %s", engines.shown_url(engine.url), what, HEAD)
         except CommandError:
             differs = _difference(connection)
             raise BadConfiguration(
-                f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {differs}"
+                f"ACQUIRE_DATABASE: {engines.shown_url(engine.url)}: {differs}"
             ) from None
 
 
@@ -154,13 +146,7 @@ def require_up_to_date(engine: Engine) -> None:
     with reported(engine.url), engine.begin() as connection:
         differs = _difference(connection)
     if differs is not None:
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(engine.url)}: {differs}")
-
-
-def require_revision(database: str) -> None:
-    """`require_up_to_date` of a database that is only read."""
-    with disposed(reading_engine(database_url(database))) as engine:
-        require_up_to_date(engine)
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {engines.shown_url(engine.url)}: {differs}")
 
 
 @contextmanager
@@ -170,7 +156,7 @@ def reported(url: URL) -> Iterator[None]:
         yield
     except (SQLAlchemyError, UnicodeDecodeError) as error:
         reason = str(getattr(error, "orig", None) or error).strip()
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: {reason}") from error
+        raise BadConfiguration(f"ACQUIRE_DATABASE: {engines.shown_url(url)}: {reason}") from error
 
 
 @contextmanager

@@ -2,26 +2,13 @@
 
 import operator
 import sqlite3
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import chain
 from operator import itemgetter
-from typing import Any
+from typing import Any, TypeVar
 
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Connection,
-    Double,
-    Executable,
-    Integer,
-    LargeBinary,
-    SmallInteger,
-    String,
-    Table,
-    case,
-    or_,
-)
+import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 
@@ -29,8 +16,8 @@ from service.storage.sql.columns import PackedText, Row, pack
 from service.storage.sql.connections import TranslatedErrors
 from service.storage.sql.tables import COUNTS, MAXIMA, MINIMA, SUMS, runs
 
-# Statements that are put into SQL once and run many times.
-#
+T = TypeVar("T")
+
 # SQLAlchemy compiles a statement at every execution and wraps every row.  With a
 # dozen statements for each group of results that takes longer than running them.
 # On SQLite the compiled text goes to the driver directly, with values by position;
@@ -45,13 +32,13 @@ _STYLES = {"sqlite": (sqlite, "qmark"), "postgresql": (postgresql, "pyformat")}
 class Prepared:
     """A statement whose SQL is the same whatever its values."""
 
-    def __init__(self, make: Callable[[Any], Executable]) -> None:
+    def __init__(self, make: Callable[[Any], sa.Executable]) -> None:
         """`make` is given the module of a dialect, whose `insert` knows of conflicts."""
         self._make = make
         self._ready: dict[str, tuple[str, tuple[str, ...]]] = {}
         self._of_many: dict[int, str] = {}
 
-    def run(self, connection: Connection, rows: Sequence[Row]) -> None:
+    def run(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
         """Run the statement with the values of every row, by name."""
         if not rows:
             return
@@ -63,7 +50,7 @@ class Prepared:
         with TranslatedErrors(connection, sql) as driver:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
 
-    def insert(self, connection: Connection, rows: Sequence[Row]) -> None:
+    def insert(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
         """`run` of an INSERT that ends with its values, on SQLite of many rows at a time.
 
         The driver lets go of the interpreter's lock with every step, and while
@@ -92,7 +79,7 @@ class Prepared:
             many = self._of_many[count] = sql + one_more * (count - 1)
         return many
 
-    def read(self, connection: Connection, values: Row) -> list[Row]:
+    def read(self, connection: sa.Connection, values: Row) -> list[Row]:
         """The rows that the statement gives."""
         sql, names = self._sql(connection.dialect.name)
         if connection.dialect.name != "sqlite":
@@ -114,12 +101,14 @@ class Prepared:
         return ready
 
 
-def prepared(statement: Executable) -> Prepared:
+def prepared(statement: sa.Executable) -> Prepared:
     """A statement that is the same in every dialect."""
     return Prepared(lambda _: statement)
 
 
-def execute(connection: Connection, sql: str, values: Row | None = None) -> list[tuple[Any, ...]]:
+def execute(
+    connection: sa.Connection, sql: str, values: Row | None = None
+) -> list[tuple[Any, ...]]:
     """Run SQL of the dialect's own, values by name; its rows."""
     if connection.dialect.name != "sqlite":
         result = connection.exec_driver_sql(sql, values or {})
@@ -132,23 +121,50 @@ def _names(cursor: sqlite3.Cursor) -> list[str]:
     return [column[0] for column in cursor.description]
 
 
+def portions(values: Sequence[T]) -> Iterator[Sequence[T]]:
+    """The values in portions of a thousand: no database takes any number of them at once."""
+    for first in range(0, len(values), 1_000):
+        yield values[first : first + 1_000]
+
+
+def count(connection: sa.Connection, table: sa.Table, *chosen: sa.ColumnElement[bool]) -> int:
+    """The number of a table's rows that are chosen."""
+    query = sa.select(sa.func.count()).select_from(table).where(*chosen)
+    return int(connection.execute(query).scalar_one())
+
+
+def rows_of(connection: sa.Connection, query: sa.Select[Any]) -> list[Row]:
+    """The rows that a query gives, by the names of their columns."""
+    return [dict(row) for row in connection.execute(query).mappings()]
+
+
+def owned_rows(
+    connection: sa.Connection, table: sa.Table, owner: str, ids: Iterable[str]
+) -> dict[str, list[Row]]:
+    """The rows of a table by the id that their column `owner` names, which may have none."""
+    found: dict[str, list[Row]] = {id: [] for id in ids}
+    for row in rows_of(connection, sa.select(table).where(table.c[owner].in_(found))):
+        found[row[owner]].append(row)
+    return found
+
+
 COPIED_FROM = 50
 """Rows; to set a COPY up takes as long as to insert a few."""
 
 # Of two that fit, the narrower stands first; Text is a String.
 _COPIED: Sequence[tuple[type[Any], str]] = (
-    (BigInteger, "int8"),
-    (SmallInteger, "int2"),
-    (Integer, "int4"),
-    (Boolean, "bool"),
-    (Double, "float8"),
-    (LargeBinary, "bytea"),
-    (String, "text"),
+    (sa.BigInteger, "int8"),
+    (sa.SmallInteger, "int2"),
+    (sa.Integer, "int4"),
+    (sa.Boolean, "bool"),
+    (sa.Double, "float8"),
+    (sa.LargeBinary, "bytea"),
+    (sa.String, "text"),
     (PackedText, "text"),
 )
 
 
-def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
+def insert_all(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
     """Insert rows that name every column; on PostgreSQL many of them by COPY."""
     if len(rows) >= COPIED_FROM and connection.dialect.name == "postgresql":
         _copy(connection, table, rows)
@@ -160,18 +176,18 @@ def insert_all(connection: Connection, table: Table, rows: Sequence[Row]) -> Non
 
 
 @cache
-def _packed(table: Table) -> Sequence[str]:
+def _packed(table: sa.Table) -> Sequence[str]:
     """The columns whose values SQLite's driver is given packed."""
     return [column.name for column in table.c if isinstance(column.type, PackedText)]
 
 
-def insert_missing(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
+def insert_missing(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
     """Insert the rows whose keys are not there yet; leave the others as they are."""
     _insert_missing(table).run(connection, rows)
 
 
 def insert_runs(
-    connection: Connection,
+    connection: sa.Connection,
     created: Mapping[str, str],
     *,
     alarms: bool = False,
@@ -183,12 +199,12 @@ def insert_runs(
     insert_missing(connection, runs, rows)
 
 
-def add_rollups(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
+def add_rollups(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
     """Merge each row of a rollup into that of its key: sums add up, outer extremes stay."""
     _add_rollups(table).run(connection, rows)
 
 
-def _copy(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
+def _copy(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
     """Send rows as PostgreSQL's COPY takes them, in the transaction and savepoint at hand.
 
     What the server says against a row is raised as by any other statement.
@@ -212,7 +228,7 @@ def _copy(connection: Connection, table: Table, rows: Sequence[Row]) -> None:
 
 
 @cache
-def _copy_of(table: Table) -> tuple[str, list[str]]:
+def _copy_of(table: sa.Table) -> tuple[str, list[str]]:
     """The statement, and the types that its binary rows are made of."""
     names = ", ".join(f'"{column.name}"' for column in table.columns)
     types = [
@@ -223,30 +239,30 @@ def _copy_of(table: Table) -> tuple[str, list[str]]:
 
 
 @cache
-def _insert(table: Table) -> Prepared:
+def _insert(table: sa.Table) -> Prepared:
     return Prepared(lambda kind: kind.insert(table))
 
 
 @cache
-def _insert_missing(table: Table) -> Prepared:
+def _insert_missing(table: sa.Table) -> Prepared:
     return Prepared(lambda kind: kind.insert(table).on_conflict_do_nothing())
 
 
 @cache
-def _add_rollups(table: Table) -> Prepared:
+def _add_rollups(table: sa.Table) -> Prepared:
     return Prepared(lambda kind: _merging(kind.insert(table), table))
 
 
-def _merging(statement: Any, table: Table) -> Executable:
+def _merging(statement: Any, table: sa.Table) -> sa.Executable:
     new = statement.excluded
     merged = {name: table.c[name] + new[name] for name in (*COUNTS, *SUMS)}
     # By CASE: of a null SQLite's MIN is null, PostgreSQL's LEAST the other one.
     for names, is_outer in ((MINIMA, operator.lt), (MAXIMA, operator.gt)):
         for name in names:
             old = table.c[name]
-            takes_over = or_(old.is_(None), is_outer(new[name], old))
-            merged[name] = case((takes_over, new[name]), else_=old)
-    found: Executable = statement.on_conflict_do_update(
+            takes_over = sa.or_(old.is_(None), is_outer(new[name], old))
+            merged[name] = sa.case((takes_over, new[name]), else_=old)
+    found: sa.Executable = statement.on_conflict_do_update(
         index_elements=list(table.primary_key), set_=merged
     )
     return found

@@ -13,6 +13,7 @@
     annotations                                    notes of people (alarm_tables.py)
     archived_parts, archived_batches, ...          batches that left it (see their figure below)
     events, event_counter                          recent events in order of commit
+    calibrations ── calibration_adoptions          of trackers, and what holds of them
     replays
     access_tokens ── access_sessions, audit        who may ask, who changed what (access_tables.py)
 
@@ -28,29 +29,21 @@ A batch's time is kept as the text of its UTC and as `time_ns`, nanoseconds of
 TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
 """
 
-from typing import Any
-
-from sqlalchemy import (
-    BigInteger,
-    Boolean,
-    Column,
-    Double,
-    ForeignKey,
-    Index,
-    Integer,
-    LargeBinary,
-    SmallInteger,
-    String,
-    Table,
-    Text,
-    UniqueConstraint,
-    false,
-    text,
-)
+import sqlalchemy as sa
 
 from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
-from service.storage.sql.columns import Digest, Id, Moment, Name, PackedText, RunName, metadata
+from service.storage.sql.columns import (
+    CURRENT,
+    Digest,
+    Id,
+    Moment,
+    Name,
+    PackedText,
+    RunName,
+    metadata,
+    rows_where,
+)
 
 # The rollups: sums and extremes of current results by hour and day, for trends.
 #
@@ -68,327 +61,330 @@ ROLLED_UP = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
 """The columns of a rollup without its key."""
 
 
-def _rollup(name: str, *trackers: Column[str]) -> Table:
+def _rollup(name: str, *key: str) -> sa.Table:
     """Sums and extremes over the current results of each spacecraft, run, tracker and bucket.
 
     A bucket is a UTC hour or day (see `Utc.bucket`).  `_n` batches have the
     value whose `_sum` stands beside it; an extreme of none is null.
     """
-    return Table(
+    return sa.Table(
         name,
         metadata,
-        Column("spacecraft", Name, primary_key=True),
-        Column("run", RunName, primary_key=True),
-        *trackers,
-        Column("bucket", Integer, primary_key=True, autoincrement=False),
-        *(Column(count, BigInteger, nullable=False) for count in COUNTS),
-        *(Column(each, _type_of(each), nullable=False, server_default=text("0")) for each in SUMS),
-        *(Column(each, Double) for each in (*MINIMA, *MAXIMA)),
+        sa.Column("spacecraft", Name, primary_key=True),
+        sa.Column("run", RunName, primary_key=True),
+        *(sa.Column(name, Name, primary_key=True) for name in key),
+        sa.Column("bucket", sa.Integer, primary_key=True, autoincrement=False),
+        *(sa.Column(count, sa.BigInteger, nullable=False) for count in COUNTS),
+        *(
+            sa.Column(f"{name}_{part}", kind, nullable=False, server_default=sa.text("0"))
+            for name in VALUES
+            for part, kind in (("n", sa.BigInteger), ("sum", sa.Double))
+        ),
+        *(sa.Column(each, sa.Double) for each in (*MINIMA, *MAXIMA)),
         sqlite_with_rowid=False,
     )
 
 
-def _type_of(sum_name: str) -> type[BigInteger] | type[Double[float]]:
-    return BigInteger if sum_name.endswith("_n") else Double
+rollups_hourly, rollups_daily = _rollup("rollups_hourly"), _rollup("rollups_daily")
+tracker_rollups_hourly = _rollup("tracker_rollups_hourly", "tracker")
+tracker_rollups_daily = _rollup("tracker_rollups_daily", "tracker")
 
-
-rollups_hourly = _rollup("rollups_hourly")
-rollups_daily = _rollup("rollups_daily")
-tracker_rollups_hourly = _rollup(
-    "tracker_rollups_hourly", Column("tracker", Name, primary_key=True)
-)
-tracker_rollups_daily = _rollup("tracker_rollups_daily", Column("tracker", Name, primary_key=True))
-
-tracker_splits = Table(
+tracker_splits = sa.Table(
     "tracker_splits",
     metadata,
     # A run of a spacecraft whose older batches are not split by tracker yet; no row: all are.
-    Column("spacecraft", Name, primary_key=True),
-    Column("run", RunName, primary_key=True),
+    sa.Column("spacecraft", Name, primary_key=True),
+    sa.Column("run", RunName, primary_key=True),
     # Batches before this one, in order of time, are still to be split; null: none was.
-    Column("time_ns", BigInteger),
-    Column("batch_id", Id),
+    sa.Column("time_ns", sa.BigInteger),
+    sa.Column("batch_id", Id),
     sqlite_with_rowid=False,
 )
 
 
-runs = Table(
+runs = sa.Table(
     "runs",
     metadata,
-    Column("name", RunName, primary_key=True),
-    Column("created", Moment, nullable=False),
+    sa.Column("name", RunName, primary_key=True),
+    sa.Column("created", Moment, nullable=False),
     # Whether limits are held against the run; live batches are watched in any case.
-    Column("alarms", Boolean, nullable=False, server_default=false()),
+    sa.Column("alarms", sa.Boolean, nullable=False, server_default=sa.false()),
     # Whether it was reprocessed with tracking: it must not continue without, nor another with.
-    Column("tracked", Boolean, nullable=False, server_default=false()),
+    sa.Column("tracked", sa.Boolean, nullable=False, server_default=sa.false()),
 )
 
-missions = Table(
+missions = sa.Table(
     "missions",
     metadata,
-    Column("digest", Digest, primary_key=True),
-    Column("spacecraft", Name, nullable=False, index=True),
-    Column("settings", Text, nullable=False),
-    Column("first_used", Moment, nullable=False),
-    Column("row_digest", BigInteger),
+    sa.Column("digest", Digest, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False, index=True),
+    sa.Column("settings", sa.Text, nullable=False),
+    sa.Column("first_used", Moment, nullable=False),
+    sa.Column("row_digest", sa.BigInteger),
 )
 
-mission_uses = Table(
+mission_uses = sa.Table(
     "mission_uses",
     metadata,
-    Column("id", Integer, primary_key=True),
-    Column("spacecraft", Name, nullable=False, index=True),
-    Column("digest", Digest, ForeignKey(missions.c.digest), nullable=False),
-    Column("since", Moment, nullable=False),
-    Column("row_digest", BigInteger),
+    sa.Column("id", sa.Integer, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False, index=True),
+    sa.Column("digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
+    sa.Column("since", Moment, nullable=False),
+    sa.Column("row_digest", sa.BigInteger),
 )
 
-catalogs = Table(
+# Calibrations of the trackers, and what an operator adopted of them in the place of the settings.
+calibrations = sa.Table(
+    "calibrations",
+    metadata,
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    # From 1 for each spacecraft.
+    sa.Column("version", sa.Integer, nullable=False),
+    sa.Column("run", RunName, nullable=False),
+    sa.Column("created", Moment, nullable=False),
+    sa.Column("ended", Moment),
+    sa.Column("who", sa.String(64), nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("done", sa.Integer, nullable=False),
+    sa.Column("total", sa.Integer, nullable=False),
+    # The settings that it started from.
+    sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
+    # JSON: what was asked, what was found, and the covariance, which is large, by itself.
+    sa.Column("request", sa.Text, nullable=False),
+    sa.Column("result", sa.Text),
+    sa.Column("covariance", sa.Text),
+    sa.Column("fault", sa.Text),
+    sa.Index("uq_calibrations_version", "spacecraft", "version", unique=True),
+)
+
+calibration_adoptions = sa.Table(
+    "calibration_adoptions",
+    metadata,
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("adopted", Moment, nullable=False),
+    sa.Column("who", sa.String(64), nullable=False),
+    sa.Column("note", sa.Text, nullable=False),
+    # Null: back to the mission file.
+    sa.Column("calibration_id", Id, sa.ForeignKey(calibrations.c.id)),
+    # The settings of the mission file that it lies over, and those of both together.
+    sa.Column("file_digest", Digest, nullable=False),
+    sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
+    # JSON: alignment and focal plane of every tracker.  Null: as the mission file has them.
+    sa.Column("trackers", sa.Text),
+    sa.Index("ix_calibration_adoptions_spacecraft", "spacecraft", "id"),
+)
+
+catalogs = sa.Table(
     "catalogs",
     metadata,
-    Column("digest", Digest, primary_key=True),
-    Column("name", Text, nullable=False),
-    Column("first_used", Moment, nullable=False),
-    Column("row_digest", BigInteger),
+    sa.Column("digest", Digest, primary_key=True),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("first_used", Moment, nullable=False),
+    sa.Column("row_digest", sa.BigInteger),
 )
 
-batches = Table(
+batches = sa.Table(
     "batches",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, ForeignKey(runs.c.name), nullable=False),
-    Column("batch", Name, nullable=False),
-    Column("time", Moment, nullable=False),
-    Column("time_ns", BigInteger, nullable=False),
-    Column("received", Moment, nullable=False),
-    Column("fingerprint", String(64), nullable=False),
-    Column("input", PackedText, nullable=False),
-    UniqueConstraint("spacecraft", "run", "batch"),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
+    sa.Column("batch", Name, nullable=False),
+    sa.Column("time", Moment, nullable=False),
+    sa.Column("time_ns", sa.BigInteger, nullable=False),
+    sa.Column("received", Moment, nullable=False),
+    sa.Column("fingerprint", sa.String(64), nullable=False),
+    sa.Column("input", PackedText, nullable=False),
+    sa.UniqueConstraint("spacecraft", "run", "batch"),
 )
 
-frames = Table(
+frames = sa.Table(
     "frames",
     metadata,
-    Column("batch_id", Id, ForeignKey(batches.c.id), primary_key=True),
-    Column("digest", Digest, nullable=False, index=True),
+    sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), primary_key=True),
+    sa.Column("digest", Digest, nullable=False, index=True),
     # JSON: what the answer says of the frame, and what was found on it.
-    Column("summary", Text, nullable=False),
-    Column("detections", Text, nullable=False),
+    sa.Column("summary", sa.Text, nullable=False),
+    sa.Column("detections", sa.Text, nullable=False),
     # PNG; so many pixels a side of the frame make one of it.
-    Column("preview", LargeBinary, nullable=False),
-    Column("preview_step", Integer, nullable=False),
+    sa.Column("preview", sa.LargeBinary, nullable=False),
+    sa.Column("preview_step", sa.Integer, nullable=False),
 )
 
 MEASURED = tuple(n for n, each in QUANTITIES.items() if isinstance(each.source, Measured))
 """The columns of measured quantities."""
 COUNTED = ("observed", "unique", "ambiguous", "unmatched")
 """The columns that count stars."""
+_FILTERS = ("status", "unique", "ambiguous", "unmatched")
 
-results = Table(
+results = sa.Table(
     "results",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("batch_id", Id, ForeignKey(batches.c.id), nullable=False),
-    Column("parent_id", Id, ForeignKey("results.id")),
-    Column("current", Boolean, nullable=False),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), nullable=False),
+    sa.Column("parent_id", Id, sa.ForeignKey("results.id")),
+    sa.Column("current", sa.Boolean, nullable=False),
     # The order in which results were recorded; zero: before there was one, or from an archive.
-    Column("seq", BigInteger, nullable=False, server_default=text("0")),
-    Column("created", Moment, nullable=False),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, nullable=False),
-    Column("time_ns", BigInteger, nullable=False),
-    Column("identifier", String(32), nullable=False),
-    Column("options", Text, nullable=False),
-    Column("mission_digest", Digest, ForeignKey(missions.c.digest), nullable=False),
-    Column("catalog_digest", Digest, ForeignKey(catalogs.c.digest), nullable=False),
-    *(Column(name, Integer, nullable=False) for name in COUNTED),
+    sa.Column("seq", sa.BigInteger, nullable=False, server_default=sa.text("0")),
+    sa.Column("created", Moment, nullable=False),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, nullable=False),
+    sa.Column("time_ns", sa.BigInteger, nullable=False),
+    sa.Column("identifier", sa.String(32), nullable=False),
+    sa.Column("options", sa.Text, nullable=False),
+    sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
+    sa.Column("catalog_digest", Digest, sa.ForeignKey(catalogs.c.digest), nullable=False),
+    *(sa.Column(name, sa.Integer, nullable=False) for name in COUNTED),
     # Of the attitude: good or suspect; null where there is none, and then a reason.
-    Column("status", String(16)),
-    Column("reason", String(64)),
+    sa.Column("status", sa.String(16)),
+    sa.Column("reason", sa.String(64)),
     # Null where the quantity is not known.
-    *(Column(name, Double) for name in MEASURED),
+    *(sa.Column(name, sa.Double) for name in MEASURED),
     # The answer's JSON, byte for byte as it was sent.
-    Column("answer", PackedText, nullable=False),
+    sa.Column("answer", PackedText, nullable=False),
     # Of all that is kept of the result.  Null: an earlier version recorded it, and the service has
     # not come to it yet; negative: then it was made, after the result.
-    Column("digest", BigInteger),
+    sa.Column("digest", sa.BigInteger),
+    # Lists, histories and trends look at current results alone, newest or oldest first; what they
+    # filter by stands in the index, so that a page touches the table only for the rows it shows.
+    sa.Index(
+        "ix_results_current_by_spacecraft",
+        *("spacecraft", "run", "time_ns", "batch_id"),
+        *_FILTERS,
+        # A trend over batches is drawn from the index alone.
+        *MEASURED,
+        **CURRENT,
+    ),
+    sa.Index("ix_results_current_by_run", "run", "time_ns", "batch_id", *_FILTERS, **CURRENT),
+    sa.Index(
+        "ix_results_current_by_time", "time_ns", "batch_id", "spacecraft", *_FILTERS, **CURRENT
+    ),
+    sa.Index("uq_results_current", "batch_id", unique=True, **CURRENT),
+    sa.Index("ix_results_what_ifs", "batch_id", **rows_where("parent_id IS NOT NULL")),
+    # The projector takes results in their order.
+    sa.Index("ix_results_seq", "seq"),
+    # Empty, or what `OlderDigests` still has to do.
+    sa.Index("ix_results_without_digest", "id", **rows_where("digest IS NULL")),
+    # Deleting a batch checks the foreign key of its results, and finds them.
+    sa.Index("ix_results_batch_id", "batch_id"),
+    # Deleting a result checks the foreign key of its what-ifs.
+    sa.Index("ix_results_parent", "parent_id", **rows_where("parent_id IS NOT NULL")),
 )
 
-# Lists, histories and trends look at current results alone, newest or oldest first; what they
-# filter by stands in the index, so that a page touches the table only for the rows it shows.
-_FILTERS = [results.c[name] for name in ("status", "unique", "ambiguous", "unmatched")]
-# SQLite uses a partial index only where the query repeats its words.
-_CURRENT: dict[str, Any] = {
-    "sqlite_where": text("current = 1"),
-    "postgresql_where": text("current"),
-}
-Index(
-    "ix_results_current_by_spacecraft",
-    results.c.spacecraft,
-    results.c.run,
-    results.c.time_ns,
-    results.c.batch_id,
-    *_FILTERS,
-    # A trend over batches is drawn from the index alone.
-    *(results.c[name] for name in MEASURED),
-    **_CURRENT,
-)
-Index(
-    "ix_results_current_by_run",
-    results.c.run,
-    results.c.time_ns,
-    results.c.batch_id,
-    *_FILTERS,
-    **_CURRENT,
-)
-Index(
-    "ix_results_current_by_time",
-    results.c.time_ns,
-    results.c.batch_id,
-    results.c.spacecraft,
-    *_FILTERS,
-    **_CURRENT,
-)
-Index("uq_results_current", results.c.batch_id, unique=True, **_CURRENT)
-Index(
-    "ix_results_what_ifs",
-    results.c.batch_id,
-    sqlite_where=results.c.parent_id.is_not(None),
-    postgresql_where=results.c.parent_id.is_not(None),
-)
-
-# The projector takes results in their order.
-Index("ix_results_seq", results.c.seq)
-
-# Empty, or what `upkeep.older_digests` still has to do.
-Index(
-    "ix_results_without_digest",
-    results.c.id,
-    sqlite_where=results.c.digest.is_(None),
-    postgresql_where=results.c.digest.is_(None),
-)
-
-# Deleting a batch checks the foreign key of its results, and finds them.
-Index("ix_results_batch_id", results.c.batch_id)
-
-# Deleting a result checks the foreign key of its what-ifs.
-Index(
-    "ix_results_parent",
-    results.c.parent_id,
-    sqlite_where=results.c.parent_id.is_not(None),
-    postgresql_where=results.c.parent_id.is_not(None),
-)
-
-star_results = Table(
+star_results = sa.Table(
     "star_results",
     metadata,
-    Column("result_id", Id, ForeignKey(results.c.id), primary_key=True),
-    Column("tracker", Name, primary_key=True),
-    Column("position", SmallInteger, primary_key=True),
-    Column("outcome", String(16), nullable=False),
-    Column("star_id", Text),
-    Column("votes", Integer, nullable=False),
-    Column("runner_up", Integer, nullable=False),
-    Column("probability", Double),
-    Column("residual_arcsec", Double),
+    sa.Column("result_id", Id, sa.ForeignKey(results.c.id), primary_key=True),
+    sa.Column("tracker", Name, primary_key=True),
+    sa.Column("position", sa.SmallInteger, primary_key=True),
+    sa.Column("outcome", sa.String(16), nullable=False),
+    sa.Column("star_id", sa.Text),
+    sa.Column("votes", sa.Integer, nullable=False),
+    sa.Column("runner_up", sa.Integer, nullable=False),
+    sa.Column("probability", sa.Double),
+    sa.Column("residual_arcsec", sa.Double),
     sqlite_with_rowid=False,
 )
 
 # Only of spacecraft with several trackers: of one alone the result has the same values.
-tracker_values = Table(
+tracker_values = sa.Table(
     "tracker_values",
     metadata,
-    Column("batch_id", Id, ForeignKey(batches.c.id), primary_key=True),
-    Column("tracker", Name, primary_key=True),
-    *(Column(name, Integer, nullable=False) for name in COUNTED),
+    sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), primary_key=True),
+    sa.Column("tracker", Name, primary_key=True),
+    *(sa.Column(name, sa.Integer, nullable=False) for name in COUNTED),
     # Of the attitude: good, or suspect if this is the tracker that disagrees; null without.
-    Column("status", String(16)),
-    *(Column(name, Double) for name in MEASURED),
+    sa.Column("status", sa.String(16)),
+    *(sa.Column(name, sa.Double) for name in MEASURED),
     # Null: an earlier version recorded it.
-    Column("row_digest", BigInteger),
+    sa.Column("row_digest", sa.BigInteger),
     sqlite_with_rowid=False,
 )
 
-solutions = Table(
+solutions = sa.Table(
     "solutions",
     metadata,
-    Column("result_id", Id, ForeignKey(results.c.id), primary_key=True),
-    *(Column(name, Double, nullable=False) for name in ("q1", "q2", "q3", "qc")),
-    Column("frame", String(16), nullable=False),
+    sa.Column("result_id", Id, sa.ForeignKey(results.c.id), primary_key=True),
+    *(sa.Column(name, sa.Double, nullable=False) for name in ("q1", "q2", "q3", "qc")),
+    sa.Column("frame", sa.String(16), nullable=False),
     # The upper triangle of the covariance, arcsec^2 about the body axes.
-    *(Column(name, Double, nullable=False) for name in ("p11", "p12", "p13", "p22", "p23", "p33")),
-    Column("residual_rms_arcsec", Double, nullable=False),
-    Column("predicted_rms_arcsec", Double, nullable=False),
-    Column("taste", Double, nullable=False),
-    Column("method", String(32), nullable=False),
-    Column("status", String(16), nullable=False),
+    *(
+        sa.Column(name, sa.Double, nullable=False)
+        for name in ("p11", "p12", "p13", "p22", "p23", "p33")
+    ),
+    sa.Column("residual_rms_arcsec", sa.Double, nullable=False),
+    sa.Column("predicted_rms_arcsec", sa.Double, nullable=False),
+    sa.Column("taste", sa.Double, nullable=False),
+    sa.Column("method", sa.String(32), nullable=False),
+    sa.Column("status", sa.String(16), nullable=False),
     sqlite_with_rowid=False,
 )
 
-idempotency_keys = Table(
+idempotency_keys = sa.Table(
     "idempotency_keys",
     metadata,
     # The token whose key it is; empty: none, for keys sent while access was open.
-    Column("token_id", String(26), primary_key=True, server_default=text("''")),
-    Column("key", String(255), primary_key=True),
-    Column("fingerprint", String(64), nullable=False),
-    Column("result_id", Id, ForeignKey(results.c.id), nullable=False, index=True),
+    sa.Column("token_id", sa.String(26), primary_key=True, server_default=sa.text("''")),
+    sa.Column("key", sa.String(255), primary_key=True),
+    sa.Column("fingerprint", sa.String(64), nullable=False),
+    sa.Column("result_id", Id, sa.ForeignKey(results.c.id), nullable=False, index=True),
 )
 
-replays = Table(
+replays = sa.Table(
     "replays",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("run", RunName, nullable=False),
-    Column("name", Text, nullable=False),
-    Column("state", String(16), nullable=False),
-    Column("lines_total", BigInteger),
-    *(Column(name, BigInteger, nullable=False) for name in ("lines_done", "lines_refused")),
-    Column("errors", Text, nullable=False),
-    Column("counts", Text),
-    Column("started", Moment, nullable=False),
-    Column("finished", Moment),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("run", RunName, nullable=False),
+    sa.Column("name", sa.Text, nullable=False),
+    sa.Column("state", sa.String(16), nullable=False),
+    sa.Column("lines_total", sa.BigInteger),
+    *(sa.Column(name, sa.BigInteger, nullable=False) for name in ("lines_done", "lines_refused")),
+    sa.Column("errors", sa.Text, nullable=False),
+    sa.Column("counts", sa.Text),
+    sa.Column("started", Moment, nullable=False),
+    sa.Column("finished", Moment),
 )
 
 # Of each hour of TAI, up to the projector's position; see `projections.seals`.
-seals = Table(
+seals = sa.Table(
     "seals",
     metadata,
-    Column("spacecraft", Name, primary_key=True),
-    Column("run", RunName, primary_key=True),
-    Column("hour", BigInteger, primary_key=True, autoincrement=False),
-    Column("results", Integer, nullable=False),
-    Column("digests", BigInteger, nullable=False),
+    sa.Column("spacecraft", Name, primary_key=True),
+    sa.Column("run", RunName, primary_key=True),
+    sa.Column("hour", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("results", sa.Integer, nullable=False),
+    sa.Column("digests", sa.BigInteger, nullable=False),
     sqlite_with_rowid=False,
 )
 
-projector = Table(
+projector = sa.Table(
     "projector",
     metadata,
     # One row: every result up to this one is in the projections, and none after it.
-    Column("id", SmallInteger, primary_key=True, autoincrement=False),
-    Column("seq", BigInteger, nullable=False),
+    sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
+    sa.Column("seq", sa.BigInteger, nullable=False),
 )
 
-events = Table(
+events = sa.Table(
     "events",
     metadata,
-    Column("id", BigInteger, primary_key=True, autoincrement=False),
-    Column("kind", String(16), nullable=False),
-    Column("run", RunName),
-    Column("spacecraft", Name),
-    Column("data", Text, nullable=False),
+    sa.Column("id", sa.BigInteger, primary_key=True, autoincrement=False),
+    sa.Column("kind", sa.String(16), nullable=False),
+    sa.Column("run", RunName),
+    sa.Column("spacecraft", Name),
+    sa.Column("data", sa.Text, nullable=False),
     # Null: recorded by an earlier version.
-    Column("at", Moment),
+    sa.Column("at", Moment),
 )
 
-event_counter = Table(
+event_counter = sa.Table(
     "event_counter",
     metadata,
     # One row, whose lock orders the events of several processes as they are committed.
-    Column("id", SmallInteger, primary_key=True, autoincrement=False),
-    Column("last", BigInteger, nullable=False),
+    sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
+    sa.Column("last", sa.BigInteger, nullable=False),
 )
 
 WRITTEN_BY_POSTS = (
@@ -420,63 +416,58 @@ WRITTEN_BY_POSTS = (
 # A batch has a row in `batches` or in `archived_batches`, never in both: one transaction takes it
 # from one to the other, and so (spacecraft, run, batch) stays unique after archiving.
 
-archived_parts = Table(
+archived_parts = sa.Table(
     "archived_parts",
     metadata,
-    Column("id", Integer, primary_key=True),
+    sa.Column("id", sa.Integer, primary_key=True),
     # Below the folder of the archive.
-    Column("path", Text, nullable=False, unique=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, nullable=False),
+    sa.Column("path", sa.Text, nullable=False, unique=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, nullable=False),
     # Of the first batch and of the last.
-    Column("first_ns", BigInteger, nullable=False),
-    Column("last_ns", BigInteger, nullable=False),
-    Column("batches", Integer, nullable=False),
-    Column("sha256", String(64), nullable=False),
+    sa.Column("first_ns", sa.BigInteger, nullable=False),
+    sa.Column("last_ns", sa.BigInteger, nullable=False),
+    sa.Column("batches", sa.Integer, nullable=False),
+    sa.Column("sha256", sa.String(64), nullable=False),
+    # A part spans no more than a day: those of a period are found by their end.
+    sa.Index("ix_archived_parts_by_spacecraft", "spacecraft", "run", "last_ns"),
+    sa.Index("ix_archived_parts_by_time", "last_ns"),
 )
-# A part spans no more than a day: those of a period are found by their end.
-Index(
-    "ix_archived_parts_by_spacecraft",
-    archived_parts.c.spacecraft,
-    archived_parts.c.run,
-    archived_parts.c.last_ns,
-)
-Index("ix_archived_parts_by_time", archived_parts.c.last_ns)
 
 # No foreign key names the part: to delete a part, each would be looked for without an index.
-archived_batches = Table(
+archived_batches = sa.Table(
     "archived_batches",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("spacecraft", Name, nullable=False),
-    Column("run", RunName, nullable=False),
-    Column("batch", Name, nullable=False),
-    Column("fingerprint", String(64), nullable=False),
-    Column("part_id", Integer, nullable=False),
-    UniqueConstraint("spacecraft", "run", "batch"),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, nullable=False),
+    sa.Column("batch", Name, nullable=False),
+    sa.Column("fingerprint", sa.String(64), nullable=False),
+    sa.Column("part_id", sa.Integer, nullable=False),
+    sa.UniqueConstraint("spacecraft", "run", "batch"),
     sqlite_with_rowid=False,
 )
 
 # The results of archived batches that do not have the id of their batch.
-archived_what_ifs = Table(
+archived_what_ifs = sa.Table(
     "archived_what_ifs",
     metadata,
-    Column("id", Id, primary_key=True),
-    Column("batch_id", Id, nullable=False),
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("batch_id", Id, nullable=False),
     sqlite_with_rowid=False,
 )
 
 # The share of a part in the trends of an hour: extremes cannot be subtracted from those of others.
-archived_hours = Table(
+archived_hours = sa.Table(
     "archived_hours",
     metadata,
-    Column("spacecraft", Name, primary_key=True),
-    Column("run", RunName, primary_key=True),
-    Column("bucket", Integer, primary_key=True, autoincrement=False),
+    sa.Column("spacecraft", Name, primary_key=True),
+    sa.Column("run", RunName, primary_key=True),
+    sa.Column("bucket", sa.Integer, primary_key=True, autoincrement=False),
     # Empty: of the spacecraft as a whole.
-    Column("tracker", Name, primary_key=True),
-    Column("part_id", Integer, primary_key=True, autoincrement=False),
+    sa.Column("tracker", Name, primary_key=True),
+    sa.Column("part_id", sa.Integer, primary_key=True, autoincrement=False),
     # JSON: the columns of a rollup.
-    Column("sums", Text, nullable=False),
+    sa.Column("sums", sa.Text, nullable=False),
     sqlite_with_rowid=False,
 )

@@ -21,7 +21,6 @@ from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service.errors import BadConfiguration
 from service.storage.archive.folder import (
-    Manifest,
     Part,
     Settings,
     claim,
@@ -30,7 +29,7 @@ from service.storage.archive.folder import (
     manifest_of,
     path_of,
     read_partition,
-    whole_content,
+    remove_part,
     write_manifest,
     write_partition,
     write_settings,
@@ -40,24 +39,15 @@ from service.storage.archive.rows import (
     differing,
     from_partition,
     lock_rows,
+    read_part,
     read_rows,
     to_partition,
 )
 from service.storage.projections import rollups
 from service.storage.projections.rollups import keep_share
 from service.storage.recording.result_metrics import is_waiting
-from service.storage.sql.statements import insert_all
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    archived_what_ifs,
-    catalogs,
-    missions,
-    results,
-    rollups_daily,
-    rollups_hourly,
-    runs,
-)
+from service.storage.sql import tables
+from service.storage.sql.statements import count, insert_all
 from service.storage.store import Store
 from service.storage.upkeep.prune import delete_batches
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, utc_now
@@ -80,7 +70,7 @@ class Archived:
     bytes: int = 0
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, order=True)
 class _Day:
     spacecraft: str
     run: str
@@ -111,8 +101,7 @@ def archive(
             claim(connection, folder)
             days = _days(connection, before)
             chosen = {day: _chosen(connection, day, before) for day in days}
-            counted = select(func.count()).select_from(results)
-            total = sum(int(connection.scalar(counted.where(*w)) or 0) for w in chosen.values())
+            total = sum(count(connection, tables.results, *each) for each in chosen.values())
         archived = Archived(total)
         step(archived)
         for day in days:
@@ -127,11 +116,11 @@ def archive(
 
 
 def _days(connection: Connection, before: Utc) -> list[_Day]:
-    daily = rollups_daily.c
+    daily = tables.rollups_daily.c
     query = select(daily.spacecraft, daily.run, daily.bucket).where(
         daily.bucket <= before.bucket(DAY_S)
     )
-    found = sorted({_Day(*row) for row in connection.execute(query)}, key=_order)
+    found = sorted(_Day(*row) for row in connection.execute(query))
     for spacecraft, run in sorted({(day.spacecraft, day.run) for day in found}):
         if is_waiting(connection, spacecraft, run):
             raise BadConfiguration(
@@ -141,40 +130,44 @@ def _days(connection: Connection, before: Utc) -> list[_Day]:
     return found
 
 
-def _order(day: _Day) -> tuple[str, str, int]:
-    return day.spacecraft, day.run, day.number
-
-
 def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElement[bool]]:
     """The current results of a day that are to be archived, as SQL."""
     end_ns = min(bucket_start(day.number + 1, DAY_S).tai_ns, before.tai_ns)
     chosen: list[ColumnElement[bool]] = [
-        results.c.current,
-        results.c.spacecraft == day.spacecraft,
-        results.c.run == day.run,
-        results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
-        results.c.time_ns < end_ns,
+        tables.results.c.current,
+        tables.results.c.spacecraft == day.spacecraft,
+        tables.results.c.run == day.run,
+        tables.results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
+        tables.results.c.time_ns < end_ns,
     ]
-    hourly = rollups_hourly.c
-    for has in (hourly.batches, hourly.solved):
-        newest = select(func.max(hourly.bucket)).where(
-            hourly.spacecraft == day.spacecraft,
-            hourly.run == day.run,
-            # A batch that is dated ahead is not the newest one.
-            hourly.bucket <= utc_now().bucket(HOUR_S),
-            has > 0,
-        )
-        hour = connection.scalar(newest)
-        if hour is not None:
-            begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
-            chosen.append(~results.c.time_ns.between(begin_ns, end_ns - 1))
+    # A batch that is dated ahead is not the newest one.
+    until = utc_now().bucket(HOUR_S)
+    for begin_ns, end_ns in newest_hours(connection, day.spacecraft, day.run, until):
+        chosen.append(~tables.results.c.time_ns.between(begin_ns, end_ns - 1))
     return chosen
+
+
+def newest_hours(
+    connection: Connection, spacecraft: str, run: str, until: int | None = None
+) -> Iterator[tuple[int, int]]:
+    """The begin and end of the hours of a run's newest batch and of its newest attitude.
+
+    `until` is the last hour that is looked at.
+    """
+    hourly = tables.rollups_hourly.c
+    own = [hourly.spacecraft == spacecraft, hourly.run == run]
+    if until is not None:
+        own.append(hourly.bucket <= until)
+    for has in (hourly.batches, hourly.solved):
+        hour = connection.scalar(select(func.max(hourly.bucket)).where(*own, has > 0))
+        if hour is not None:
+            yield bucket_start(hour, HOUR_S).tai_ns, bucket_start(hour + 1, HOUR_S).tai_ns
 
 
 def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[list[str]]:
     """The ids of the batches of one part after another, in order of time."""
-    query = select(results.c.batch_id).where(*chosen)
-    query = query.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
+    query = select(tables.results.c.batch_id).where(*chosen)
+    query = query.order_by(tables.results.c.time_ns, tables.results.c.batch_id).limit(MOST_BATCHES)
     while True:
         with store.reading() as connection:
             ids = list(connection.scalars(query))
@@ -193,13 +186,14 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
                 pc.unique(made[f"{kind}_digest"]).to_pylist() for kind in ("mission", "catalog")
             )
             keep_settings(connection, folder, *used)
-            tracked = connection.scalar(select(runs.c.tracked).where(runs.c.name == day.run))
+            tracked = connection.scalar(
+                select(tables.runs.c.tracked).where(tables.runs.c.name == day.run)
+            )
         file = _new_file(day_folder(folder, day.spacecraft, day.text))
         content = write_partition(file, to_partition(rows))
         part = described(file.name, day.run, rows, content)
         part = msgspec.structs.replace(part, tracked=bool(tracked))
-        manifest = manifest_of(folder, day.spacecraft, day.text)
-        manifest = msgspec.structs.replace(manifest, parts=[*manifest.parts, part])
+        manifest = manifest_of(folder, day.spacecraft, day.text).with_part(part)
         write_manifest(folder, manifest)
         path = path_of(folder, manifest, part)
         written = from_partition(read_partition(content))
@@ -243,7 +237,7 @@ def keep_settings(
     connection: Connection, folder: Path, of_missions: Sequence[str], of_catalogs: Sequence[str]
 ) -> None:
     """Keep in the archive what these digests stand for."""
-    for digests, table in ((of_missions, missions), (of_catalogs, catalogs)):
+    for digests, table in ((of_missions, tables.missions), (of_catalogs, tables.catalogs)):
         query = select(table).where(table.c.digest.in_(digests))
         for row in connection.execute(query).mappings():
             write_settings(folder, Settings(digest=row["digest"], row=dict(row)))
@@ -253,21 +247,16 @@ def note_part(
     connection: Connection, spacecraft: str, part: Part, path: str, found: pa.Table
 ) -> int:
     """Note the batches of a part as archived; returns the id of the part."""
-    row = {
-        "path": path,
-        "spacecraft": spacecraft,
-        "run": part.run,
-        "first_ns": part.first_ns,
-        "last_ns": part.last_ns,
-        "batches": part.batches,
-        "sha256": part.sha256,
-    }
-    part_id = connection.execute(insert(archived_parts).returning(archived_parts.c.id), row)
+    names = ("run", "first_ns", "last_ns", "batches", "sha256")
+    row = {name: getattr(part, name) for name in names} | {"path": path, "spacecraft": spacecraft}
+    part_id = connection.execute(
+        insert(tables.archived_parts).returning(tables.archived_parts.c.id), row
+    )
     number = int(part_id.scalar_one())
-    columns = [each.name for each in archived_batches.columns if each.name != "part_id"]
+    columns = [each.name for each in tables.archived_batches.columns if each.name != "part_id"]
     numbers = pa.array([number] * len(found), pa.int32())
     noted = found.select(columns).append_column("part_id", numbers)
-    insert_all(connection, archived_batches, noted.to_pylist())
+    insert_all(connection, tables.archived_batches, noted.to_pylist())
     return number
 
 
@@ -280,7 +269,7 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     number = note_part(connection, day.spacecraft, part, path, written["batches"])
     made = written["results"]
     further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
-    insert_all(connection, archived_what_ifs, further.to_pylist())
+    insert_all(connection, tables.archived_what_ifs, further.to_pylist())
     of_hour = _by_hour(day, written)
     # Who counts an hour anew reads its results, then its shares: all of it before, or after.
     position = rollups.lock_position(connection)
@@ -318,12 +307,12 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
     manifest = manifest_of(folder, day.spacecraft, day.text)
     paths = {path_of(folder, manifest, part): part for part in manifest.parts}
     with store.reading() as connection:
-        query = select(archived_parts.c.path).where(archived_parts.c.path.in_(paths))
+        query = select(tables.archived_parts.c.path).where(tables.archived_parts.c.path.in_(paths))
         known = set(connection.scalars(query))
     for path, part in paths.items():
         if path in known or part.run != day.run:
             continue
-        rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
+        rows = read_part(folder, path, part.sha256)
         with store.reading() as connection:
             present = read_rows(connection, rows["batches"]["id"].to_pylist())
         if not len(present["results"]):
@@ -335,12 +324,3 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
                 "it with `acquire archive restore`, or move it away"
             )
         manifest = remove_part(folder, manifest, part)
-
-
-def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
-    """Take a part out of the manifest, then delete its file."""
-    left = [each for each in manifest.parts if each.file != part.file]
-    manifest = msgspec.structs.replace(manifest, parts=left)
-    write_manifest(folder, manifest)
-    (day_folder(folder, manifest.spacecraft, manifest.day) / part.file).unlink()
-    return manifest

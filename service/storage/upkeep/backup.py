@@ -3,30 +3,32 @@
 SQLite is copied page by page from one read transaction: writers go on beside
 it, and what they write meanwhile is not in the copy.  PostgreSQL's own tool
 does the same with a snapshot.
+
+A backup keeps the schema of the version that wrote it, and restoring does not migrate it: that
+version can be installed again and serve the restored database.
 """
 
 import os
 import sqlite3
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 from sqlalchemy import URL, inspect
 
 from service.errors import BadConfiguration
+from service.storage.sql import engines
 from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile, sync_folder
-from service.storage.sql.engines import (
-    BUSY_TIMEOUT_MS,
-    database_url,
-    reading_engine,
-    shown_url,
-)
-from service.storage.sql.migrations import reported, revision_of
+from service.storage.sql.migrations import connected, revision_of
 
 PAGES_AT_ONCE = 2_000
 """About eight megabytes: often enough to show how far it is."""
+SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
+"""How the files begin."""
+BESIDE = ("-wal", "-shm", "-journal")
+"""The files that SQLite keeps beside a file: another database's would be taken for this one's."""
 
 Step = Callable[[int, int], object]
 """Called with the pages that are left and those there are."""
@@ -39,26 +41,39 @@ def back_up(database: str, target: Path, step: Step = lambda left, total: None) 
     `pg_restore` reads.  Raises `BadConfiguration` where the database cannot be
     read, and for a target that is there already.
     """
-    url = database_url(database)
+    url = engines.database_url(database)
     if target.exists():
         raise BadConfiguration(f"{target}: exists already; choose another file")
     if not target.absolute().parent.is_dir():
         raise BadConfiguration(f"{target}: there is no such folder")
+    with _part_of(target) as part:
+        if url.drivername == "sqlite":
+            _copy_sqlite(Path(url.database or ""), part, step)
+        else:
+            _dump_postgresql(url, part)
+        _move(part, target, Path.replace)
+
+
+@contextmanager
+def _part_of(target: Path) -> Iterator[Path]:
+    """A file beside the target to write to, which nothing is left of at the end."""
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
         # It holds what access depends on, such as the secrets of webhooks.
         part.touch(mode=PRIVATE_FILE, exist_ok=False)
-        if url.drivername == "sqlite":
-            _copy_sqlite(Path(url.database or ""), part, step)
-        else:
-            _dump_postgresql(url, part)
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        part.replace(target)
-        sync_folder(target.absolute().parent)
+        yield part
     finally:
-        part.unlink(missing_ok=True)
+        for left in (part, *(part.with_name(part.name + end) for end in BESIDE)):
+            left.unlink(missing_ok=True)
+
+
+def _move(part: Path, target: Path, move: Callable[[Path, Path], object]) -> None:
+    """Give a file its name, where both then outlast a power cut."""
+    with part.open("rb") as file:
+        os.fsync(file.fileno())
+    move(part, target)
+    sync_folder(target.absolute().parent)
 
 
 def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
@@ -70,12 +85,7 @@ def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
             # of another process would begin the copy anew.
             reading.execute("BEGIN")
             reading.execute("SELECT count(*) FROM sqlite_master").fetchone()
-            reading.backup(
-                writing,
-                pages=PAGES_AT_ONCE,
-                progress=lambda _, left, total: step(left, total),
-                sleep=0.0,
-            )
+            _copy_pages(reading, writing, step)
             reading.execute("ROLLBACK")
             # One file is the whole of it: no log beside it that could be left behind.
             writing.execute("PRAGMA journal_mode = DELETE")
@@ -83,28 +93,33 @@ def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {source}: cannot be copied: {error}") from None
 
 
+def _copy_pages(reading: sqlite3.Connection, writing: sqlite3.Connection, step: Step) -> None:
+    def progress(_: int, left: int, total: int) -> None:
+        step(left, total)
+
+    reading.backup(writing, pages=PAGES_AT_ONCE, progress=progress, sleep=0.0)
+
+
 def _opened(source: Path) -> sqlite3.Connection:
     uri = DatabaseFile(source.absolute()).uri
     connection = sqlite3.connect(uri, isolation_level=None, uri=True)
-    connection.execute(f"PRAGMA busy_timeout = {BUSY_TIMEOUT_MS}")
+    connection.execute(f"PRAGMA busy_timeout = {engines.BUSY_TIMEOUT_MS}")
     connection.execute("PRAGMA query_only = ON")
     return connection
 
 
 def _dump_postgresql(url: URL, part: Path) -> None:
     to_server, secret = client_options(url)
-    engine = reading_engine(url)
-    try:
-        with reported(url), engine.connect() as connection:
-            schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one()
-    finally:
-        engine.dispose()
+    with connected(url) as connection:
+        schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one()
     if schema is None:
-        raise BadConfiguration(f"ACQUIRE_DATABASE: {shown_url(url)}: has no schema of records")
+        raise BadConfiguration(
+            f"ACQUIRE_DATABASE: {engines.shown_url(url)}: has no schema of records"
+        )
     # A name without quotes would be a pattern.
     quoted = '"' + schema.replace('"', '""') + '"'
     command = ["pg_dump", "--format=custom", "--no-owner", "--no-privileges", f"--schema={quoted}"]
-    run_client([*command, *to_server, f"--file={part}"], shown_url(url), secret)
+    run_client([*command, *to_server, f"--file={part}"], engines.shown_url(url), secret)
 
 
 def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
@@ -115,7 +130,7 @@ def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
     other place.
     """
     # First of all: it says what to install where psycopg is missing.
-    dialect = reading_engine(url).dialect
+    dialect = engines.reading_engine(url).dialect
     from psycopg.conninfo import make_conninfo
     from psycopg.pq import Conninfo
 
@@ -152,25 +167,14 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
     return done.stdout
 
 
-# Makes a database from a backup: whole, or not at all, and never over records that are there.
-#
-# A backup keeps the schema of the version that wrote it.  This module does not migrate it:
-# the version that wrote a backup can be installed again and serve the database restored from it.
-
-SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
-"""How the files begin."""
-BESIDE = ("-wal", "-shm", "-journal")
-"""The files that SQLite keeps beside a file: another database's would be taken for this one's."""
-
-
 def restore(database: str, source: Path, step: Step = lambda left, total: None) -> str:
-    """Make a database from a file of `back_up`, and return the schema revision that it has.
+    """Make a database from a file of `back_up`, whole or not at all; returns its revision.
 
     A SQLite file must not exist yet; a PostgreSQL database must exist, without the service's
     tables.  Raises `BadConfiguration` for a backup that is missing, damaged or of the other
     kind, and for a database that holds records already or that a service is using.
     """
-    url = database_url(database)
+    url = engines.database_url(database)
     _check_kind(source, url)
     if url.drivername == "sqlite":
         return _restore_sqlite(source, Path(url.database or ""), step)
@@ -199,51 +203,35 @@ def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
             raise BadConfiguration(
                 f"ACQUIRE_DATABASE: {path}: exists already; move it away, or name another file"
             )
-    part = target.with_name(target.name + ".part")
-    part.unlink(missing_ok=True)
+    uri = f"{source.absolute().as_uri()}?mode=ro"
     try:
-        part.touch(mode=PRIVATE_FILE, exist_ok=False)
-        with (
-            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True)) as reading,
-            closing(sqlite3.connect(part)) as writing,
-        ):
-            reading.backup(
-                writing,
-                pages=PAGES_AT_ONCE,
-                progress=lambda _, left, total: step(left, total),
-                sleep=0.0,
-            )
-            found = [row[0] for row in writing.execute("PRAGMA integrity_check(1)")]
-        if found != ["ok"]:
-            raise BadConfiguration(f"{source}: is damaged: {found[0]}")
-        revision = _revision(f"sqlite:///{part}", source)
-        with part.open("rb") as file:
-            os.fsync(file.fileno())
-        # Unlike `replace` this refuses a file that a service has made in the meantime.
-        os.link(part, target)
-        sync_folder(target.absolute().parent)
+        with _part_of(target) as part:
+            with (
+                closing(sqlite3.connect(uri, uri=True)) as reading,
+                closing(sqlite3.connect(part)) as writing,
+            ):
+                _copy_pages(reading, writing, step)
+                found = [row[0] for row in writing.execute("PRAGMA integrity_check(1)")]
+            if found != ["ok"]:
+                raise BadConfiguration(f"{source}: is damaged: {found[0]}")
+            revision = _revision(f"sqlite:///{part}", source)
+            # Unlike `replace` this refuses a file that a service has made in the meantime.
+            _move(part, target, os.link)
     except FileExistsError:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {target}: exists already") from None
     except sqlite3.Error as error:
         raise BadConfiguration(f"{source}: cannot be restored: {error}") from None
-    finally:
-        for left in (part, *(part.with_name(part.name + end) for end in BESIDE)):
-            left.unlink(missing_ok=True)
     return revision
 
 
 def _restore_postgresql(source: Path, url: URL) -> str:
     to_server, secret = client_options(url)
-    engine = reading_engine(url)
-    try:
-        with reported(url), engine.begin() as connection:
-            schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one_or_none()
-            tables = inspect(connection).get_table_names() if schema is not None else []
-    finally:
-        engine.dispose()
+    with connected(url) as connection:
+        schema = connection.exec_driver_sql("SELECT current_schema()").scalar_one_or_none()
+        tables = inspect(connection).get_table_names() if schema is not None else []
     if tables:
         raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {shown_url(url)}: holds tables already ({tables[0]}, ...); "
+            f"ACQUIRE_DATABASE: {engines.shown_url(url)}: holds tables already ({tables[0]}, ...); "
             "name an empty database"
         )
     contents = run_client(["pg_restore", "--list", str(source)], str(source)).splitlines()
@@ -252,7 +240,7 @@ def _restore_postgresql(source: Path, url: URL) -> str:
     if schema is not None and held and not held[0].startswith(f"TABLE {schema} "):
         raise BadConfiguration(
             f"{source}: holds the tables of schema {held[0].split()[1]}; those of "
-            f"{shown_url(url)} belong in schema {schema}"
+            f"{engines.shown_url(url)} belong in schema {schema}"
         )
     wanted = [line for line in contents if schema is None or not _makes_schema(line, schema)]
     with tempfile.NamedTemporaryFile("w", encoding="utf-8") as listed:
@@ -260,7 +248,7 @@ def _restore_postgresql(source: Path, url: URL) -> str:
         listed.flush()
         command = ["pg_restore", "--single-transaction", "--exit-on-error", "--no-owner"]
         command += ["--no-privileges", f"--use-list={listed.name}", *to_server, str(source)]
-        run_client(command, f"{source} into {shown_url(url)}", secret)
+        run_client(command, f"{source} into {engines.shown_url(url)}", secret)
     return _revision(url.render_as_string(hide_password=False), source)
 
 

@@ -15,46 +15,15 @@ from hashlib import blake2b
 from typing import Any
 
 import msgspec
-from sqlalchemy import (
-    Column,
-    Connection,
-    Double,
-    LargeBinary,
-    Row,
-    Select,
-    Table,
-    bindparam,
-    delete,
-    func,
-    select,
-    text,
-    update,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
+from service.storage.sql import engines, migrations
 from service.storage.sql.access_tables import webhook_sender
 from service.storage.sql.database_file import writing_alone
-from service.storage.sql.engines import (
-    database_file,
-    database_url,
-    reading_engine,
-    shown_url,
-    writing_engine,
-)
-from service.storage.sql.migrations import (
-    HEAD,
-    UNFINISHED,
-    all_tables,
-    bring_up_to_date,
-    disposed,
-    reported,
-    require_records,
-    require_up_to_date,
-    revision_in,
-)
 from service.storage.sql.projector_lock import ProjectorLock
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import count, insert_all
 from service.storage.sql.tables import event_counter, projector
 from service.storage.upkeep.verify import verify
 
@@ -89,33 +58,37 @@ def copy_record(
 
 
 @contextmanager
-def _source(database: str) -> Iterator[Connection]:
+def _source(database: str) -> Iterator[sa.Connection]:
     """A connection that sees the source as of one moment, while no service writes to it."""
     with _named("FROM"):
-        require_records(database)
-        url = database_url(database)
-    file = database_file(url)
+        migrations.require_records(database)
+        url = engines.database_url(database)
+    file = engines.database_file(url)
     # Nothing can write to a read-only file, and its lock cannot be taken.
     locked = writing_alone(None if file is None or file.is_read_only else file)
-    with _named("FROM"), locked, disposed(reading_engine(url)) as engine:
-        require_up_to_date(engine)
-        with reported(url), engine.connect() as connection:
+    with _named("FROM"), locked, migrations.disposed(engines.reading_engine(url)) as engine:
+        migrations.require_up_to_date(engine)
+        with migrations.reported(url), engine.connect() as connection:
             _take_lock(connection)
             with connection.begin():
                 yield connection
 
 
 @contextmanager
-def _target(database: str) -> Iterator[Connection]:
+def _target(database: str) -> Iterator[sa.Connection]:
     """A connection that writes to the target, which has tables and no service."""
     with _named("TO"):
-        url = database_url(database)
-    with _named("TO"), writing_alone(database_file(url)), disposed(writing_engine(url)) as engine:
-        with reported(url), engine.begin() as connection:
-            is_new = revision_in(connection) is None
+        url = engines.database_url(database)
+    with (
+        _named("TO"),
+        writing_alone(engines.database_file(url)),
+        migrations.disposed(engines.writing_engine(url)) as engine,
+    ):
+        with migrations.reported(url), engine.begin() as connection:
+            is_new = migrations.revision_in(connection) is None
         if is_new:
-            bring_up_to_date(engine)
-        with reported(url), engine.connect() as connection:
+            migrations.bring_up_to_date(engine)
+        with migrations.reported(url), engine.connect() as connection:
             _take_lock(connection)
             yield connection
 
@@ -130,21 +103,21 @@ def _named(argument: str) -> Iterator[None]:
         raise BadConfiguration(message) from error
 
 
-def _take_lock(connection: Connection) -> None:
+def _take_lock(connection: sa.Connection) -> None:
     """Hold the projector's lock of PostgreSQL until the session ends."""
     if connection.dialect.name != "postgresql":
         return
     if ProjectorLock().take(connection) != "taken":
         raise BadConfiguration(
-            f"ACQUIRE_DATABASE: {shown_url(connection.engine.url)}: a service or another copy is "
-            "using it: stop it first"
+            f"ACQUIRE_DATABASE: {engines.shown_url(connection.engine.url)}: a service or another "
+            "copy is using it: stop it first"
         )
     connection.rollback()
 
 
-def _copy(reading: Connection, writing: Connection, step: Step) -> int:
+def _copy(reading: sa.Connection, writing: sa.Connection, step: Step) -> int:
     """Copy what is missing, and compare all of it; returns the number of rows."""
-    tables = all_tables()
+    tables = migrations.all_tables()
     counts = _counted(reading, tables)
     total = sum(counts.values())
     if _begin(writing, tables, counts):
@@ -170,62 +143,61 @@ def _copy(reading: Connection, writing: Connection, step: Step) -> int:
         step("comparing", done, total)
     with writing.begin():
         _set_sequences(writing, tables)
-        _set_revision(writing, HEAD)
+        _set_revision(writing, migrations.HEAD)
     return total
 
 
-def _counted(connection: Connection, tables: Sequence[Table]) -> Counts:
-    return {
-        table.name: int(connection.scalar(select(func.count()).select_from(table)) or 0)
-        for table in tables
-    }
+def _counted(connection: sa.Connection, tables: Sequence[sa.Table]) -> Counts:
+    return {table.name: count(connection, table) for table in tables}
 
 
-def _begin(connection: Connection, tables: Sequence[Table], counts: Counts) -> bool:
+def _begin(connection: sa.Connection, tables: Sequence[sa.Table], counts: Counts) -> bool:
     """Mark a new database as an unfinished copy; False if it has as many rows as the source."""
-    marked = UNFINISHED + blake2b(msgspec.json.encode(counts), digest_size=12).hexdigest()
+    marked = (
+        migrations.UNFINISHED + blake2b(msgspec.json.encode(counts), digest_size=12).hexdigest()
+    )
     with connection.begin():
-        revision = revision_in(connection)
+        revision = migrations.revision_in(connection)
         if revision == marked:
             return True
-        if revision == HEAD:
+        if revision == migrations.HEAD:
             present = _counted(connection, tables)
             if not any(present[table.name] for table in tables if table not in FIRST_ROWS):
                 for table in FIRST_ROWS:
-                    connection.execute(delete(table))
+                    connection.execute(sa.delete(table))
                 _set_revision(connection, marked)
                 return True
             if present == counts:
                 return False
-    if revision == HEAD:
+    if revision == migrations.HEAD:
         reason = "it holds a record already"
-    elif revision is not None and revision.startswith(UNFINISHED):
+    elif revision is not None and revision.startswith(migrations.UNFINISHED):
         reason = "it is an unfinished copy of another database, or of an earlier state of this one"
     else:
-        reason = f"its schema is at {revision}, this version needs {HEAD}"
+        reason = f"its schema is at {revision}, this version needs {migrations.HEAD}"
     raise BadConfiguration(
-        f"TO: {shown_url(connection.engine.url)}: {reason}: name an empty database"
+        f"TO: {engines.shown_url(connection.engine.url)}: {reason}: name an empty database"
     )
 
 
-def _set_revision(connection: Connection, revision: str) -> None:
-    connection.execute(text("UPDATE alembic_version SET version_num = :it"), {"it": revision})
+def _set_revision(connection: sa.Connection, revision: str) -> None:
+    connection.execute(sa.text("UPDATE alembic_version SET version_num = :it"), {"it": revision})
 
 
 def _chunks(
-    connection: Connection, query: Select[Any], table: Table
-) -> Iterator[Sequence[Row[Any]]]:
+    connection: sa.Connection, query: sa.Select[Any], table: sa.Table
+) -> Iterator[Sequence[sa.Row[Any]]]:
     """The rows of a query on a table, as many at a time as memory allows."""
-    has_large = any(isinstance(column.type, LargeBinary) for column in table.columns)
+    has_large = any(isinstance(column.type, sa.LargeBinary) for column in table.columns)
     at_once = LARGE_ROWS_AT_ONCE if has_large else ROWS_AT_ONCE
     yield from connection.execute(query, execution_options={"yield_per": at_once}).partitions()
 
 
 def _copy_rows(
-    reading: Connection, writing: Connection, table: Table, present: int
+    reading: sa.Connection, writing: sa.Connection, table: sa.Table, present: int
 ) -> Iterator[int]:
     """Copy the rows after those that are there; yields how many each transaction took."""
-    query = select(table).order_by(*table.primary_key).offset(present)
+    query = sa.select(table).order_by(*table.primary_key).offset(present)
     later = dict.fromkeys(column.name for column in _own_references(table))
     for chunk in _chunks(reading, query, table):
         with writing.begin():
@@ -233,26 +205,30 @@ def _copy_rows(
         yield len(chunk)
 
 
-def _own_references(table: Table) -> list[Column[Any]]:
+def _own_references(table: sa.Table) -> list[sa.Column[Any]]:
     """The columns that refer to rows of the same table, which may come later."""
     return [key.parent for key in table.foreign_keys if key.column.table is table]
 
 
-def _refer_to_own(reading: Connection, writing: Connection, table: Table) -> None:
+def _refer_to_own(reading: sa.Connection, writing: sa.Connection, table: sa.Table) -> None:
     for column in _own_references(table):
         (key,) = table.primary_key
-        query = select(key.label("own"), column.label("other")).where(column.is_not(None))
-        change = update(table).where(key == bindparam("own")).values({column: bindparam("other")})
+        query = sa.select(key.label("own"), column.label("other")).where(column.is_not(None))
+        change = (
+            sa.update(table)
+            .where(key == sa.bindparam("own"))
+            .values({column: sa.bindparam("other")})
+        )
         for chunk in _chunks(reading, query, table):
             with writing.begin():
                 writing.execute(change, [dict(row._mapping) for row in chunk])
 
 
-def _digest(connection: Connection, table: Table) -> int:
+def _digest(connection: sa.Connection, table: sa.Table) -> int:
     """The sum of the digests of a table's rows, which does not depend on their order."""
-    is_double = [isinstance(column.type, Double) for column in table.columns]
+    is_double = [isinstance(column.type, sa.Double) for column in table.columns]
     total = 0
-    for chunk in _chunks(connection, select(table), table):
+    for chunk in _chunks(connection, sa.select(table), table):
         for row in chunk:
             # SQLite has no minus zero.
             content = [
@@ -264,13 +240,13 @@ def _digest(connection: Connection, table: Table) -> int:
     return total
 
 
-def _set_sequences(connection: Connection, tables: Sequence[Table]) -> None:
+def _set_sequences(connection: sa.Connection, tables: Sequence[sa.Table]) -> None:
     """Let PostgreSQL's next numbers come after those that were copied; SQLite looks for itself."""
     if connection.dialect.name != "postgresql":
         return
     after = "coalesce(max({0}), 0) + 1, false) FROM {1}"
     connection.execute(
-        text(
+        sa.text(
             "SELECT setval('results_seq', 1 + greatest((SELECT max(seq) FROM results), "
             "(SELECT seq FROM projector)), false)"
         )
@@ -279,5 +255,7 @@ def _set_sequences(connection: Connection, tables: Sequence[Table]) -> None:
         column = table.autoincrement_column
         if column is not None:
             of = f"pg_get_serial_sequence('{table.name}', '{column.name}')"
-            connection.execute(text(f"SELECT setval({of}, {after.format(column.name, table.name)}"))
-        connection.execute(text(f'ANALYZE "{table.name}"'))
+            connection.execute(
+                sa.text(f"SELECT setval({of}, {after.format(column.name, table.name)}")
+            )
+        connection.execute(sa.text(f'ANALYZE "{table.name}"'))

@@ -3,6 +3,7 @@
 import logging
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
 from functools import cache
 
 import erfa
@@ -60,25 +61,28 @@ def leap_seconds_end() -> Utc:
     return parse_utc(f"{LAST_YEAR}-01-01T00:00:00Z", "year")
 
 
+@dataclass(frozen=True)
 class ExpiryDates:
     """Reads what ends when, and warns of what ends soon."""
 
-    def __init__(
-        self,
-        reading: Callable[[], AbstractContextManager[Connection]],
-        now: Callable[[], Utc] = utc_now,
-    ) -> None:
-        self._reading = reading
-        self._now = now
+    reading: Callable[[], AbstractContextManager[Connection]]
+    now: Callable[[], Utc] = utc_now
 
     def dates(self) -> Expiries:
         """The dates on which something ends."""
-        with self._reading() as connection:
-            return Expiries(leap_seconds_end().text, _tokens(connection, self._now().text))
+        c = access_tokens.c
+        query = (
+            select(c.name, c.created, c.expires)
+            .where(c.revoked.is_(None), c.expires > self.now().text)
+            .order_by(c.expires, c.name)
+        )
+        with self.reading() as connection:
+            tokens = tuple(TokenTerm(*row) for row in connection.execute(query))
+        return Expiries(leap_seconds_end().text, tokens)
 
     def warn(self) -> list[str]:
         """Log a warning about each thing that ends soon, or has ended."""
-        found, now = self.dates(), self._now()
+        found, now = self.dates(), self.now()
         soon = shifted(now, SOON_DAYS * DAY_S).text
         warnings = []
         if found.leap_seconds <= soon:
@@ -94,13 +98,3 @@ class ExpiryDates:
         for each in warnings:
             log.warning(each)
         return warnings
-
-
-def _tokens(connection: Connection, moment: str) -> tuple[TokenTerm, ...]:
-    """The tokens in force, the first to expire first."""
-    query = (
-        select(access_tokens.c.name, access_tokens.c.created, access_tokens.c.expires)
-        .where(access_tokens.c.revoked.is_(None), access_tokens.c.expires > moment)
-        .order_by(access_tokens.c.expires, access_tokens.c.name)
-    )
-    return tuple(TokenTerm(*row) for row in connection.execute(query))

@@ -18,14 +18,14 @@ from sqlalchemy.exc import IntegrityError
 from service.errors import BadConfiguration, NotFound, shown_value
 from service.storage.models.runs import Forgotten
 from service.storage.projections import rollups
-from service.storage.projections.rollups import forget_share
 from service.storage.recording.unsaved_result import LIVE
+from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.statements import count, rows_of
 from service.storage.sql.tables import (
     archived_batches,
     archived_hours,
     archived_parts,
-    archived_what_ifs,
     batches,
     runs,
 )
@@ -76,7 +76,7 @@ def found(connection: Connection, selected: ForgetFilter) -> Forgotten:
     """The selected data; raises `NotFound` where nothing is, or a name is not there."""
     _require_names(connection, selected)
     counts = {
-        name: int(connection.scalar(select(func.count()).select_from(table).where(*chosen)) or 0)
+        name: count(connection, table, *chosen)
         for name, table, chosen in (
             ("batches", batches, selected.of_batches(batches)),
             ("archived_batches", archived_batches, selected.of_batches(archived_batches)),
@@ -110,9 +110,14 @@ def forget(
         raise BadConfiguration(
             f"{total.archived_batches} of the batches are archived: name the folder of the archive"
         )
+
+    def forget_days(connection: Connection) -> None:
+        while delete_days(connection, _of_days(selected)):
+            pass
+        note(connection, total)
+
     # What is computed from the batches goes first: it is computed again from what is left.
-    days = partial(_forget_days, selected=selected, note=note, total=total)
-    store.writer.change(days).result()
+    store.writer.change(forget_days).result()
     done = 0
     if total.archived_batches and archive is not None:
         done += _forget_archived(store, archive, selected)
@@ -183,18 +188,6 @@ def _of_days(selected: ForgetFilter) -> list[Any]:
     return [*chosen, or_(*overlapping)]
 
 
-def _forget_days(
-    connection: Connection,
-    selected: ForgetFilter,
-    note: Callable[[Connection, Forgotten], object],
-    total: Forgotten,
-) -> None:
-    chosen = _of_days(selected)
-    while delete_days(connection, chosen):
-        pass
-    note(connection, total)
-
-
 def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
     """Delete some of the selected batches and count their hours anew; how many."""
     if not selected.is_whole and not selected.batches:
@@ -202,13 +195,9 @@ def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
     query = select(batches.c.id, batches.c.spacecraft, batches.c.time)
     rows = list(connection.execute(query.where(*selected.of_batches(batches)).limit(_AT_ONCE)))
     delete_batches(connection, [row.id for row in rows])
-    hours = {(row.spacecraft, selected.run, _hour(row.time)) for row in rows}
-    rollups.renew(connection, hours)
+    hours = {(row.spacecraft, recorded_utc(row.time).bucket(HOUR_S)) for row in rows}
+    rollups.renew(connection, ((spacecraft, selected.run, hour) for spacecraft, hour in hours))
     return len(rows)
-
-
-def _hour(time: str) -> int:
-    return recorded_utc(time).bucket(HOUR_S)
 
 
 def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
@@ -218,73 +207,52 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
     again, from where the selected ones are then deleted; `acquire archive` archives the rest.
     """
     # Archives need pyarrow, which is an extra.
-    from service.storage.archive.folder import (
-        claim,
-        locked,
-        manifest_of,
-        manifests,
-        path_of,
-        read_partition,
-        whole_content,
-    )
-    from service.storage.archive.rows import from_partition
-    from service.storage.upkeep.archiving import remove_part
-    from service.storage.upkeep.restoring import put_back
+    from service.storage.archive.folder import claim, locked, manifest_of, parts_of, remove_part
+    from service.storage.archive.rows import read_part
+    from service.storage.upkeep.restoring import forget_part, put_back
+
+    def forget_whole(connection: Connection, row: Row) -> None:
+        own = archived_hours.c.spacecraft == row["spacecraft"], archived_hours.c.run == row["run"]
+        query = select(archived_hours.c.bucket).where(*own, archived_hours.c.part_id == row["id"])
+        hours = set(connection.scalars(query))
+        rollups.lock_position(connection)
+        named = archived_batches.c.part_id == row["id"]
+        ids = connection.scalars(select(archived_batches.c.id).where(named)).all()
+        forget_part(connection, row["id"], row["spacecraft"], row["run"], ids)
+        rollups.renew(connection, ((row["spacecraft"], row["run"], hour) for hour in hours))
+
+    def forget_some(connection: Connection, part: Any, rows: Any) -> None:
+        put_back(connection, folder, part, rows)
+        _forget_batches(connection, selected)
 
     with locked(folder):
         with store.reading() as connection:
             claim(connection, folder)
             chosen = selected.of_batches(archived_batches)
-            query = select(archived_batches.c.part_id, func.count().label("batches")).where(*chosen)
+            query = select(archived_batches.c.part_id, func.count()).where(*chosen)
             grouped = connection.execute(query.group_by(archived_batches.c.part_id))
-            counts = {row.part_id: int(row.batches) for row in grouped}
+            counts = dict(map(tuple, grouped))
             parts = select(archived_parts).where(archived_parts.c.id.in_(counts))
-            known = {row["path"]: dict(row) for row in connection.execute(parts).mappings()}
+            known = {row["path"]: row for row in rows_of(connection, parts)}
         named = {
-            path: (manifest, part)
-            for manifest in manifests(folder)
-            for part in manifest.parts
-            if (path := path_of(folder, manifest, part)) in known
+            path: (manifest, part) for path, manifest, part in parts_of(folder) if path in known
         }
         if missing := sorted(set(known) - set(named)):
             raise BadConfiguration(f"{folder / missing[0]}: no manifest of the archive names it")
         for path, (manifest, part) in named.items():
             row = known[path]
             if counts[row["id"]] == row["batches"]:
-                store.writer.change(partial(_forget_part, row=row)).result()
+                store.writer.change(partial(forget_whole, row=row)).result()
             else:
-                rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
-
-                def put_back_part(
-                    connection: Connection, part: Any = part, rows: Any = rows
-                ) -> int:
-                    put_back(connection, folder, part, rows)
-                    return _forget_batches(connection, selected)
-
-                store.writer.change(put_back_part).result()
+                rows = read_part(folder, path, part.sha256)
+                store.writer.change(partial(forget_some, part=part, rows=rows)).result()
             # After the record: a file too many is named by `archive verify`, a missing one lost.
             remove_part(folder, manifest_of(folder, manifest.spacecraft, manifest.day), part)
     return sum(counts.values())
 
 
-def _forget_part(connection: Connection, row: dict[str, Any]) -> None:
-    """Delete what the database knows of a part, and its share in the trends."""
-    spacecraft, run, part_id = row["spacecraft"], row["run"], row["id"]
-    own = archived_hours.c.spacecraft == spacecraft, archived_hours.c.run == run
-    chosen = select(archived_hours.c.bucket).where(*own, archived_hours.c.part_id == part_id)
-    hours = {(spacecraft, run, hour) for hour in connection.scalars(chosen.distinct())}
-    rollups.lock_position(connection)
-    forget_share(connection, part_id, spacecraft, run)
-    ids = select(archived_batches.c.id).where(archived_batches.c.part_id == part_id)
-    connection.execute(delete(archived_what_ifs).where(archived_what_ifs.c.batch_id.in_(ids)))
-    connection.execute(delete(archived_batches).where(archived_batches.c.part_id == part_id))
-    connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
-    rollups.renew(connection, hours)
-
-
 def _forget_run(store: Store, run: str) -> None:
     """Delete the settings of a run, unless something was recorded in it meanwhile."""
+    deletion = delete(runs).where(runs.c.name == run)
     with suppress(IntegrityError):
-        store.writer.change(
-            lambda connection: connection.execute(delete(runs).where(runs.c.name == run))
-        ).result()
+        store.writer.change(lambda connection: connection.execute(deletion)).result()

@@ -8,10 +8,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from sqlalchemy import ColumnElement, Connection, delete, func, select
+from sqlalchemy import ColumnElement, Connection, Table, delete, select
 
 from service.storage.projections import rollups, seals
 from service.storage.sql.grade_tables import graded_blocks, graded_days, gyro_blocks
+from service.storage.sql.statements import count, portions
 from service.storage.sql.tables import (
     batches,
     frames,
@@ -29,11 +30,12 @@ OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
 MOST_BATCHES = 10_000
 """The most batches that one transaction deletes: other writers of the hour, on SQLite all, wait."""
-_AT_ONCE = 1_000
 _BLOCKS_AT_ONCE = 100
 """Blocks that one transaction deletes, of up to 240 kB each."""
 _DAYS_AT_ONCE = 10
 """Days that one transaction deletes, of about 12 MB each."""
+
+Conditions = list[ColumnElement[bool]]
 
 
 @dataclass
@@ -64,29 +66,26 @@ def prune(
     """
     with store.reading() as connection:
         # A batch has exactly one current result, and those have the index by time.
-        chosen = [results.c.current, results.c.time_ns < before.tai_ns]
-        if run is not None:
-            chosen.append(results.c.run == run)
-        counted = select(func.count()).select_from(results).where(*chosen)
-        pruned = Pruned(int(connection.scalar(counted) or 0))
-        old_blocks = _old_blocks(before, run)
-        blocks = select(func.count()).select_from(gyro_blocks).where(*old_blocks)
-        pruned.total_gyro_blocks = int(connection.scalar(blocks) or 0)
-        old_days = _old_days(before, run)
-        days = select(func.count()).select_from(graded_days).where(*old_days)
-        pruned.total_graded_days = int(connection.scalar(days) or 0)
-        hours = select(rollups_hourly.c.bucket, rollups_hourly.c.spacecraft, rollups_hourly.c.run)
-        hours = hours.where(rollups_hourly.c.bucket <= before.bucket(HOUR_S))
-        if run is not None:
-            hours = hours.where(rollups_hourly.c.run == run)
-        keys = sorted(
-            (hour, spacecraft, name) for hour, spacecraft, name in connection.execute(hours)
+        is_old = _of_run(run, results, results.c.time_ns < before.tai_ns)
+        old_blocks = _of_run(run, gyro_blocks, gyro_blocks.c.end_ns < before.tai_ns)
+        old_days = _of_run(run, graded_days, graded_days.c.end_ns <= before.tai_ns)
+        pruned = Pruned(
+            count(connection, results, results.c.current, *is_old),
+            total_gyro_blocks=count(connection, gyro_blocks, *old_blocks),
+            total_graded_days=count(connection, graded_days, *old_days),
         )
+        hourly = rollups_hourly.c
+        hours = select(hourly.bucket, hourly.spacecraft, hourly.run).where(
+            *_of_run(run, rollups_hourly, hourly.bucket <= before.bucket(HOUR_S))
+        )
+        keys = sorted(map(tuple, connection.execute(hours)))
     step(pruned)
     if dry_run:
         return pruned
     for hour, spacecraft, name in keys:
-        deletion = _of_an_hour(spacecraft, name, hour, before)
+        deletion = partial(
+            _delete_oldest, spacecraft=spacecraft, run=name, hour=hour, before=before
+        )
         deleted = MOST_BATCHES
         while deleted == MOST_BATCHES:
             deleted = store.writer.change(deletion).result()
@@ -99,21 +98,12 @@ def prune(
     return pruned
 
 
-def _old_blocks(before: Utc, run: str | None) -> list[ColumnElement[bool]]:
-    chosen: list[ColumnElement[bool]] = [gyro_blocks.c.end_ns < before.tai_ns]
-    if run is not None:
-        chosen.append(gyro_blocks.c.run == run)
-    return chosen
+def _of_run(run: str | None, table: Table, chosen: ColumnElement[bool]) -> Conditions:
+    """The chosen rows of a table, of one run or of all."""
+    return [chosen] if run is None else [chosen, table.c.run == run]
 
 
-def _old_days(before: Utc, run: str | None) -> list[ColumnElement[bool]]:
-    chosen: list[ColumnElement[bool]] = [graded_days.c.end_ns <= before.tai_ns]
-    if run is not None:
-        chosen.append(graded_days.c.run == run)
-    return chosen
-
-
-def delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+def delete_days(connection: Connection, chosen: Conditions) -> int:
     """Delete some of the graded days that are chosen, with their samples; how many."""
     ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
     connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
@@ -121,7 +111,7 @@ def delete_days(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -
     return len(ids)
 
 
-def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]]) -> int:
+def delete_blocks(connection: Connection, chosen: Conditions) -> int:
     """Delete some of the blocks that are chosen; how many."""
     chunk = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
     ids = list(connection.scalars(chunk))
@@ -129,32 +119,28 @@ def delete_blocks(connection: Connection, chosen: Sequence[ColumnElement[bool]])
     return len(ids)
 
 
-def _of_an_hour(spacecraft: str, run: str, hour: int, before: Utc) -> Callable[[Connection], int]:
-    """A change that deletes the oldest batches of an hour, and returns how many."""
-    start = bucket_start(hour, HOUR_S).tai_ns
-    end = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
-
-    def change(connection: Connection) -> int:
-        chosen = select(results.c.batch_id).where(
-            results.c.current,
-            results.c.spacecraft == spacecraft,
-            results.c.run == run,
-            results.c.time_ns >= start,
-            results.c.time_ns < end,
-        )
-        oldest = chosen.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
-        ids = list(connection.scalars(oldest))
-        delete_batches(connection, ids)
-        rollups.renew(connection, [(spacecraft, run, hour)])
-        return len(ids)
-
-    return change
+def _delete_oldest(
+    connection: Connection, spacecraft: str, run: str, hour: int, before: Utc
+) -> int:
+    """Delete the oldest batches of an hour; how many."""
+    end_ns = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
+    oldest = select(results.c.batch_id).where(
+        results.c.current,
+        results.c.spacecraft == spacecraft,
+        results.c.run == run,
+        results.c.time_ns >= bucket_start(hour, HOUR_S).tai_ns,
+        results.c.time_ns < end_ns,
+    )
+    oldest = oldest.order_by(results.c.time_ns, results.c.batch_id).limit(MOST_BATCHES)
+    ids = list(connection.scalars(oldest))
+    delete_batches(connection, ids)
+    rollups.renew(connection, [(spacecraft, run, hour)])
+    return len(ids)
 
 
 def delete_batches(connection: Connection, batch_ids: Sequence[str]) -> None:
     """Delete batches with all that was made of them, what refers to others first."""
-    for first in range(0, len(batch_ids), _AT_ONCE):
-        ids = batch_ids[first : first + _AT_ONCE]
+    for ids in portions(batch_ids):
         seals.take_out(connection, ids)
         made = list(connection.scalars(select(results.c.id).where(results.c.batch_id.in_(ids))))
         for table in OF_A_RESULT:

@@ -12,21 +12,12 @@ from pathlib import Path
 import msgspec
 import pyarrow as pa
 import pyarrow.compute as pc
-from sqlalchemy import Connection, func, select
+from sqlalchemy import Connection, select
 from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration
-from service.storage.archive.folder import (
-    Manifest,
-    Part,
-    manifest_of,
-    manifests,
-    path_of,
-    read_partition,
-    whole_content,
-    write_manifest,
-)
-from service.storage.archive.rows import Rows, from_partition
+from service.storage.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
+from service.storage.archive.rows import Rows, read_part
 from service.storage.projections import alarms, rollups
 from service.storage.projections.recorded import RecordedResult
 from service.storage.projections.rollups import WHOLE, insert_share
@@ -34,23 +25,17 @@ from service.storage.recording import events
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
 from service.storage.recording.unsaved_result import STARS
+from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    batches,
-    rollups_hourly,
-    runs,
-)
+from service.storage.sql.statements import count, portions
 from service.storage.store import Store
-from service.storage.upkeep.archiving import described, hours_of, note_part
+from service.storage.upkeep.archiving import described, hours_of, newest_hours, note_part
 from service.storage.upkeep.restoring import put_back
-from service.times import DAY_S, HOUR_S, bucket_start, parse_utc
+from service.times import DAY_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
 """The columns of a batch that stay in the database."""
 _LONG = ["answer", "options"]
-_AT_ONCE = 1_000
 
 
 @dataclass(frozen=True)
@@ -113,9 +98,8 @@ def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
 
 def name_part(folder: Path, made: RunPart) -> str:
     """Name a part in the manifest of its day; returns its path below the folder."""
-    manifest = manifest_of(folder, made.spacecraft, made.day)
-    others = [each for each in manifest.parts if each.file != made.part.file]
-    write_manifest(folder, msgspec.structs.replace(manifest, parts=[*others, made.part]))
+    manifest = manifest_of(folder, made.spacecraft, made.day).with_part(made.part)
+    write_manifest(folder, manifest)
     return path_of(folder, manifest, made.part)
 
 
@@ -134,12 +118,16 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     spacecraft, run = made.spacecraft, made.part.run
     # A batch that another process records in the run holds this row until its commit, and waits
     # for it: the table of archived batches and that of recorded ones have no unique key together.
-    connection.execute(select(runs.c.name).where(runs.c.name == run).with_for_update())
-    recorded = select(batches.c.id).where(batches.c.spacecraft == spacecraft, batches.c.run == run)
+    connection.execute(
+        select(tables.runs.c.name).where(tables.runs.c.name == run).with_for_update()
+    )
+    recorded = select(tables.batches.c.id).where(
+        tables.batches.c.spacecraft == spacecraft, tables.batches.c.run == run
+    )
     if connection.scalar(recorded.limit(1)) is not None:
         names = made.identities["batch"].to_pylist()
-        for first in range(0, len(names), _AT_ONCE):
-            wanted = {(spacecraft, run, name) for name in names[first : first + _AT_ONCE]}
+        for some_names in portions(names):
+            wanted = {(spacecraft, run, name) for name in some_names}
             if known := look_up(connection, wanted).identities:
                 raise _taken(made, next(iter(known))[2])
     number = note_part(connection, spacecraft, made.part, path, made.identities)
@@ -147,8 +135,7 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     rollups.add_shares(connection, spacecraft, run, made.shares)
     insert_share(connection, number, spacecraft, run, made.shares)
     if alarms.runs_with_alarms(connection, {run}):
-        content = whole_content(folder, path, made.part.sha256)
-        for some_results in _as_recorded(from_partition(read_partition(content))):
+        for some_results in _as_recorded(read_part(folder, path, made.part.sha256)):
             alarms.apply(connection, some_results)
     fields = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
     fields |= {"latest": made.latest}
@@ -172,8 +159,7 @@ def _as_recorded(rows: Rows) -> Iterator[Sequence[RecordedResult]]:
     found = [
         RecordedResult(made[batch["id"]] | batch, trackers.get(batch["id"], ())) for batch in own
     ]
-    for first in range(0, len(found), _AT_ONCE):
-        yield found[first : first + _AT_ONCE]
+    yield from portions(found)
 
 
 def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPart]]:
@@ -181,37 +167,25 @@ def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPar
 
     A process that was killed in between left them.  Raises `BadConfiguration` for a damaged one.
     """
-    for manifest in manifests(folder):
-        for part in manifest.parts:
-            path = path_of(folder, manifest, part)
-            if part.run != run or part.source is None or _is_known(store, path):
+    for path, manifest, part in parts_of(folder):
+        if part.run != run or part.source is None:
+            continue
+        with store.reading() as connection:
+            if count(connection, tables.archived_parts, tables.archived_parts.c.path == path):
                 continue
-            rows = from_partition(read_partition(whole_content(folder, path, part.sha256)))
-            if not _has_some(store, rows["batches"]["id"].to_pylist()):
-                made = run_part(part.file, part.source, rows, b"")
-                yield path, _with(made, manifest, part)
-
-
-def _with(made: RunPart, manifest: Manifest, part: Part) -> RunPart:
-    return replace(made, spacecraft=manifest.spacecraft, day=manifest.day, part=part)
-
-
-def _is_known(store: Store, path: str) -> bool:
-    with store.reading() as connection:
-        query = select(archived_parts.c.id).where(archived_parts.c.path == path)
-        return connection.scalar(query) is not None
+        rows = read_part(folder, path, part.sha256)
+        if not _has_some(store, rows["batches"]["id"].to_pylist()):
+            made = run_part(part.file, part.source, rows, b"")
+            yield path, replace(made, spacecraft=manifest.spacecraft, day=manifest.day, part=part)
 
 
 def _has_some(store: Store, ids: Sequence[str]) -> bool:
     """True if some batches are recorded, others of them perhaps pruned, or are archived."""
     with store.reading() as connection:
         return any(
-            connection.scalar(
-                select(table.c.id).where(table.c.id.in_(ids[first : first + _AT_ONCE])).limit(1)
-            )
-            is not None
-            for table in (batches, archived_batches)
-            for first in range(0, len(ids), _AT_ONCE)
+            connection.scalar(select(table.c.id).where(table.c.id.in_(some_ids)).limit(1))
+            for table in (tables.batches, tables.archived_batches)
+            for some_ids in portions(ids)
         )
 
 
@@ -222,21 +196,13 @@ def restore_newest(store: Store, folder: Path, spacecraft: str, run: str) -> Non
     """
     wanted: dict[str, str] = {}
     with store.reading() as connection:
-        c, hourly = archived_parts.c, rollups_hourly.c
+        c = tables.archived_parts.c
         own = c.spacecraft == spacecraft, c.run == run
-        for has in (hourly.batches, hourly.solved):
-            newest = select(func.max(hourly.bucket)).where(
-                hourly.spacecraft == spacecraft, hourly.run == run, has > 0
-            )
-            hour = connection.scalar(newest)
-            if hour is None:
-                continue
-            begin_ns, end_ns = (bucket_start(hour + k, HOUR_S).tai_ns for k in (0, 1))
+        for begin_ns, end_ns in newest_hours(connection, spacecraft, run):
             query = select(c.path, c.sha256).where(*own, c.last_ns >= begin_ns, c.first_ns < end_ns)
             wanted |= dict(map(tuple, connection.execute(query)))
     for path, sha256 in sorted(wanted.items()):
-        content = whole_content(folder, path, sha256)
         manifest = manifest_of(folder, spacecraft, Path(path).parent.name.removeprefix("day="))
         part = next(each for each in manifest.parts if each.file == Path(path).name)
-        rows = from_partition(read_partition(content))
+        rows = read_part(folder, path, sha256)
         store.writer.change(partial(put_back, folder=folder, part=part, rows=rows)).result()

@@ -1,6 +1,6 @@
 """Takes archived batches back into the database, and verifies an archive."""
 
-from collections.abc import Callable, Container, Iterator, Mapping
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -17,33 +17,18 @@ from service.storage.archive.folder import (
     UNFINISHED,
     Manifest,
     Part,
-    day_folder,
     day_folders,
     is_locked,
     locked,
-    manifests,
-    path_of,
-    read_partition,
+    parts_of,
     read_settings,
-    whole_content,
 )
-from service.storage.archive.rows import Rows, from_partition, insert_rows
+from service.storage.archive.rows import Rows, insert_rows, read_part
 from service.storage.projections import rollups, seals
-from service.storage.projections.rollups import forget_share
-from service.storage.sql.statements import insert_missing, insert_runs
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    archived_what_ifs,
-    batches,
-    catalogs,
-    missions,
-    results,
-)
+from service.storage.sql import tables
+from service.storage.sql.statements import insert_missing, insert_runs, portions
 from service.storage.store import Store
 from service.times import HOUR_S, Utc, parse_utc
-
-_AT_ONCE = 1_000
 
 
 @dataclass(frozen=True)
@@ -89,16 +74,14 @@ def restore(
     """
     with locked(folder):
         parts = [
-            (path_of(folder, manifest, part), part)
-            for manifest in manifests(folder)
-            for part in manifest.parts
+            (path, part)
+            for path, manifest, part in parts_of(folder)
             if selected.takes(manifest, part)
         ]
         restored = Restored(sum(part.batches for _, part in parts))
         step(restored)
         for path, part in parts:
-            content = whole_content(folder, path, part.sha256)
-            rows = from_partition(read_partition(content))
+            rows = read_part(folder, path, part.sha256)
             record_again = partial(put_back, folder=folder, part=part, rows=rows)
             try:
                 is_new = store.writer.change(record_again).result()
@@ -115,13 +98,13 @@ def restore(
 def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
     """Insert the rows of a part; False: they are there."""
     ids = rows["batches"]["id"].to_pylist()
-    query = select(batches.c.id).where(batches.c.id.in_(ids[:1]))
+    query = select(tables.batches.c.id).where(tables.batches.c.id.in_(ids[:1]))
     if connection.scalar(query) is not None:
         return False
     part_id = connection.scalar(
-        select(archived_batches.c.part_id).where(archived_batches.c.id.in_(ids[:1]))
+        select(tables.archived_batches.c.part_id).where(tables.archived_batches.c.id.in_(ids[:1]))
     )
-    for digests, table in ((part.missions, missions), (part.catalogs, catalogs)):
+    for digests, table in ((part.missions, tables.missions), (part.catalogs, tables.catalogs)):
         rows_of_settings = [read_settings(folder, each).row for each in digests]
         # An archive of an earlier version has none.
         insert_missing(connection, table, [{"row_digest": None} | row for row in rows_of_settings])
@@ -129,20 +112,27 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     insert_runs(connection, {part.run: created}, tracked=part.tracked)
     if part_id is not None:
         spacecraft = rows["batches"]["spacecraft"][0].as_py()
-        forget_share(connection, part_id, spacecraft, part.run)
-        for first in range(0, len(ids), _AT_ONCE):
-            some_ids = ids[first : first + _AT_ONCE]
-            for table, column in ((archived_batches, "id"), (archived_what_ifs, "batch_id")):
-                connection.execute(delete(table).where(table.c[column].in_(some_ids)))
-        connection.execute(delete(archived_parts).where(archived_parts.c.id == part_id))
+        forget_part(connection, part_id, spacecraft, part.run, ids)
     position = rollups.lock_position(connection)
     insert_rows(connection, _placed(rows, 0 if part_id is None else position))
-    for first in range(0, len(ids), _AT_ONCE):
-        seals.add(connection, results.c.batch_id.in_(ids[first : first + _AT_ONCE]))
+    for some_ids in portions(ids):
+        seals.add(connection, tables.results.c.batch_id.in_(some_ids))
     if part_id is None:
         # The trends have the share of a part that the database knows.
         _add_to_trends(connection, rows)
     return True
+
+
+def forget_part(
+    connection: Connection, part_id: int, spacecraft: str, run: str, batch_ids: Sequence[str]
+) -> None:
+    """Delete what the database knows of a part with these batches, and its share in the trends."""
+    rollups.forget_share(connection, part_id, spacecraft, run)
+    for ids in portions(batch_ids):
+        for column in (tables.archived_batches.c.id, tables.archived_what_ifs.c.batch_id):
+            connection.execute(delete(column.table).where(column.in_(ids)))
+    own = tables.archived_parts.c.id == part_id
+    connection.execute(delete(tables.archived_parts).where(own))
 
 
 def _placed(rows: Rows, position: int) -> Rows:
@@ -163,7 +153,7 @@ def _add_to_trends(connection: Connection, rows: Rows) -> None:
     keys = {id: (row["spacecraft"], row["run"], hours[id]) for id, row in current.items()}
     rollups.add(connection, ((keys[id], row) for id, row in current.items()))
     of_trackers = rows["tracker_values"].to_pylist()
-    rollups.add_trackers(connection, ((keys[row["batch_id"]], row) for row in of_trackers))
+    rollups.add(connection, ((keys[row["batch_id"]], row) for row in of_trackers))
 
 
 def verify_archive(
@@ -178,19 +168,15 @@ def verify_archive(
     """
     done, whole = 0, {}
     named: dict[Path, set[str]] = {day: set() for day in day_folders(folder)}
-    for manifest in manifests(folder):
-        of_day = named.setdefault(day_folder(folder, manifest.spacecraft, manifest.day), set())
-        for part in manifest.parts:
-            path = path_of(folder, manifest, part)
-            of_day.add(part.file)
-            whole[path] = part.sha256
-            try:
-                content = whole_content(folder, path, part.sha256)
-                yield from _of_a_part(folder, path, manifest, part, content)
-            except BadConfiguration as error:
-                yield str(error)
-            done += part.batches
-            step(done)
+    for path, manifest, part in parts_of(folder):
+        named.setdefault((folder / path).parent, set()).add(part.file)
+        whole[path] = part.sha256
+        try:
+            yield from _of_a_part(folder, path, manifest, part)
+        except BadConfiguration as error:
+            yield str(error)
+        done += part.batches
+        step(done)
     # Another command may be writing parts: what it has not named yet is not left over.
     if not is_locked(folder):
         for day, files in named.items():
@@ -216,11 +202,9 @@ def _is_own(input: str, fingerprint: str) -> bool:
         return False
 
 
-def _of_a_part(
-    folder: Path, path: str, manifest: Manifest, part: Part, content: bytes
-) -> Iterator[str]:
+def _of_a_part(folder: Path, path: str, manifest: Manifest, part: Part) -> Iterator[str]:
     name = str(folder / path)
-    rows = from_partition(read_partition(content))
+    rows = read_part(folder, path, part.sha256)
     found, made = rows["batches"].to_pylist(), rows["results"].to_pylist()
     if (len(found), len(made)) != (part.batches, part.results):
         yield f"{name}: has other numbers of batches and results than the manifest says"

@@ -11,11 +11,12 @@ or whose result was replaced meanwhile, is left as it is.
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
-from sqlalchemy import Connection, Select, Table, bindparam, select, tuple_, update
+from sqlalchemy import Connection, Select, bindparam, select, tuple_, update
 from sqlalchemy import delete as deleted
 
 from service.errors import BadInput, Busy
@@ -32,7 +33,7 @@ from service.storage.queries.results import answer_from_json
 from service.storage.recording.identity import SETTINGS, digest_of, digest_of_row, made_later
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
-from service.storage.sql.statements import insert_all
+from service.storage.sql.statements import insert_all, owned_rows, rows_of
 from service.storage.sql.tables import (
     batches,
     frames,
@@ -83,18 +84,9 @@ class TrackerSplitter:
         pause_s: float = 0.0,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Split all that is waiting; how many batches were looked at.
-
-        `step` is called with that number as it grows.  After each step it pauses, so that
-        batches that are sent meanwhile do not wait.
-        """
-        done = 0
-        for owner in self.waiting():
-            while not is_stopped() and (looked_at := self._step(owner)):
-                done += looked_at
-                step(done)
-                time.sleep(pause_s)
-        return done
+        """Split all that is waiting; how many batches were looked at, see `_in_steps`."""
+        work = [partial(self._step, owner) for owner in self.waiting()]
+        return _in_steps(work, step, pause_s, is_stopped)
 
     def _step(self, owner: Owner) -> int:
         """Split the next batches of a run; 0 when it is done."""
@@ -102,7 +94,7 @@ class TrackerSplitter:
             place = _place(connection, owner)
             if place is None:
                 return 0
-            rows = [dict(row) for row in connection.execute(_next(owner, place)).mappings()]
+            rows = rows_of(connection, _next(owner, place))
             for digest in {row["mission_digest"] for row in rows} - self._recorded.keys():
                 self._recorded[digest] = recorded_mission(connection, digest)
         split = {row["id"]: self._split(row) for row in rows}
@@ -189,6 +181,26 @@ class BackgroundUpgrade:
             return
 
 
+def _in_steps(
+    work: Iterable[Callable[[], int]],
+    step: Callable[[int], object],
+    pause_s: float,
+    is_stopped: Callable[[], bool],
+) -> int:
+    """Call each function until it gives zero; the sum of what they gave.
+
+    `step` is called with that sum as it grows.  After each step it pauses, so that batches that
+    are sent meanwhile do not wait.
+    """
+    done = 0
+    for function in work:
+        while not is_stopped() and (made := function()):
+            done += made
+            step(done)
+            time.sleep(pause_s)
+    return done
+
+
 def _place(connection: Connection, owner: Owner, *, lock: bool = False) -> Place | None:
     """How far the batches of a run were looked at; None if all are."""
     query = select(tracker_splits.c.time_ns, tracker_splits.c.batch_id).where(_is(owner))
@@ -247,7 +259,7 @@ def _write(
     insert_all(connection, tracker_values, [values for _, values in new])
     # The projector adds those that it has not come to yet.
     passed = [(id, values) for id, values in new if current[id] <= position]
-    rollups.add_trackers(connection, (((*owner, hours[id]), values) for id, values in passed))
+    rollups.add(connection, (((*owner, hours[id]), values) for id, values in passed))
     last = {"time_ns": rows[-1]["time_ns"], "batch_id": rows[-1]["batch_id"]}
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))
 
@@ -283,18 +295,10 @@ class OlderDigests:
         pause_s: float = 0.0,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Make all that are missing; how many results got one.
-
-        `step` is called with that number as it grows.  After each step it pauses, so that
-        batches that are sent meanwhile do not wait.
-        """
+        """Make all that are missing; how many results got one, see `_in_steps`."""
         self.store.writer.change(_give_to_settings).result()
-        done = 0
-        while not is_stopped() and (made := self.store.writer.change(_give).result()):
-            done += made
-            step(done)
-            time.sleep(pause_s)
-        return done
+        work = [lambda: self.store.writer.change(_give).result()]
+        return _in_steps(work, step, pause_s, is_stopped)
 
 
 def _give(connection: Connection) -> int:
@@ -302,25 +306,20 @@ def _give(connection: Connection) -> int:
     # Whoever deletes results takes this lock, too.
     rollups.lock_position(connection)
     query = select(results).where(results.c.digest.is_(None)).order_by(results.c.id).limit(AT_ONCE)
-    made = [dict(row) for row in connection.execute(query).mappings()]
+    made = rows_of(connection, query)
     if not made:
         return 0
     ids = [row["id"] for row in made]
-    stars: dict[str, list[Row]] = {id: [] for id in ids}
-    for row in _rows(connection, star_results, "result_id", ids):
-        stars[row["result_id"]].append(row)
-    solved = {row["result_id"]: row for row in _rows(connection, solutions, "result_id", ids)}
-    sent = {row["id"]: row for row in _rows(connection, batches, "id", ids)}
-    framed = {row["batch_id"]: row for row in _rows(connection, frames, "batch_id", ids)}
-    digests = [
-        {
-            "of": id,
-            "given": made_later(
-                digest_of(row, stars[id], solved.get(id), sent.get(id), framed.get(id))
-            ),
-        }
-        for row, id in zip(made, ids, strict=True)
+    stars = owned_rows(connection, star_results, "result_id", ids)
+    others = [
+        owned_rows(connection, table, owner, ids)
+        for table, owner in ((solutions, "result_id"), (batches, "id"), (frames, "batch_id"))
     ]
+    digests = []
+    for row in made:
+        own = (next(iter(rows[row["id"]]), None) for rows in others)
+        digest = made_later(digest_of(row, stars[row["id"]], *own))
+        digests.append({"of": row["id"], "given": digest})
     chosen = results.c.id.in_(ids)
     seals.add(connection, chosen, -1)
     one = update(results).where(results.c.id == bindparam("of"))
@@ -332,12 +331,7 @@ def _give(connection: Connection) -> int:
 def _give_to_settings(connection: Connection) -> None:
     for table in SETTINGS:
         query = select(table).where(table.c.row_digest.is_(None))
-        for row in connection.execute(query).mappings().all():
+        for row in rows_of(connection, query):
             own = [column == row[column.name] for column in table.primary_key]
-            digest = made_later(digest_of_row(table, dict(row)))
+            digest = made_later(digest_of_row(table, row))
             connection.execute(update(table).where(*own).values(row_digest=digest))
-
-
-def _rows(connection: Connection, table: Table, owner: str, ids: list[str]) -> list[Row]:
-    query = select(table).where(table.c[owner].in_(ids))
-    return [dict(row) for row in connection.execute(query).mappings()]

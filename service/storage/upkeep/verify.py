@@ -8,25 +8,14 @@ import hashlib
 import json
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from itertools import product
+from itertools import chain, product
 from typing import Any, get_args
 
 import msgspec
 import numpy as np
-from sqlalchemy import (
-    ColumnElement,
-    Connection,
-    Engine,
-    Table,
-    and_,
-    event,
-    func,
-    select,
-    text,
-    tuple_,
-)
+import sqlalchemy as sa
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
@@ -37,26 +26,18 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
+from service.storage.queries.time_buckets import Bucket
 from service.storage.recording.identity import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.result_metrics import is_waiting
+from service.storage.sql import tables
 from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days, gyro_blocks
-from service.storage.sql.migrations import check, reported
-from service.storage.sql.tables import (
-    archived_batches,
-    archived_parts,
-    batches,
-    frames,
-    missions,
-    results,
-    solutions,
-    star_results,
-    tracker_values,
-)
+from service.storage.sql.migrations import check, disposed, reading, reported
+from service.storage.sql.statements import count, owned_rows, rows_of
 from service.times import unix_seconds, utc_of_unix
 
-AT_ONCE = 500
+AT_ONCE, BLOCKS_AT_ONCE = 500, 50
 OUTCOMES = ("unique", "ambiguous", "unmatched")
 TOLERANCE = 1e-9
 """Relative, for sums of the same numbers in another order."""
@@ -78,22 +59,19 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
     url = database_url(database)
     engine = reading_engine(url)
     if engine.dialect.name == "sqlite":
-        event.listen(engine, "connect", _read_any_text)
-    try:
-        with reported(url):
-            found = _of_the_file(engine)
-            # The content of a damaged file is not evidence of what was written.
-            if not found:
-                found += _of_the_references(engine)
-                found += _of_the_batches(engine, step)
-                found += _of_the_missions(engine)
-                found += _of_the_seals(engine)
-                found += _of_the_trends(engine)
-                found += of_the_gyro_blocks(engine)
-                found += of_the_archived(engine)
-                found += of_the_grades(engine)
-    finally:
-        engine.dispose()
+        sa.event.listen(engine, "connect", _read_any_text)
+    with disposed(engine), reported(url):
+        found = list(_of_the_file(engine))
+        # The content of a damaged file is not evidence of what was written.
+        if not found:
+            found += _of_the_references(engine)
+            found += _of_the_batches(engine, step)
+            found += _of_the_missions(engine)
+            found += _of_the_seals(engine)
+            found += _of_the_trends(engine)
+            found += _of_the_gyro_blocks(engine)
+            found += _of_the_archived(engine)
+            found += _of_the_grades(engine)
     return found
 
 
@@ -104,126 +82,108 @@ def _read_any_text(connection: Any, _: object) -> None:
 
 def earlier_results(database: str) -> tuple[int, int]:
     """Results of earlier versions: those without a digest, and those that got one at an upgrade."""
-    digest = results.c.digest
-    query = select(func.count().filter(digest.is_(None)), func.count().filter(digest < 0))
-    url = database_url(database)
-    engine = reading_engine(url)
-    try:
-        with reported(url), engine.begin() as connection:
-            without, later = connection.execute(query.select_from(results)).one()
-    finally:
-        engine.dispose()
+    digest = tables.results.c.digest
+    query = sa.select(sa.func.count().filter(digest.is_(None)), sa.func.count().filter(digest < 0))
+    with reading(database) as connection:
+        without, later = connection.execute(query.select_from(tables.results)).one()
     return int(without), int(later)
 
 
-def _of_the_file(engine: Engine) -> list[str]:
+def _of_the_file(engine: sa.Engine) -> Iterator[str]:
     if engine.dialect.name != "sqlite":
-        return []
-    found = []
+        return
     try:
         with engine.begin() as connection:
             lines = connection.exec_driver_sql("PRAGMA integrity_check(20)").scalars().all()
-            found = [f"the file is damaged: {each}" for each in lines if each != "ok"]
     except DatabaseError as error:
-        found.append(f"the file is damaged: {error.orig}")
-    return found
+        lines = [error.orig]
+    for line in lines:
+        if line != "ok":
+            yield f"the file is damaged: {line}"
 
 
-def _of_the_references(engine: Engine) -> list[str]:
+def _of_the_references(engine: sa.Engine) -> Iterator[str]:
     if engine.dialect.name != "sqlite":
-        return []
-    found = []
+        return
     with engine.begin() as connection:
         for name, row, parent, _ in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
             key = "a row"
             if row is not None:
-                query = select(*metadata.tables[name].primary_key).where(text("rowid = :row"))
+                query = sa.select(*metadata.tables[name].primary_key).where(sa.text("rowid = :row"))
                 key = " ".join(map(str, connection.execute(query, {"row": row}).one()))
-            found.append(f"{name}, {key}: it refers to what is not in {parent}")
-    return found
+            yield f"{name}, {key}: it refers to what is not in {parent}"
 
 
-def _of_the_batches(engine: Engine, step: Step) -> list[str]:
-    problems: list[str] = []
+def _of_the_batches(engine: sa.Engine, step: Step) -> Iterator[str]:
     with engine.begin() as connection:
-        total = int(connection.scalar(select(func.count()).select_from(batches)) or 0)
-    done, last = 0, ""
-    while True:
-        with engine.begin() as connection:
-            rows = connection.execute(
-                select(batches).where(batches.c.id > last).order_by(batches.c.id).limit(AT_ONCE)
-            ).mappings()
-            chunk = {row["id"]: dict(row) for row in rows}
-            if not chunk:
-                return problems
-            problems += _of_a_chunk(connection, chunk)
-        done, last = done + len(chunk), max(chunk)
+        total = count(connection, tables.batches)
+    done = 0
+    for connection, rows in _pages(engine, tables.batches, ("id",), AT_ONCE):
+        yield from _of_a_chunk(connection, {row["id"]: row for row in rows})
+        done += len(rows)
         step(done, max(total, done))
 
 
-def _of_a_chunk(connection: Connection, chunk: Mapping[str, Row]) -> Iterator[str]:
-    made = [
-        dict(row)
-        for row in connection.execute(
-            select(results).where(results.c.batch_id.in_(chunk))
-        ).mappings()
-    ]
+def _pages(
+    engine: sa.Engine, table: sa.Table, order: Sequence[str], at_once: int
+) -> Iterator[tuple[sa.Connection, list[Row]]]:
+    """The rows of a table in the order of unique columns, each page as of one moment."""
+    columns = [table.c[name] for name in order]
+    query = sa.select(table).order_by(*columns).limit(at_once)
+    beyond = query
+    while True:
+        with engine.begin() as connection:
+            if rows := rows_of(connection, beyond):
+                yield connection, rows
+        if len(rows) < at_once:
+            return
+        last = [rows[-1][name] for name in order]
+        beyond = query.where(sa.tuple_(*columns) > sa.tuple_(*last))
+
+
+def _of_a_chunk(connection: sa.Connection, chunk: Mapping[str, Row]) -> Iterator[str]:
+    of_batch = owned_rows(connection, tables.results, "batch_id", chunk)
+    made = [row for rows in of_batch.values() for row in rows]
     ids = [row["id"] for row in made]
-    stars: dict[str, list[Row]] = {id: [] for id in ids}
-    for row in _rows(connection, star_results, star_results.c.result_id, ids):
-        stars[row["result_id"]].append(row)
-    found = _rows(connection, solutions, solutions.c.result_id, ids)
-    solved = {row["result_id"]: row for row in found}
-    found = _rows(connection, frames, frames.c.batch_id, chunk)
-    framed = {row["batch_id"]: row for row in found}
-    of_batch: dict[str, list[Row]] = {id: [] for id in chunk}
-    for row in made:
-        of_batch[row["batch_id"]].append(row)
+    stars = owned_rows(connection, tables.star_results, "result_id", ids)
+    solutions = owned_rows(connection, tables.solutions, "result_id", ids)
+    frames = owned_rows(connection, tables.frames, "batch_id", chunk)
     yield from _of_the_trackers(connection, chunk, made)
     for id, batch in chunk.items():
-        yield from _of_a_batch(batch, of_batch[id], framed.get(id))
+        frame = next(iter(frames[id]), None)
+        yield from _of_a_batch(batch, of_batch[id], frame)
         for row in of_batch[id]:
-            of_row, solution = stars[row["id"]], solved.get(row["id"])
-            outcomes = Counter(each["outcome"] for each in of_row)
+            own_stars, solution = stars[row["id"]], next(iter(solutions[row["id"]]), None)
+            outcomes = Counter(star["outcome"] for star in own_stars)
             yield from _of_a_result(row, batch, outcomes, solution is not None)
-            own = (batch, framed.get(id)) if row["id"] == id else ()
+            own = (batch, frame) if row["id"] == id else ()
             if row["digest"] is None and row["seq"]:
                 yield f"result {row['id']} of batch {id}: it has no digest"
-            if not agrees(row["digest"], digest_of(row, of_row, solution, *own)):
+            if not agrees(row["digest"], digest_of(row, own_stars, solution, *own)):
                 yield f"result {row['id']} of batch {id}: it is not what was recorded"
 
 
-def _rows(
-    connection: Connection, table: Table, owner: ColumnElement[str], ids: Iterable[str]
-) -> list[Row]:
-    query = select(table).where(owner.in_(ids))
-    return [dict(row) for row in connection.execute(query).mappings()]
-
-
 def _of_the_trackers(
-    connection: Connection, chunk: Mapping[str, Row], made: Sequence[Row]
+    connection: sa.Connection, chunk: Mapping[str, Row], made: Sequence[Row]
 ) -> Iterator[str]:
     """The faults of what is stored of each tracker: it must be what its stars say.
 
     A batch of several trackers that has none must be waiting for it.
     """
     current = {row["id"]: row["batch_id"] for row in made if row["current"]}
-    stars = star_results.c
-    counted = (
-        select(stars.result_id, stars.tracker, stars.outcome, func.count())
-        .where(stars.result_id.in_(current))
-        .group_by(stars.result_id, stars.tracker, stars.outcome)
-    )
+    stars = tables.star_results.c
+    groups = stars.result_id, stars.tracker, stars.outcome
+    counted = sa.select(*groups, sa.func.count()).where(stars.result_id.in_(current))
     seen: dict[str, dict[str, Counter[str]]] = {}
-    for id, tracker, outcome, count in connection.execute(counted):
+    for id, tracker, outcome, number in connection.execute(counted.group_by(*groups)):
         of_batch = seen.setdefault(current[id], {})
-        of_batch.setdefault(tracker, Counter())[outcome] = count
+        of_batch.setdefault(tracker, Counter())[outcome] = number
     stored: dict[str, dict[str, Counter[str]]] = {}
-    rows = select(tracker_values).where(tracker_values.c.batch_id.in_(chunk))
-    for row in connection.execute(rows).mappings():
+    query = sa.select(tables.tracker_values).where(tables.tracker_values.c.batch_id.in_(chunk))
+    for row in rows_of(connection, query):
         of_batch = stored.setdefault(row["batch_id"], {})
         of_batch[row["tracker"]] = Counter({name: row[name] for name in OUTCOMES})
-        if not agrees(row["row_digest"], digest_of_row(tracker_values, dict(row))):
+        if not agrees(row["row_digest"], digest_of_row(tables.tracker_values, row)):
             yield f"batch {row['batch_id']}: {row['tracker']}'s values are not what was recorded"
     for id, batch in chunk.items():
         of_stars, of_rows = seen.get(id, {}), stored.get(id, {})
@@ -306,15 +266,15 @@ def _of_a_result(row: Row, batch: Row, stars: "Counter[str]", is_solved: bool) -
         yield f"{name}: its answer says otherwise than its row"
 
 
-def _of_the_trends(engine: Engine) -> Iterator[str]:
+def _of_the_trends(engine: sa.Engine) -> Iterator[str]:
     try:
-        for bucket, of_trackers in product(get_args(rollups.Bucket), (False, True)):
+        for bucket, of_trackers in product(get_args(Bucket), (False, True)):
             yield from _of_trends_by(engine, bucket, of_trackers=of_trackers)
     except BadInput as error:
         yield f"the trends cannot be counted again: {error}"
 
 
-def _of_trends_by(engine: Engine, bucket: rollups.Bucket, *, of_trackers: bool) -> Iterator[str]:
+def _of_trends_by(engine: sa.Engine, bucket: Bucket, *, of_trackers: bool) -> Iterator[str]:
     with engine.begin() as connection:
         stored, counted = (
             {key: row for key, row in found.items() if row["batches"]}
@@ -333,16 +293,16 @@ def _of_trends_by(engine: Engine, bucket: rollups.Bucket, *, of_trackers: bool) 
             yield f"{of}, {bucket} {number}: not those of the results"
 
 
-def _of_the_missions(engine: Engine) -> Iterator[str]:
+def _of_the_missions(engine: sa.Engine) -> Iterator[str]:
     """Settings and catalogs that are not what was recorded, under the digests that results name."""
     with engine.begin() as connection:
-        rows = {t: connection.execute(select(t)).mappings().all() for t in SETTINGS}
+        rows = {table: rows_of(connection, sa.select(table)) for table in SETTINGS}
     for table, table_rows in rows.items():
         for row in table_rows:
-            if not agrees(row["row_digest"], digest_of_row(table, dict(row))):
+            if not agrees(row["row_digest"], digest_of_row(table, row)):
                 yield f"{table.name}, {row['digest']}: the row is not what was recorded"
     # See `Mission.digest`.
-    for digest, settings in ((row["digest"], row["settings"]) for row in rows[missions]):
+    for digest, settings in ((row["digest"], row["settings"]) for row in rows[tables.missions]):
         try:
             canonical = json.dumps(json.loads(settings), sort_keys=True, separators=(",", ":"))
         except ValueError:
@@ -351,7 +311,7 @@ def _of_the_missions(engine: Engine) -> Iterator[str]:
             yield f"mission settings {digest}: they are not what was recorded"
 
 
-def _of_the_seals(engine: Engine) -> Iterator[str]:
+def _of_the_seals(engine: sa.Engine) -> Iterator[str]:
     with engine.begin() as connection:
         stored, counted = seals.stored(connection), seals.counted(connection)
     for key in sorted(stored.keys() | counted.keys()):
@@ -376,16 +336,15 @@ def _same(one: float | None, other: float | None) -> bool:
     return math.isclose(one, other, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
 
 
-def of_the_archived(engine: Engine) -> Iterator[str]:
+def _of_the_archived(engine: sa.Engine) -> Iterator[str]:
     """The faults: batches in no part, in fewer than their part has, and recorded ones."""
-    counted = select(archived_batches.c.part_id, func.count()).group_by(archived_batches.c.part_id)
-    both = select(batches.c.id).join(
-        archived_batches,
-        and_(*(archived_batches.c[name] == batches.c[name] for name in _IDENTITY)),
-    )
+    archived, recorded_ones = tables.archived_batches.c, tables.batches.c
+    counted = sa.select(archived.part_id, sa.func.count()).group_by(archived.part_id)
+    same = (archived[name] == recorded_ones[name] for name in ("spacecraft", "run", "batch"))
+    both = sa.select(recorded_ones.id).where(*same)
     with engine.begin() as connection:
         found = dict(map(tuple, connection.execute(counted)))
-        parts = connection.execute(select(archived_parts)).mappings().all()
+        parts = rows_of(connection, sa.select(tables.archived_parts))
         recorded = list(connection.scalars(both)) if found else []
     for part in parts:
         if found.pop(part["id"], 0) != part["batches"]:
@@ -396,48 +355,39 @@ def of_the_archived(engine: Engine) -> Iterator[str]:
         yield f"batch {id}: it is recorded and archived"
 
 
-_IDENTITY = ("spacecraft", "run", "batch")
-
-
 _UNPACKED: dict[str, Callable[[bytes, int], GradedSamples | MeasuredInnovations]] = {
     INNOVATIONS: unpacked_innovations
 }
 
 
-def of_the_grades(engine: Engine) -> Iterator[str]:
+def _of_the_grades(engine: sa.Engine) -> Iterator[str]:
     """The faults of the graded days, a sentence each.
 
     The samples of a current day must be those that were digested, in order of time, within the
     day and as many as it says; an earlier revision has none.
     """
-    last = ""
-    while True:
-        query = select(graded_days.c.id).where(graded_days.c.id > last).order_by(graded_days.c.id)
+    pages = _pages(engine, graded_days, ("id",), AT_ONCE)
+    for id in [day["id"] for _, days in pages for day in days]:
+        # As of one moment: a new revision takes the samples from the one before.
         with engine.begin() as connection:
-            ids = connection.scalars(query.limit(AT_ONCE)).all()
-        for id in ids:
-            # As of one moment: a new revision takes the samples from the one before.
-            with engine.begin() as connection:
-                yield from _of_a_day(connection, id)
-        if len(ids) < AT_ONCE:
-            return
-        last = ids[-1]
+            yield from _of_a_day(connection, id)
 
 
-def _of_a_day(connection: Connection, id: str) -> Iterator[str]:
-    row = connection.execute(select(graded_days).where(graded_days.c.id == id)).mappings().first()
-    if row is None:
+def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
+    rows = rows_of(connection, sa.select(graded_days).where(graded_days.c.id == id))
+    if not rows:
         return
+    (row,) = rows
     name = f"graded day {id}"
     c = graded_blocks.c
     if not row["current"]:
-        if connection.scalar(select(func.count()).where(c.day_id == id)):
+        if count(connection, graded_blocks, c.day_id == id):
             yield f"{name}: it has samples, though it is not the current revision"
         return
     digest, samples = hashlib.sha256(), Counter[str]()
     for grade in (*GRADES, INNOVATIONS):
         end_ns = row["start_ns"]
-        chosen = select(graded_blocks).where(c.day_id == row["id"], c.grade == grade)
+        chosen = sa.select(graded_blocks).where(c.day_id == row["id"], c.grade == grade)
         for block in connection.execute(chosen.order_by(c.position)).mappings():
             where = f"{name}: block {block['position']} of {grade}"
             try:
@@ -462,17 +412,15 @@ def _of_a_day(connection: Connection, id: str) -> Iterator[str]:
         yield f"{name}: its samples are not those that were digested"
 
 
-BLOCKS_AT_ONCE = 50
-ORDER = (gyro_blocks.c.spacecraft, gyro_blocks.c.run, gyro_blocks.c.start_ns, gyro_blocks.c.id)
-
-
-def of_the_gyro_blocks(engine: Engine) -> Iterator[str]:
+def _of_the_gyro_blocks(engine: sa.Engine) -> Iterator[str]:
     """The faults of the gyro blocks, a sentence each.
 
     A block must be the one that was sent, and no two of a spacecraft and a run may share a time.
     """
     before: list[tuple[Any, Nanoseconds]] = []
-    for row in _block_rows(engine):
+    order = ("spacecraft", "run", "start_ns", "id")
+    pages = _pages(engine, gyro_blocks, order, BLOCKS_AT_ONCE)
+    for row in chain.from_iterable(rows for _, rows in pages):
         name = f"gyro block {row['id']}"
         try:
             block = block_of(row)
@@ -497,16 +445,3 @@ def of_the_gyro_blocks(engine: Engine) -> Iterator[str]:
             if first_shared_ns(times_ns, others_ns) is not None:
                 yield f"{name}: it shares a time with gyro block {other['id']}"
         before.append((row, times_ns))
-
-
-def _block_rows(engine: Engine) -> Iterator[Any]:
-    query = select(gyro_blocks).order_by(*ORDER).limit(BLOCKS_AT_ONCE)
-    beyond = query
-    while True:
-        with engine.begin() as connection:
-            rows = connection.execute(beyond).mappings().all()
-        yield from rows
-        if len(rows) < BLOCKS_AT_ONCE:
-            return
-        last = [rows[-1][column.name] for column in ORDER]
-        beyond = query.where(tuple_(*ORDER) > tuple_(*last))

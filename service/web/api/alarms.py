@@ -2,8 +2,7 @@
 
 from typing import Annotated, ClassVar, Self
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
+from fastapi import Path
 from pydantic import AfterValidator, ConfigDict, Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
@@ -13,164 +12,108 @@ from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, Wire
-from service.storage.models.alarms import (
-    AlarmPage,
-    AlarmWithActions,
-    Annotation,
-    AnnotationPage,
-    Limit,
-    LimitHistory,
-    LimitList,
-    LimitPreview,
-)
-from service.web.openapi.route import LINK, ResponseDoc, route_docs
-from service.web.requests.access import AuditDep, CallerDep, author, require_all_spacecraft
+from service.storage.models import alarms as models
+from service.web.openapi import LINK, ApiRouter, Returns
+from service.web.requests import query_parameters as params
+from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    AlarmQuery,
-    AnnotationQuery,
-    AuthorQuery,
-    Comment,
-    LimitQuery,
-    LimitStatementQuery,
-    RunQuery,
-    SpacecraftPath,
-    Time,
-    Who,
-    without_nul,
-)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
 
-router = APIRouter(prefix="/api/v1", tags=["alarms"])
+router = ApiRouter("alarms")
 
 QuantityPath = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
 AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
-LIMITS = "/spacecraft/{name}/limits"
 
 
-class StatementIn(Wire):
+class _Statement(Wire):
+    who: Who = None
+    comment: params.Comment = None
+
+
+class StatementIn(_Statement):
     """The author of an action, and a comment."""
 
     component: ClassVar[str] = "Said"
     model_config = ConfigDict(title=component)
 
-    who: Who = None
-    comment: Comment = None
 
-
-class ShelveIn(StatementIn):
+class ShelveIn(_Statement):
     """How long to shelve an alarm."""
-
-    component: ClassVar[str] = "ShelveIn"
-    model_config = ConfigDict(title=component)
 
     minutes: Annotated[int, Field(ge=1, le=10_080, description="At most a week.")]
 
 
-class CommentIn(StatementIn):
+class CommentIn(_Statement):
     """A comment on an alarm."""
 
-    component: ClassVar[str] = "CommentIn"
-    model_config = ConfigDict(title=component)
-
-    comment: Annotated[str, Field(min_length=1, max_length=2_000), AfterValidator(without_nul)]
+    comment: Annotated[
+        str, Field(min_length=1, max_length=2_000), AfterValidator(params.without_nul)
+    ]
 
 
 class LimitTrialIn(Wire):
     """A limit to try."""
 
-    component: ClassVar[str] = "LimitTrialIn"
-    model_config = ConfigDict(title=component)
-
     settings: LimitSettings
 
 
-class LimitPreviewQuery(LimitQuery, RunQuery):
+class LimitPreviewQuery(params.LimitQuery, params.RunQuery):
     """What a limit is tried on."""
 
     days: Annotated[int, Field(ge=1, le=30, description="Up to the run's latest batch.")] = 7
 
 
-class LimitIn(StatementIn):
+class LimitIn(_Statement):
     """A new limit."""
-
-    component: ClassVar[str] = "LimitIn"
-    model_config = ConfigDict(title=component)
 
     settings: LimitSettings
 
 
-@router.get(
-    LIMITS,
-    **route_docs({200: ResponseDoc("Every limit.", LimitList)}, problems=(404,)),
-)
-def list_limits(
-    name: SpacecraftPath, query: Annotated[LimitQuery, InQuery()], app: AppDep
-) -> Response:
+@router.serves("GET /spacecraft/{name}/limits", Returns("Every limit.", models.LimitList))
+def list_limits(name: SpacecraftPath, query: FromQuery[params.LimitQuery], app: AppDep) -> Response:
     """The limits of every quantity of a spacecraft or a tracker, set or shipped."""
     return json_response({"items": app.limits.all(name, query.tracker)})
 
 
-@router.get(
-    LIMITS + "/{quantity}",
-    **route_docs({200: ResponseDoc("The limit and its history.", LimitHistory)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/limits/{quantity}",
+    Returns("The limit and its history.", models.LimitHistory),
 )
 def get_limit(
-    name: SpacecraftPath,
-    quantity: QuantityPath,
-    query: Annotated[LimitQuery, InQuery()],
-    app: AppDep,
+    name: SpacecraftPath, quantity: QuantityPath, query: FromQuery[params.LimitQuery], app: AppDep
 ) -> Response:
     """The limit of one quantity, the shipped limit, and the history of changes."""
     return json_response(app.limits.get(name, _quantity_with_limits(quantity), query.tracker))
 
 
-@router.put(
-    LIMITS + "/{quantity}",
-    **route_docs(
-        {200: ResponseDoc("The limit, which applies from the next batch on.", Limit)},
-        body=LimitIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "PUT /spacecraft/{name}/limits/{quantity}",
+    Returns("The limit, which applies from the next batch on.", models.Limit),
+    body=LimitIn,
 )
 def set_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: Annotated[LimitQuery, InQuery()],
+    query: FromQuery[params.LimitQuery],
     body: JsonBody,
     app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    change: ChangeDep,
 ) -> Response:
     """Set a limit; the previous one stays in the history."""
     asked = read_model(LimitIn, body)
-    limited, who = _quantity_with_limits(quantity), author(caller, asked.who)
-    return json_response(
-        app.limits.set(
-            name,
-            limited,
-            asked.settings,
-            who=who,
-            comment=asked.comment,
-            entry=audited.entry(),
-            tracker=query.tracker,
-        )
-    )
+    return json_response(_set(app, name, quantity, query.tracker, asked.settings, asked, change))
 
 
-@router.post(
-    LIMITS + "/{quantity}/preview",
-    **route_docs(
-        {200: ResponseDoc("How this limit and the one in force evaluate them.", LimitPreview)},
-        body=LimitTrialIn,
-        problems=(404,),
-    ),
+@router.serves(
+    "POST /spacecraft/{name}/limits/{quantity}/preview",
+    Returns("How this limit and the one in force evaluate them.", models.LimitPreview),
+    body=LimitTrialIn,
 )
 def preview_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: Annotated[LimitPreviewQuery, InQuery()],
+    query: FromQuery[LimitPreviewQuery],
     body: JsonBody,
     app: AppDep,
 ) -> Response:
@@ -180,123 +123,107 @@ def preview_limit(
     return json_response(app.limits.preview(name, limited, asked.settings, **query.asked()))
 
 
-@router.delete(
-    LIMITS + "/{quantity}",
-    **route_docs(
-        {200: ResponseDoc("The shipped limit, which applies again.", Limit)}, problems=(404, 503)
-    ),
+@router.serves(
+    "DELETE /spacecraft/{name}/limits/{quantity}",
+    Returns("The shipped limit, which applies again.", models.Limit),
+    problems=(503,),
 )
 def reset_limit(
     name: SpacecraftPath,
     quantity: QuantityPath,
-    query: Annotated[LimitStatementQuery, InQuery()],
+    query: FromQuery[params.LimitStatementQuery],
     app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    change: ChangeDep,
 ) -> Response:
     """Restore the shipped limit; earlier limits stay in the history."""
-    limited, who = _quantity_with_limits(quantity), author(caller, query.who)
-    return json_response(
-        app.limits.set(
-            name,
-            limited,
-            None,
-            who=who,
-            comment=query.comment,
-            entry=audited.entry(),
-            tracker=query.tracker,
-        )
+    return json_response(_set(app, name, quantity, query.tracker, None, query, change))
+
+
+def _set(
+    app: AppDep,
+    name: str,
+    quantity: str,
+    tracker: str | None,
+    settings: LimitSettings | None,
+    statement: LimitIn | params.LimitStatementQuery,
+    change: ChangeDep,
+) -> models.Limit:
+    """Set a limit, or without settings restore the shipped one."""
+    limited, who = _quantity_with_limits(quantity), change.author(statement.who)
+    return app.limits.set(
+        name,
+        limited,
+        settings,
+        who=who,
+        comment=statement.comment,
+        entry=change.entry(),
+        tracker=tracker,
     )
 
 
-@router.get("/alarms", **route_docs({200: ResponseDoc("A page of alarms.", AlarmPage, LINK)}))
-def list_alarms(request: Request, query: Annotated[AlarmQuery, InQuery()], app: AppDep) -> Response:
+@router.serves("GET /alarms", Returns("A page of alarms.", models.AlarmPage, LINK))
+def list_alarms(request: Request, query: FromQuery[params.AlarmQuery], app: AppDep) -> Response:
     """Alarms, newest first; by default those that are not cleared."""
     return page_response(request, app.alarms.page(**query.asked()))
 
 
-@router.get(
-    "/alarms/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The alarm.", AlarmWithActions)}, problems=(404,)),
-)
+@router.serves("GET /alarms/{id}", Returns("The alarm.", models.AlarmWithActions))
 def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     """One alarm with its history."""
     return json_response(_visible_alarm(app, id, caller))
 
 
-@router.post(
-    "/alarms/{id}/acknowledge",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The alarm, now acknowledged.", AlarmWithActions)},
-        body=StatementIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /alarms/{id}/acknowledge",
+    Returns("The alarm, now acknowledged.", models.AlarmWithActions),
+    body=StatementIn,
+    problems=(409,),
 )
-def acknowledge_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Acknowledge an alarm; it is cleared if the quantity is back in limits."""
     asked = read_model(StatementIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.acknowledge(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.acknowledge(id, who, asked.comment, change.entry()))
 
 
-@router.post(
-    "/alarms/{id}/shelve",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The alarm, now shelved.", AlarmWithActions)},
-        body=ShelveIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /alarms/{id}/shelve",
+    Returns("The alarm, now shelved.", models.AlarmWithActions),
+    body=ShelveIn,
+    problems=(409,),
 )
-def shelve_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Shelve an alarm for some minutes; it returns by itself."""
     asked = read_model(ShelveIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.shelve(id, who, asked.minutes, asked.comment, change.entry()))
 
 
-@router.post(
-    "/alarms/{id}/unshelve",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The alarm.", AlarmWithActions)},
-        body=StatementIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /alarms/{id}/unshelve",
+    Returns("The alarm.", models.AlarmWithActions),
+    body=StatementIn,
+    problems=(409,),
 )
-def unshelve_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def unshelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Unshelve an alarm."""
     asked = read_model(StatementIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.unshelve(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.unshelve(id, who, asked.comment, change.entry()))
 
 
-@router.post(
-    "/alarms/{id}/comment",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The alarm.", AlarmWithActions)}, body=CommentIn, problems=(404, 503)
-    ),
+@router.serves(
+    "POST /alarms/{id}/comment", Returns("The alarm.", models.AlarmWithActions), body=CommentIn
 )
-def comment_alarm(
-    id: AlarmId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def comment_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Add a comment to an alarm."""
     asked = read_model(CommentIn, body)
-    _visible_alarm(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.alarms.comment(id, who, asked.comment, audited.entry()))
+    _visible_alarm(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.alarms.comment(id, who, asked.comment, change.entry()))
 
 
 def _quantity_with_limits(quantity: str) -> QuantityName:
@@ -306,7 +233,7 @@ def _quantity_with_limits(quantity: str) -> QuantityName:
     return quantity
 
 
-def _visible_alarm(app: AppDep, id: str, caller: Caller) -> AlarmWithActions:
+def _visible_alarm(app: AppDep, id: str, caller: Caller) -> models.AlarmWithActions:
     """An alarm of the caller's spacecraft; raises `NotFound` for those of others."""
     found = app.alarms.get(id)
     if not caller.may_see(found.spacecraft):
@@ -314,7 +241,7 @@ def _visible_alarm(app: AppDep, id: str, caller: Caller) -> AlarmWithActions:
     return found
 
 
-annotations_router = APIRouter(prefix="/api/v1", tags=["annotations"])
+annotations_router = ApiRouter("annotations")
 
 AnnotationId = Annotated[str, Path(description="The `id` of an annotation.")]
 NoteText = Annotated[
@@ -332,9 +259,6 @@ NoteText = Annotated[
 class AnnotationIn(Wire):
     """A new annotation."""
 
-    component: ClassVar[str] = "AnnotationIn"
-    model_config = ConfigDict(title=component)
-
     text: NoteText
     start: Annotated[Time, Field(description="Telemetry time that the note is about.")]
     end: Annotated[Time | None, Field(description="End of a period; null: a moment.")] = None
@@ -348,58 +272,51 @@ class AnnotationIn(Wire):
         return self
 
 
-@annotations_router.get(
-    "/annotations",
-    **route_docs({200: ResponseDoc("A page of annotations.", AnnotationPage, LINK)}),
+@annotations_router.serves(
+    "GET /annotations", Returns("A page of annotations.", models.AnnotationPage, LINK)
 )
 def list_annotations(
-    request: Request, query: Annotated[AnnotationQuery, InQuery()], app: AppDep
+    request: Request, query: FromQuery[params.AnnotationQuery], app: AppDep
 ) -> Response:
     """Notes that touch a period, the latest written first."""
     return page_response(request, app.annotations.page(**query.asked()))
 
 
-@annotations_router.post(
-    "/annotations",
-    **route_docs(
-        {201: ResponseDoc("The annotation.", Annotation)}, body=AnnotationIn, problems=(503,)
-    ),
+@annotations_router.serves(
+    "POST /annotations",
+    Returns("The annotation.", models.Annotation, status=201),
+    body=AnnotationIn,
 )
-def add_annotation(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
+def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Write a note on a time or a period; the name of its author is stored with it."""
     asked = read_model(AnnotationIn, body)
-    _require(caller, asked.spacecraft)
+    _require(change.caller, asked.spacecraft)
     written = app.annotations.add(
         asked.text,
         start=asked.start,
         end=asked.end,
         spacecraft=asked.spacecraft,
-        who=author(caller, asked.who),
-        entry=audited.entry(201),
+        who=change.author(asked.who),
+        entry=change.entry(201),
     )
     return json_response(written, 201)
 
 
-@annotations_router.delete(
-    "/annotations/{id}",
-    **route_docs(
-        {200: ResponseDoc("The annotation that was deleted.", Annotation)}, problems=(404, 503)
-    ),
+@annotations_router.serves(
+    "DELETE /annotations/{id}",
+    Returns("The annotation that was deleted.", models.Annotation),
+    problems=(503,),
 )
 def delete_annotation(
-    id: AnnotationId,
-    query: Annotated[AuthorQuery, InQuery()],
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    id: AnnotationId, query: FromQuery[params.AuthorQuery], app: AppDep, change: ChangeDep
 ) -> Response:
     """Delete a note; the audit list keeps its text, and who deleted it."""
-    author(caller, query.who)
+    change.author(query.who)
     found = app.annotations.get(id)
-    if found.spacecraft is not None and not caller.may_see(found.spacecraft):
+    if found.spacecraft is not None and not change.caller.may_see(found.spacecraft):
         raise NotFound(f"there is no annotation with the id {shown_value(id)}")
-    _require(caller, found.spacecraft)
-    return json_response(app.annotations.delete(id, audited.entry()))
+    _require(change.caller, found.spacecraft)
+    return json_response(app.annotations.delete(id, change.entry()))
 
 
 def _require(caller: Caller, spacecraft: str | None) -> None:

@@ -1,29 +1,24 @@
-"""Batches: submit, list, look at one, try it with other options, compare sets of options."""
+"""Batches and gyro blocks: submit, list, look at one, try a batch with other options, compare."""
 
 from typing import Annotated
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
+from fastapi import Path
 from msgspec import Raw
 from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.errors import BadBatch, BadInput, Fault
+from service.gyro import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.models.compare import Comparison
+from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import Answered
-from service.web.openapi.route import (
-    IDEMPOTENCY_KEY,
-    LINK,
-    LOCATION,
-    REPLAYED,
-    ResponseDoc,
-    route_docs,
-)
-from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
+from service.web.requests import query_parameters as params
+from service.web.requests.access import CallerDep, ChangeDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
     MetricsDep,
@@ -31,17 +26,12 @@ from service.web.requests.dependencies import (
     page_response,
 )
 from service.web.requests.problems import problem_within
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    BatchQuery,
-    Comment,
-    Time,
-    Who,
-)
+from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who
 from service.web.requests.request_body import (
     BINARY,
     JSON,
     NO_IDEMPOTENCY_KEY,
+    NO_KEY_OF_A_BLOCK,
     NO_KEY_OF_MANY,
     JsonBody,
     idempotency_key,
@@ -51,7 +41,7 @@ from service.web.requests.request_body import (
     require_no_query,
 )
 
-router = APIRouter(prefix="/api/v1/batches", tags=["batches"])
+router = ApiRouter("batches")
 
 PNG = "image/png"
 
@@ -72,7 +62,7 @@ class WhatIfIn(Wire):
         Field(description="Record the result, and make it the current one of its batch."),
     ] = False
     who: Who = None
-    comment: Comment = None
+    comment: params.Comment = None
 
 
 def answer_response(answered: Answered, recorded: bool = True) -> Response:
@@ -84,17 +74,13 @@ def answer_response(answered: Answered, recorded: bool = True) -> Response:
     return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
 
 
-@router.post(
-    "",
-    **route_docs(
-        {
-            201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
-            200: ResponseDoc("The answer that was recorded before.", Answer, REPLAYED),
-        },
-        body=BatchIn,
-        problems=(409, 503),
-        parameters=(IDEMPOTENCY_KEY,),
-    ),
+@router.serves(
+    "POST /batches",
+    Returns("The answer, now recorded.", Answer, LOCATION, status=201),
+    Returns("The answer that was recorded before.", Answer, REPLAYED),
+    body=BatchIn,
+    problems=(409,),
+    parameters=(IDEMPOTENCY_KEY,),
 )
 async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
@@ -111,13 +97,11 @@ async def submit_batch(request: Request) -> Response:
     return answer_response(answered)
 
 
-@router.post(
-    "/many",
-    dependencies=[NO_QUERY, NO_KEY_OF_MANY],
-    **route_docs(
-        {200: ResponseDoc("An outcome for each batch, in the order sent.", BatchOutcomes)},
-        array_of=(BatchIn, MAX_ARRAY),
-    ),
+@router.serves(
+    "POST /batches/many",
+    Returns("An outcome for each batch, in the order sent.", BatchOutcomes),
+    array_of=(BatchIn, MAX_ARRAY),
+    dependencies=[NO_KEY_OF_MANY],
 )
 async def submit_batches(
     request: Request, body: JsonBody, app: AppDep, caller: CallerDep, metrics: MetricsDep
@@ -148,32 +132,19 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
     return BatchOutcome(status=problem.status, answer=None, problem=problem)
 
 
-@router.get("", **route_docs({200: ResponseDoc("A page of results.", BatchPage, LINK)}))
-def list_batches(
-    request: Request, query: Annotated[BatchQuery, InQuery()], app: AppDep
-) -> Response:
+@router.serves("GET /batches", Returns("A page of results.", BatchPage, LINK))
+def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: AppDep) -> Response:
     """The current results of recorded batches, newest first by batch time."""
     return page_response(request, app.results.page(**query.asked()))
 
 
-@router.get(
-    "/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The result and its batch.", Result)}, problems=(404,)),
-)
+@router.serves("GET /batches/{id}", Returns("The result and its batch.", Result))
 def get_batch(id: ResultId, app: AppDep) -> Response:
     """One recorded result with its batch."""
     return json_response(app.results.get(id))
 
 
-@router.get(
-    "/{id}/overlay",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The image.", media_type=PNG, also=BINARY)},
-        problems=(404,),
-    ),
-)
+@router.serves("GET /batches/{id}/overlay", Returns("The image.", media_type=PNG, also=BINARY))
 def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     """An image of a frame's result: the stars, their names, and residual arrows.
 
@@ -184,40 +155,28 @@ def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     return Response(app.frames.overlay(id), media_type=media_type, headers={"Vary": "Accept"})
 
 
-@router.post(
-    "/{id}/what-if",
-    dependencies=[NO_QUERY, NO_IDEMPOTENCY_KEY],
-    **route_docs(
-        {
-            200: ResponseDoc("The answer, which was not recorded.", Answer),
-            201: ResponseDoc(
-                "The answer, now recorded in addition to the first one.", Answer, LOCATION
-            ),
-        },
-        body=WhatIfIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /batches/{id}/what-if",
+    Returns("The answer, which was not recorded.", Answer),
+    Returns("The answer, now recorded in addition to the first one.", Answer, LOCATION, status=201),
+    body=WhatIfIn,
+    dependencies=[NO_IDEMPOTENCY_KEY],
 )
 def what_if(
-    request: Request,
-    id: ResultId,
-    body: JsonBody,
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    request: Request, id: ResultId, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Process a recorded batch again with other options; recording the result needs `operate`."""
     asked = read_model(WhatIfIn, body)
     record, entry = asked.record or asked.adopt, None
     if record:
-        require_scope(caller, "operate")
+        require_scope(change.caller, "operate")
         request.state.changes = "what_if"
-        entry = audited.entry(201)
+        entry = change.entry(201)
     answered = app.results.what_if(id, asked.options, record=record, adopt=asked.adopt, entry=entry)
     return answer_response(answered, recorded=record)
 
 
-compare_router = APIRouter(prefix="/api/v1", tags=["batches"])
+compare_router = ApiRouter("batches")
 
 COMPARISON_S = 10.0
 """The duration of one comparison; the rest is left out, and the answer says so."""
@@ -230,8 +189,8 @@ class CompareIn(Wire):
 
     spacecraft: Key
     run: RunName = "live"
-    start: Annotated[Time | None, Field(description="Start of the period, included.")] = None
-    end: Annotated[Time | None, Field(description="End of the period, excluded.")] = None
+    start: params.Start = None
+    end: params.End = None
     sample: Annotated[
         int,
         Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
@@ -240,14 +199,11 @@ class CompareIn(Wire):
     b: SideOptions = OptionsIn()
 
 
-@compare_router.post(
-    "/compare",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The results of both sides.", Comparison)},
-        body=CompareIn,
-        problems=(404, 503),
-    ),
+@compare_router.serves(
+    "POST /compare",
+    Returns("The results of both sides.", Comparison),
+    body=CompareIn,
+    problems=(404,),
 )
 def compare(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Process recorded batches again with two sets of options; nothing is recorded."""
@@ -266,3 +222,54 @@ def compare(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
         limit_s=COMPARISON_S,
     )
     return json_response(found)
+
+
+gyro_router = ApiRouter("gyro")
+
+BlockId = Annotated[str, Path(description="The `id` of a recorded gyro block.")]
+
+
+@gyro_router.serves(
+    "POST /spacecraft/{name}/gyro",
+    Returns("The block, now recorded.", GyroBlockRow, LOCATION, status=201),
+    Returns("The block that was recorded before.", GyroBlockRow, REPLAYED),
+    body=GyroBlockIn,
+    problems=(409,),
+    dependencies=[NO_KEY_OF_A_BLOCK],
+)
+def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: MetricsDep) -> Response:
+    """Record a block of gyro samples.
+
+    The same block again is answered with 200 and `Replayed`. 409 if another body has its name, or
+    if another block of the run holds one of its times.
+    """
+    try:
+        recorded = app.gyro.submit(name, body)
+    except BadInput as error:
+        raise refused(body, error) from None
+    if recorded.replayed:
+        metrics.count_repeat()
+        return json_response(recorded.row, 200, {"Replayed": "true"})
+    location = f"/api/v1/spacecraft/{name}/gyro/{recorded.row.id}"
+    return json_response(recorded.row, 201, {"Location": location})
+
+
+@gyro_router.serves(
+    "GET /spacecraft/{name}/gyro", Returns("A page of blocks.", GyroBlockPage, LINK)
+)
+def list_gyro(
+    request: Request, name: SpacecraftPath, query: FromQuery[PeriodPageQuery], app: AppDep
+) -> Response:
+    """The gyro blocks that touch a period, without their samples, the earliest first.
+
+    The samples of a period are the table `gyro`.
+    """
+    return page_response(request, app.gyro.page(name, **query.asked()))
+
+
+@gyro_router.serves(
+    "GET /spacecraft/{name}/gyro/{id}", Returns("The block and its samples.", GyroSamples)
+)
+def get_gyro(name: SpacecraftPath, id: BlockId, app: AppDep) -> Response:
+    """One gyro block with its samples."""
+    return json_response(app.gyro.get(name, id))

@@ -1,10 +1,9 @@
 """Trackers calibrated from recorded batches: estimated, tried, adopted and taken back."""
 
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
-from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from fastapi import Path
+from pydantic import AfterValidator, Field, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -14,55 +13,35 @@ from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
-from service.storage.calibrations import (
-    Calibration,
-    CalibrationAdoption,
-    CalibrationInForce,
-    CalibrationPage,
-)
+from service.storage import calibrations as models
 from service.storage.models.compare import Comparison
 from service.web.api.batches import COMPARISON_S
-from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
-from service.web.requests.access import AuditDep, CallerDep, author
+from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests import query_parameters as params
+from service.web.requests.access import CallerDep, ChangeDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    Cursor,
-    PageLimit,
-    Query,
-    SpacecraftFilter,
-    SpacecraftPath,
-    Time,
-    Who,
-    without_nul,
-)
+from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
-router = APIRouter(prefix="/api/v1", tags=["calibrations"])
+router = ApiRouter("calibrations")
 
 CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
-Start = Annotated[Time | None, Field(description="Start of the period, included.")]
-End = Annotated[Time | None, Field(description="End of the period, excluded.")]
 
 
 class _Period(Wire):
     """The batches that are used."""
 
-    start: Start = None
-    end: End = None
+    start: params.Start = None
+    end: params.End = None
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        if self.start and self.end and self.start.tai_ns > self.end.tai_ns:
-            raise ValueError(f"start {self.start} must not be after end {self.end}")
+        params.require_order(self.start, self.end)
         return self
 
 
 class CalibrationIn(_Period):
     """What is calibrated, and with which batches."""
-
-    component: ClassVar[str] = "CalibrationIn"
-    model_config = ConfigDict(title=component)
 
     spacecraft: Key
     run: RunName = "live"
@@ -104,9 +83,6 @@ _ASKED = tuple(name for name in CalibrationIn.model_fields if name != "who")
 class CalibrationTrialIn(_Period):
     """The batches that a calibration is tried over; without a run those of the calibration's."""
 
-    component: ClassVar[str] = "CalibrationTrialIn"
-    model_config = ConfigDict(title=component)
-
     run: RunName | None = None
     sample: Annotated[
         int,
@@ -121,22 +97,16 @@ class _Signed(Wire):
     note: Annotated[
         str,
         Field(max_length=2_000, description="The reason, in plain text."),
-        AfterValidator(without_nul),
+        AfterValidator(params.without_nul),
     ] = ""
 
 
 class CalibrationAdoptIn(_Signed):
     """The author of an adoption, and the reason."""
 
-    component: ClassVar[str] = "CalibrationAdoptIn"
-    model_config = ConfigDict(title=component)
-
 
 class CalibrationRevertIn(_Signed):
     """What the spacecraft goes back to."""
-
-    component: ClassVar[str] = "CalibrationRevertIn"
-    model_config = ConfigDict(title=component)
 
     to: Annotated[
         Key | None, Field(description="The `id` of an earlier adoption; null: the mission file.")
@@ -146,60 +116,46 @@ class CalibrationRevertIn(_Signed):
 class CalibrationQuery(Query):
     """Which calibrations."""
 
-    spacecraft: SpacecraftFilter = None
-    limit: PageLimit = 100
-    cursor: Cursor = None
+    spacecraft: params.SpacecraftFilter = None
+    limit: params.PageLimit = 100
+    cursor: params.Cursor = None
 
 
-@router.get(
-    "/calibrations",
-    **route_docs({200: ResponseDoc("A page of calibrations.", CalibrationPage, LINK)}),
+@router.serves(
+    "GET /calibrations", Returns("A page of calibrations.", models.CalibrationPage, LINK)
 )
 def list_calibrations(
-    request: Request, query: Annotated[CalibrationQuery, InQuery()], app: AppDep
+    request: Request, query: FromQuery[CalibrationQuery], app: AppDep
 ) -> Response:
     """Calibrations without covariances and residual maps, newest first."""
     return page_response(request, app.calibrations.page(**query.asked()))
 
 
-@router.post(
-    "/calibrations",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {202: ResponseDoc("The calibration, which is computed now.", Calibration, LOCATION)},
-        body=CalibrationIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /calibrations",
+    Returns("The calibration, which is computed now.", models.Calibration, LOCATION, status=202),
+    body=CalibrationIn,
+    problems=(404,),
 )
-def start_calibration(
-    body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Estimate alignment, scale and distortion of trackers; no setting is changed."""
     asked = read_model(CalibrationIn, body)
-    caller.require(asked.spacecraft)
-    who = author(caller, asked.who)
-    begun = app.calibrations.start(asked.request(), who, audited.entry(202))
+    change.caller.require(asked.spacecraft)
+    begun = app.calibrations.start(asked.request(), change.author(asked.who), change.entry(202))
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
-@router.get(
-    "/calibrations/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The calibration.", Calibration)}, problems=(404,)),
-)
+@router.serves("GET /calibrations/{id}", Returns("The calibration.", models.Calibration))
 def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Response:
     """One calibration with covariance and residual maps."""
     return json_response(_visible(app, id, caller))
 
 
-@router.post(
-    "/calibrations/{id}/trial",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("In force (a), and with the calibration (b).", Comparison)},
-        body=CalibrationTrialIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /calibrations/{id}/trial",
+    Returns("In force (a), and with the calibration (b).", Comparison),
+    body=CalibrationTrialIn,
+    problems=(409,),
 )
 def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Process recorded batches again with and without a calibration; nothing is recorded."""
@@ -208,56 +164,47 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     return json_response(app.calibrations.trial(id, **vars(asked), limit_s=COMPARISON_S))
 
 
-@router.post(
-    "/calibrations/{id}/adopt",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The adoption.", CalibrationAdoption)},
-        body=CalibrationAdoptIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /calibrations/{id}/adopt",
+    Returns("The adoption.", models.CalibrationAdoption),
+    body=CalibrationAdoptIn,
+    problems=(409,),
 )
 def adopt_calibration(
-    id: CalibrationId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+    id: CalibrationId, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Let new batches of the spacecraft be processed with a calibration."""
     asked = read_model(CalibrationAdoptIn, body)
-    _visible(app, id, caller)
-    who = author(caller, asked.who)
-    return json_response(app.adoptions.adopt(id, who, asked.note, audited.entry()))
+    _visible(app, id, change.caller)
+    who = change.author(asked.who)
+    return json_response(app.adoptions.adopt(id, who, asked.note, change.entry()))
 
 
-@router.get(
-    "/spacecraft/{name}/calibration",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The calibration in force.", CalibrationInForce)}, problems=(404,)
-    ),
+@router.serves(
+    "GET /spacecraft/{name}/calibration",
+    Returns("The calibration in force.", models.CalibrationInForce),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
     """The calibration that new batches use, and what held when."""
     return json_response(app.adoptions.in_force(name))
 
 
-@router.post(
-    "/spacecraft/{name}/calibration/revert",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The change.", CalibrationAdoption)},
-        body=CalibrationRevertIn,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /spacecraft/{name}/calibration/revert",
+    Returns("The change.", models.CalibrationAdoption),
+    body=CalibrationRevertIn,
+    problems=(409,),
 )
 def revert_calibration(
-    name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
+    name: SpacecraftPath, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Go back to an earlier adoption, or to the mission file."""
     asked = read_model(CalibrationRevertIn, body)
-    who = author(caller, asked.who)
-    return json_response(app.adoptions.revert(name, asked.to, who, asked.note, audited.entry()))
+    who = change.author(asked.who)
+    return json_response(app.adoptions.revert(name, asked.to, who, asked.note, change.entry()))
 
 
-def _visible(app: AppDep, id: str, caller: Caller) -> Calibration:
+def _visible(app: AppDep, id: str, caller: Caller) -> models.Calibration:
     """A calibration of the caller's spacecraft; raises `NotFound` for those of others."""
     found = app.calibrations.get(id)
     if not caller.may_see(found.spacecraft):

@@ -5,8 +5,7 @@ from functools import partial
 from typing import Annotated
 
 import anyio
-from fastapi import APIRouter, Depends
-from fastapi import Query as InQuery
+from fastapi import Depends
 from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,13 +14,12 @@ from starlette.types import Receive, Scope, Send
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import RunName
 from service.web.event_stream import Listener, Live
-from service.web.openapi.route import LAST_EVENT_ID, ResponseDoc, route_docs
+from service.web.openapi import EVENT_STREAM, LAST_EVENT_ID, ApiRouter, Returns
 from service.web.requests.access import CallerDep, credentials
-from service.web.requests.query_parameters import Query, SpacecraftFilter
+from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter
 
-router = APIRouter(prefix="/api/v1", tags=["events"])
+router = ApiRouter("events")
 
-EVENT_STREAM = "text/event-stream"
 SEND_S = 30.0
 """A client that reads nothing for this long is disconnected; it reconnects and continues."""
 HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
@@ -85,17 +83,15 @@ async def _live(request: Request) -> Live:
     return live
 
 
-@router.get(
-    "/events",
-    **route_docs(
-        {200: ResponseDoc("The stream of events.", None, media_type=EVENT_STREAM)},
-        problems=(503,),
-        parameters=(LAST_EVENT_ID,),
-    ),
+@router.serves(
+    "GET /events",
+    Returns("The stream of events.", None, media_type=EVENT_STREAM),
+    problems=(503,),
+    parameters=(LAST_EVENT_ID,),
 )
 async def events(
     request: Request,
-    query: Annotated[EventQuery, InQuery()],
+    query: FromQuery[EventQuery],
     live: Annotated[Live, Depends(_live)],
     caller: CallerDep,
 ) -> Response:

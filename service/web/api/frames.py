@@ -5,8 +5,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import IO, Annotated, Any
 
-from fastapi import APIRouter, Depends
-from fastapi import Query as InQuery
+from fastapi import Depends
 from pydantic import Field
 from pydantic_core import from_json
 from starlette.requests import Request
@@ -18,13 +17,13 @@ from service.missions.mission import mission_named
 from service.storage.models.answers import Answer
 from service.storage.models.pictures import Picture
 from service.web.api.batches import answer_response
-from service.web.openapi.route import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ResponseDoc, route_docs
+from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, MetricsDep, json_response
-from service.web.requests.query_parameters import TIME_SCHEMA, Query, SpacecraftPath
+from service.web.requests.query_parameters import TIME_SCHEMA, FromQuery, Query, SpacecraftPath
 from service.web.requests.request_body import IdempotencyKey, frame_body
 
-router = APIRouter(prefix="/api/v1", tags=["frames"])
+router = ApiRouter("frames")
 
 _A_PRIORI = '{"quaternion": [0.1, 0.2, 0.3, 0.9273618495495703]}'
 
@@ -110,26 +109,20 @@ class FrameUpload:
             yield self.file
 
 
-async def _frame(
-    request: Request, query: Annotated[FrameQuery, InQuery()], app: AppDep
-) -> FrameUpload:
+async def _frame(request: Request, query: FromQuery[FrameQuery], app: AppDep) -> FrameUpload:
     # Name and query are checked before the frame is read.
     mission_named(app.missions, request.path_params["name"])
     known = query.known()
     return FrameUpload(known, await frame_body(request, app.settings.frame_mb << 20))
 
 
-@router.post(
-    "/spacecraft/{name}/frames",
-    **route_docs(
-        {
-            201: ResponseDoc("The answer, now recorded.", Answer, LOCATION),
-            200: ResponseDoc("The answer that was recorded before.", Answer, REPLAYED),
-        },
-        frame=True,
-        problems=(404, 409, 503),
-        parameters=(IDEMPOTENCY_KEY,),
-    ),
+@router.serves(
+    "POST /spacecraft/{name}/frames",
+    Returns("The answer, now recorded.", Answer, LOCATION, status=201),
+    Returns("The answer that was recorded before.", Answer, REPLAYED),
+    frame=True,
+    problems=(409, 503),
+    parameters=(IDEMPOTENCY_KEY,),
 )
 def submit_frame(
     name: SpacecraftPath,
@@ -166,22 +159,18 @@ class PictureQuery(Query):
     ] = False
 
 
-async def _picture(
-    request: Request, query: Annotated[PictureQuery, InQuery()], app: AppDep
-) -> IO[bytes]:
+async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep) -> IO[bytes]:
     return await frame_body(request, app.settings.frame_mb << 20)
 
 
-@router.post(
-    "/pictures",
-    **route_docs(
-        {200: ResponseDoc("What was found; nothing is recorded.", Picture)},
-        frame=True,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /pictures",
+    Returns("What was found; nothing is recorded.", Picture),
+    frame=True,
+    problems=(404, 503),
 )
 def solve_picture(
-    query: Annotated[PictureQuery, InQuery()],
+    query: FromQuery[PictureQuery],
     file: Annotated[IO[bytes], Depends(_picture)],
     app: AppDep,
     caller: CallerDep,

@@ -4,7 +4,6 @@ import asyncio
 import logging
 
 import anyio.to_thread
-from fastapi import APIRouter
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.requests import Request
 from starlette.responses import PlainTextResponse, Response
@@ -12,11 +11,10 @@ from starlette.responses import PlainTextResponse, Response
 from service.app.factory import App
 from service.errors import Busy
 from service.storage.projections.projector import WAIT_S, Lag
-from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.openapi import ApiRouter, Returns
 from service.web.requests.dependencies import AppDep, MetricsDep
-from service.web.requests.query_parameters import NO_QUERY
 
-router = APIRouter(tags=["probes"], dependencies=[NO_QUERY])
+router = ApiRouter("probes", prefix="")
 
 TEXT = "text/plain"
 READY_WAIT_S = 1.5
@@ -25,14 +23,14 @@ READY_WAIT_S = 1.5
 log = logging.getLogger(__name__)
 
 
-@router.get("/livez", **route_docs({200: ResponseDoc("Alive.", media_type=TEXT)}))
+@router.serves("GET /livez", Returns("Alive.", media_type=TEXT))
 async def livez(app: AppDep) -> Response:
     """Whether the process answers, and works on what is submitted."""
     app.submissions.require_alive()
     return PlainTextResponse("alive\n")
 
 
-@router.get("/readyz", **route_docs({200: ResponseDoc("Ready.", media_type=TEXT)}, problems=(503,)))
+@router.serves("GET /readyz", Returns("Ready.", media_type=TEXT), problems=(503,))
 async def readyz(request: Request, app: AppDep) -> Response:
     """Whether the service is ready: catalog loaded, database reachable, last write succeeded."""
     state = request.app.state
@@ -63,7 +61,7 @@ def _ready(app: App) -> Lag:
     return app.projector.lag()
 
 
-@router.get("/metrics", **route_docs({200: ResponseDoc("The counters.", media_type=TEXT)}))
+@router.serves("GET /metrics", Returns("The counters.", media_type=TEXT))
 def metrics(counted: MetricsDep) -> Response:
     """Counters in the text format of Prometheus."""
     return Response(counted.text(), media_type=CONTENT_TYPE_LATEST)

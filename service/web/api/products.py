@@ -1,12 +1,11 @@
 """Products: attitudes, tables and tracks as files, and attitude over time."""
 
 from dataclasses import asdict
-from typing import Annotated, ClassVar, Self
+from typing import Annotated, Self
 from urllib.parse import quote
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
-from pydantic import ConfigDict, model_validator
+from fastapi import Path
+from pydantic import model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -18,48 +17,34 @@ from service.products.formats import (
     write_attitudes,
     write_table,
 )
-from service.storage.grades.days import DefinitiveJob, DefinitiveJobList, InnovationPage
-from service.storage.grades.rows import LiveAttitude
-from service.storage.models.products import AttitudeAtMoment, AttitudeProduct
+from service.storage.models.products import (
+    AttitudeAtMoment,
+    AttitudeProduct,
+    DefinitiveJob,
+    DefinitiveJobList,
+    InnovationPage,
+    LiveAttitude,
+)
 from service.storage.tracks import TrackList
-from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
+from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import CallerDep, author
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.exports import ExportsDep, attached_as
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    TDM_MEDIA_TYPE,
-    AttitudeAtQuery,
-    AttitudeQuery,
-    End,
-    PeriodPageQuery,
-    SpacecraftPath,
-    Start,
-    TableKindPath,
-    TableQuery,
-    TracksQuery,
-    Who,
-    require_order,
-)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
-router = APIRouter(prefix="/api/v1/spacecraft", tags=["products"])
+router = ApiRouter("products")
 
 
-@router.get(
-    "/{name}/attitude",
-    **route_docs(
-        {
-            200: ResponseDoc(
-                "The attitudes, in the requested format.", AttitudeProduct, attitudes=True
-            )
-        },
-        problems=(404, 503),
-    ),
+@router.serves(
+    "GET /spacecraft/{name}/attitude",
+    Returns("The attitudes, in the requested format.", AttitudeProduct, attitudes=True),
+    problems=(503,),
 )
 def get_attitude(
     name: SpacecraftPath,
-    query: Annotated[AttitudeQuery, InQuery()],
+    query: FromQuery[params.AttitudeQuery],
     app: AppDep,
     exports: ExportsDep,
     caller: CallerDep,
@@ -78,12 +63,9 @@ def get_attitude(
     )
 
 
-@router.get(
-    "/{name}/attitude/at",
-    **route_docs({200: ResponseDoc("The attitude.", AttitudeAtMoment)}, problems=(404,)),
-)
+@router.serves("GET /spacecraft/{name}/attitude/at", Returns("The attitude.", AttitudeAtMoment))
 def get_attitude_at(
-    name: SpacecraftPath, query: Annotated[AttitudeAtQuery, InQuery()], app: AppDep
+    name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
 ) -> Response:
     """The attitude at a moment with its error: interpolated within a stretch, or the nearest.
 
@@ -95,23 +77,19 @@ def get_attitude_at(
     return json_response(AttitudeAtMoment(**asdict(found)))
 
 
-@router.get(
-    "/{name}/tables/{kind}",
-    **route_docs(
-        {
-            200: ResponseDoc(
-                "The table, in the requested format.",
-                media_type=OUTPUT_FORMATS["csv"].media_type,
-                tables=True,
-            )
-        },
-        problems=(404, 503),
+@router.serves(
+    "GET /spacecraft/{name}/tables/{kind}",
+    Returns(
+        "The table, in the requested format.",
+        media_type=OUTPUT_FORMATS["csv"].media_type,
+        tables=True,
     ),
+    problems=(503,),
 )
 def get_table(
     name: SpacecraftPath,
-    kind: TableKindPath,
-    query: Annotated[TableQuery, InQuery()],
+    kind: params.TableKindPath,
+    query: FromQuery[params.TableQuery],
     app: AppDep,
     exports: ExportsDep,
     caller: CallerDep,
@@ -130,10 +108,7 @@ def get_table(
     )
 
 
-@router.get(
-    "/{name}/attitude/latest",
-    **route_docs({200: ResponseDoc("The attitude.", LiveAttitude)}, problems=(404,)),
-)
+@router.serves("GET /spacecraft/{name}/attitude/latest", Returns("The attitude.", LiveAttitude))
 def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     """The filtered attitude at the last epoch of live data, where the mission keeps it up.
 
@@ -142,17 +117,11 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     return json_response(app.live_filter.latest(name))
 
 
-@router.get(
-    "/{name}/innovations",
-    **route_docs(
-        {200: ResponseDoc("A page of innovations.", InnovationPage, LINK)}, problems=(404,)
-    ),
+@router.serves(
+    "GET /spacecraft/{name}/innovations", Returns("A page of innovations.", InnovationPage, LINK)
 )
 def list_innovations(
-    request: Request,
-    name: SpacecraftPath,
-    query: Annotated[PeriodPageQuery, InQuery()],
-    app: AppDep,
+    request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
 ) -> Response:
     """How each measured attitude met the filter, and how far it is from the smoothed one.
 
@@ -164,28 +133,21 @@ def list_innovations(
 class DefinitiveIn(Wire):
     """Which days get a definitive attitude."""
 
-    component: ClassVar[str] = "DefinitiveIn"
-    model_config = ConfigDict(title=component)
-
     run: RunName = "live"
-    start: Start = None
-    end: End = None
+    start: params.Start = None
+    end: params.End = None
     who: Who = None
 
     @model_validator(mode="after")
     def _in_order(self) -> Self:
-        require_order(self.start, self.end)
+        params.require_order(self.start, self.end)
         return self
 
 
-@router.post(
-    "/{name}/definitive-attitude",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {202: ResponseDoc("The job, which is queued.", DefinitiveJob, LOCATION)},
-        body=DefinitiveIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /spacecraft/{name}/definitive-attitude",
+    Returns("The job, which is queued.", DefinitiveJob, LOCATION, status=202),
+    body=DefinitiveIn,
 )
 def make_definitive_attitude(
     name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep
@@ -202,20 +164,16 @@ def make_definitive_attitude(
     return json_response(job, 202, headers={"Location": location})
 
 
-@router.get(
-    "/{name}/definitive-attitude",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The jobs.", DefinitiveJobList)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/definitive-attitude", Returns("The jobs.", DefinitiveJobList)
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     """The jobs of a spacecraft since the start of the service, the newest first."""
-    return json_response(app.definitive.all(name))
+    return json_response(DefinitiveJobList(items=app.definitive.all(name)))
 
 
-@router.get(
-    "/{name}/definitive-attitude/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The job.", DefinitiveJob)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/definitive-attitude/{id}", Returns("The job.", DefinitiveJob)
 )
 def get_definitive_attitude(
     name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep
@@ -224,19 +182,16 @@ def get_definitive_attitude(
     return json_response(app.definitive.get(name, id))
 
 
-tracks_router = APIRouter(prefix="/api/v1/spacecraft", tags=["products"])
+tracks_router = ApiRouter("products")
 
 
-@tracks_router.get(
-    "/{name}/tracks",
-    **route_docs(
-        {200: ResponseDoc("The tracks.", TrackList, also=TDM_MEDIA_TYPE)}, problems=(404, 503)
-    ),
+@tracks_router.serves(
+    "GET /spacecraft/{name}/tracks",
+    Returns("The tracks.", TrackList, also=params.TDM_MEDIA_TYPE),
+    problems=(503,),
 )
 def list_tracks(
-    name: SpacecraftPath,
-    query: Annotated[TracksQuery, InQuery()],
-    app: AppDep,
+    name: SpacecraftPath, query: FromQuery[params.TracksQuery], app: AppDep
 ) -> Response:
     """Tracks of a period: points that no catalog star explains and that move together.
 
@@ -248,4 +203,4 @@ def list_tracks(
     if query.format == "json":
         return json_response(found)
     attached = {"Content-Disposition": f'attachment; filename="{name}-{query.run}-tracks.tdm"'}
-    return Response(b"".join(app.tracks.tdm(found)), 200, attached, TDM_MEDIA_TYPE)
+    return Response(b"".join(app.tracks.tdm(found)), 200, attached, params.TDM_MEDIA_TYPE)

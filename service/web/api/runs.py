@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Annotated
 
-from fastapi import APIRouter, Depends, Path
-from fastapi import Query as InQuery
+from fastapi import Depends, Path
 from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
@@ -15,10 +14,10 @@ from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
-from service.web.openapi.route import LOCATION, ResponseDoc, route_docs
-from service.web.requests.access import AuditDep, CallerDep, require_all_spacecraft
+from service.web.openapi import LOCATION, ApiRouter, Returns
+from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.query_parameters import NO_QUERY, Query
+from service.web.requests.query_parameters import FromQuery, Query
 from service.web.requests.request_body import (
     MAX_JSON_BYTES,
     JsonBody,
@@ -27,7 +26,7 @@ from service.web.requests.request_body import (
     telemetry_body,
 )
 
-router = APIRouter(prefix="/api/v1", tags=["runs and replays"])
+router = ApiRouter("runs and replays")
 
 RunPath = Annotated[str, Path(description="The run's name.")]
 ReplayId = Annotated[str, Path(description="The `id` of a replay.")]
@@ -55,8 +54,7 @@ class ForgetIn(Wire):
     ] = ()
     gyro_blocks: Annotated[tuple[Key, ...], Field(max_length=MOST_NAMES)] = ()
     confirm: Annotated[
-        StrictBool,
-        Field(description="false: answer what would be removed, and remove nothing."),
+        StrictBool, Field(description="false: answer what would be removed, and remove nothing.")
     ] = False
 
 
@@ -76,7 +74,7 @@ class _ReplayQuery(Query):
     ] = None
 
 
-ReplayQuery = Annotated[_ReplayQuery, InQuery()]
+ReplayQuery = FromQuery[_ReplayQuery]
 
 
 @dataclass(frozen=True)
@@ -99,37 +97,23 @@ async def _telemetry(
     return ReplayUpload(query, body)
 
 
-@router.get(
-    "/runs", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("Every run.", RunList)})
-)
+@router.serves("GET /runs", Returns("Every run.", RunList))
 def list_runs(app: AppDep, caller: CallerDep) -> Response:
     """Every run with batches; of a token that is bound to spacecraft, with theirs."""
     return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
-@router.put(
-    "/runs/{run}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The run.", RunState)}, body=RunIn),
-)
-def watch_run(run: RunPath, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+@router.serves("PUT /runs/{run}", Returns("The run.", RunState), body=RunIn, may_create=True)
+def watch_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Switch the alarms of a run on or off; creates the run if it does not exist."""
     asked = read_model(RunIn, body)
-    return json_response(app.runs.watch(run, asked.alarms, audited.entry()))
+    return json_response(app.runs.watch(run, asked.alarms, change.entry()))
 
 
-@router.post(
-    "/runs/{run}/forget",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("What is removed, or would be.", Forgotten)},
-        body=ForgetIn,
-        problems=(404,),
-    ),
+@router.serves(
+    "POST /runs/{run}/forget", Returns("What is removed, or would be.", Forgotten), body=ForgetIn
 )
-def forget_run(
-    run: RunPath, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+def forget_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Remove what was recorded wrongly, with its trends and archived batches; it cannot be undone.
 
     The same batches can be recorded again afterwards. Alarms, events, notes and the audit list
@@ -137,20 +121,16 @@ def forget_run(
     """
     asked = read_model(ForgetIn, body)
     if asked.spacecraft is None:
-        require_all_spacecraft(caller)
+        require_all_spacecraft(change.caller)
     else:
-        caller.require(asked.spacecraft)
+        change.caller.require(asked.spacecraft)
     selected = ForgetFilter(run, asked.spacecraft, asked.batches, asked.gyro_blocks)
     if not asked.confirm:
         return json_response(app.runs.would_forget(selected))
-    return json_response(app.runs.forget(selected, audited.entry()))
+    return json_response(app.runs.forget(selected, change.entry()))
 
 
-@router.get(
-    "/replays",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The latest hundred replays.", ReplayList)}),
-)
+@router.serves("GET /replays", Returns("The latest hundred replays.", ReplayList))
 def list_replays(app: AppDep, caller: CallerDep) -> Response:
     """The latest replays and their progress, newest first.
 
@@ -159,20 +139,15 @@ def list_replays(app: AppDep, caller: CallerDep) -> Response:
     return json_response(ReplayList(items=app.replays.all(caller.spacecraft)))
 
 
-@router.post(
-    "/replays",
-    **route_docs(
-        {202: ResponseDoc("The replay, now running.", Replay, LOCATION)},
-        lines_of=BatchIn,
-        archive="Files of CCSDS space packets, and one XTCE file (.xml or .xtce).",
-        problems=(503,),
-    ),
+@router.serves(
+    "POST /replays",
+    Returns("The replay, now running.", Replay, LOCATION, status=202),
+    lines_of=BatchIn,
+    archive="Files of CCSDS space packets, and one XTCE file (.xml or .xtce).",
+    problems=(503,),
 )
 def start_replay(
-    upload: Annotated[ReplayUpload, Depends(_telemetry)],
-    app: AppDep,
-    caller: CallerDep,
-    audited: AuditDep,
+    upload: Annotated[ReplayUpload, Depends(_telemetry)], app: AppDep, change: ChangeDep
 ) -> Response:
     """Accept a telemetry file and process it in the background.
 
@@ -191,34 +166,25 @@ def start_replay(
         query.run,
         name=query.run,
         total=body.lines,
-        caller=caller,
+        caller=change.caller,
         alarms=query.alarms,
-        entry=audited.entry(202) if query.alarms else None,
+        entry=change.entry(202) if query.alarms else None,
     )
     location = {"Location": f"/api/v1/replays/{id}"}
     return json_response(app.replays.get(id), 202, location)
 
 
-@router.get(
-    "/replays/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The replay.", Replay)}, problems=(404,)),
-)
+@router.serves("GET /replays/{id}", Returns("The replay.", Replay))
 def get_replay(id: ReplayId, app: AppDep) -> Response:
     """A replay and its progress."""
     return json_response(app.replays.get(id))
 
 
-@router.delete(
-    "/replays/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {
-            200: ResponseDoc("The replay, now cancelled.", Replay),
-            202: ResponseDoc("The replay, which will end soon.", Replay),
-        },
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "DELETE /replays/{id}",
+    Returns("The replay, now cancelled.", Replay),
+    Returns("The replay, which will end soon.", Replay, status=202),
+    problems=(409, 503),
 )
 def cancel_replay(id: ReplayId, app: AppDep, caller: CallerDep) -> Response:
     """Cancel a replay; the batches that it recorded stay."""

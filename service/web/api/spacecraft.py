@@ -2,8 +2,6 @@
 
 from typing import Annotated, Any
 
-from fastapi import APIRouter
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
@@ -12,18 +10,12 @@ from service.app.advice import ADVICE_SAMPLE
 from service.app.spacecraft import batch_table, history_table
 from service.observations.schema import tolerances_from_text
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
+from service.storage.models import spacecraft as models
 from service.storage.models.advice import Advice
 from service.storage.models.answers import Result
 from service.storage.models.overview import About, Overview
-from service.storage.models.spacecraft import (
-    AttitudePage,
-    History,
-    Ranking,
-    RateList,
-    SpacecraftList,
-    SpacecraftState,
-)
-from service.web.openapi.route import CONTENT_LOCATION, LINK, ResponseDoc, route_docs
+from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
+from service.web.requests import query_parameters as params
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
 from service.web.requests.exports import (
@@ -33,51 +25,32 @@ from service.web.requests.exports import (
     history_headers,
     thinned_header,
 )
-from service.web.requests.query_parameters import (
-    NO_QUERY,
-    HistoryQuery,
-    PeriodPageQuery,
-    PeriodQuery,
-    RatesQuery,
-    RunQuery,
-    SpacecraftPath,
-    WorstQuery,
-)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath
 
-router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
+router = ApiRouter("spacecraft")
 
 DEFAULT_SIZE = 500
 
 
-@router.get("", **route_docs({200: ResponseDoc("Every spacecraft.", SpacecraftList)}))
-def list_spacecraft(
-    query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep
-) -> Response:
+@router.serves("GET /spacecraft", Returns("Every spacecraft.", models.SpacecraftList))
+def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft with a mission file, with its state in a run."""
     theirs = [each for each in app.spacecraft.states(query.run) if caller.may_see(each.name)]
     return json_response({"items": theirs})
 
 
-@router.get(
-    "/{name}",
-    **route_docs({200: ResponseDoc("The spacecraft.", SpacecraftState)}, problems=(404,)),
-)
+@router.serves("GET /spacecraft/{name}", Returns("The spacecraft.", models.SpacecraftState))
 def get_spacecraft(
-    name: SpacecraftPath, query: Annotated[RunQuery, InQuery()], app: AppDep
+    name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep
 ) -> Response:
     """One spacecraft: state in a run, mission settings and their history."""
     return json_response(app.spacecraft.state(name, query.run))
 
 
-@router.get(
-    "/{name}/latest",
-    **route_docs(
-        {200: ResponseDoc("The result and its batch.", Result, CONTENT_LOCATION)}, problems=(404,)
-    ),
+@router.serves(
+    "GET /spacecraft/{name}/latest", Returns("The result and its batch.", Result, CONTENT_LOCATION)
 )
-def get_latest(
-    name: SpacecraftPath, query: Annotated[RunQuery, InQuery()], app: AppDep
-) -> Response:
+def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep) -> Response:
     """The newest current result of a run, by batch time; it may have no attitude.
 
     A live batch that is dated more than an hour in the future counts only where there is no other.
@@ -88,41 +61,32 @@ def get_latest(
     )
 
 
-@router.get(
-    "/{name}/attitudes",
-    **route_docs({200: ResponseDoc("A page of attitudes.", AttitudePage, LINK)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/attitudes", Returns("A page of attitudes.", models.AttitudePage, LINK)
 )
 def list_attitudes(
-    request: Request,
-    name: SpacecraftPath,
-    query: Annotated[PeriodPageQuery, InQuery()],
-    app: AppDep,
+    request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
 ) -> Response:
     """The attitudes of a run, oldest first by batch time."""
     return page_response(request, app.spacecraft.attitudes(name, **query.asked()))
 
 
-@router.get(
-    "/{name}/rates",
-    **route_docs({200: ResponseDoc("The buckets with batches.", RateList)}, problems=(404,)),
+@router.serves(
+    "GET /spacecraft/{name}/rates", Returns("The buckets with batches.", models.RateList)
 )
-def list_rates(
-    name: SpacecraftPath, query: Annotated[RatesQuery, InQuery()], app: AppDep
-) -> Response:
+def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: AppDep) -> Response:
     """Stars by outcome, in at most 20,000 buckets of batch time."""
-    return json_response(RateList(items=app.spacecraft.rates(name, **query.asked())))
+    return json_response(models.RateList(items=app.spacecraft.rates(name, **query.asked())))
 
 
-@router.get(
-    "/{name}/history",
-    **route_docs(
-        {200: ResponseDoc("The history, in the requested format.", History, THINNED, tables=True)},
-        problems=(404, 503),
-    ),
+@router.serves(
+    "GET /spacecraft/{name}/history",
+    Returns("The history, in the requested format.", models.History, THINNED, tables=True),
+    problems=(503,),
 )
 def get_history(
     name: SpacecraftPath,
-    query: Annotated[HistoryQuery, InQuery()],
+    query: FromQuery[params.HistoryQuery],
     app: AppDep,
     exports: ExportsDep,
     caller: CallerDep,
@@ -156,46 +120,35 @@ def get_history(
     return json_response(history, headers=thinned_header(history.thinned))
 
 
-@router.get(
-    "/{name}/worst",
-    **route_docs({200: ResponseDoc("The worst batches.", Ranking)}, problems=(404,)),
-)
-def list_worst(
-    name: SpacecraftPath, query: Annotated[WorstQuery, InQuery()], app: AppDep
-) -> Response:
+@router.serves("GET /spacecraft/{name}/worst", Returns("The worst batches.", models.Ranking))
+def list_worst(name: SpacecraftPath, query: FromQuery[params.WorstQuery], app: AppDep) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
     return json_response(app.spacecraft.ranking(name, **query.asked()))
 
 
-overview_router = APIRouter(prefix="/api/v1", tags=["spacecraft"])
+overview_router = ApiRouter("spacecraft")
 
 
-@overview_router.get(
-    "/overview", **route_docs({200: ResponseDoc("Every spacecraft in the run.", Overview)})
-)
-def get_overview(query: Annotated[RunQuery, InQuery()], app: AppDep, caller: CallerDep) -> Response:
+@overview_router.serves("GET /overview", Returns("Every spacecraft in the run.", Overview))
+def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft in a run: state, last attitude, the last hour and day, active alarms."""
     return json_response(app.spacecraft.overview(query.run, caller.spacecraft))
 
 
-@overview_router.get(
-    "/about",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The version of the service and its data.", About)}),
-)
+@overview_router.serves("GET /about", Returns("The version of the service and its data.", About))
 def get_about(app: AppDep, caller: CallerDep) -> Response:
     """Version, catalog, missions, database and credits."""
     return json_response(app.service.about(caller.spacecraft))
 
 
-advice_router = APIRouter(prefix="/api/v1/spacecraft", tags=["spacecraft"])
+advice_router = ApiRouter("spacecraft")
 
 MAX_SAMPLE = 2_000
 ADVICE_LIMIT_S = 20.0
 """The longest wait for an answer; a sample that takes longer is cut short, and says so."""
 
 
-class AdviceQuery(PeriodQuery):
+class AdviceQuery(params.PeriodQuery):
     """Which batches to advise from, and how much work to spend on them."""
 
     sample: Annotated[
@@ -216,12 +169,9 @@ class AdviceQuery(PeriodQuery):
         return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
 
 
-@advice_router.get(
-    "/{name}/advice",
-    **route_docs({200: ResponseDoc("The advice.", Advice)}, problems=(404, 503)),
+@advice_router.serves(
+    "GET /spacecraft/{name}/advice", Returns("The advice.", Advice), problems=(503,)
 )
-def get_advice(
-    name: SpacecraftPath, query: Annotated[AdviceQuery, InQuery()], app: AppDep
-) -> Response:
+def get_advice(name: SpacecraftPath, query: FromQuery[AdviceQuery], app: AppDep) -> Response:
     """Recommended mission settings from recorded batches: tolerances, noise, alignment."""
     return json_response(app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S))

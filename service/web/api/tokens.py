@@ -1,10 +1,9 @@
 """Access: tokens, a token exchanged for a browser's session, and the list of what was changed."""
 
-from typing import Annotated, ClassVar
+from typing import Annotated
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
-from pydantic import ConfigDict, Field
+from fastapi import Path
+from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -13,13 +12,13 @@ from service.access.tokens import DEFAULT_DAYS, MAX_DAYS, SESSION_H
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
-from service.web.openapi.route import LINK, ResponseDoc, route_docs
-from service.web.requests.access import COOKIE, AuditDep, CallerDep
+from service.web.openapi import LINK, ApiRouter, Returns
+from service.web.requests.access import COOKIE, CallerDep, ChangeDep
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import NO_QUERY, AuditQuery
+from service.web.requests.query_parameters import AuditQuery, FromQuery
 from service.web.requests.request_body import JsonBody, SessionBody, read_model
 
-router = APIRouter(prefix="/api/v1", tags=["access"])
+router = ApiRouter("access")
 
 
 class SignIn(Wire):
@@ -28,12 +27,8 @@ class SignIn(Wire):
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
 
-@router.post(
-    "/session",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The signed-in caller.", Session)}, body=SignIn, problems=(401, 503)
-    ),
+@router.serves(
+    "POST /session", Returns("The signed-in caller.", Session), body=SignIn, problems=(401,)
 )
 def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     """Exchange a token for a session cookie (`HttpOnly`, `SameSite=Strict`)."""
@@ -50,21 +45,13 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     return response
 
 
-@router.get(
-    "/session",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The caller.", Session)}),
-)
+@router.serves("GET /session", Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
     """The caller and its scopes."""
     return json_response(_shown(caller))
 
 
-@router.delete(
-    "/session",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The session has ended.", Session)}, problems=(401,)),
-)
+@router.serves("DELETE /session", Returns("The session has ended.", Session), problems=(401,))
 def sign_out(request: Request, app: AppDep) -> Response:
     """End the browser's session."""
     cookie = request.cookies.get(COOKIE)
@@ -78,9 +65,6 @@ def sign_out(request: Request, app: AppDep) -> Response:
 
 class TokenIn(Wire):
     """A new token."""
-
-    component: ClassVar[str] = "TokenIn"
-    model_config = ConfigDict(title=component)
 
     name: Annotated[
         str,
@@ -106,47 +90,38 @@ class TokenIn(Wire):
 TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
 
 
-@router.get(
-    "/tokens",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("All tokens, without their secrets.", TokenList)}),
-)
+@router.serves("GET /tokens", Returns("All tokens, without their secrets.", TokenList))
 def list_tokens(app: AppDep) -> Response:
     """Every token, with its scopes, spacecraft, end and state."""
     return json_response(TokenList(items=app.tokens.all()))
 
 
-@router.post(
-    "/tokens",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {201: ResponseDoc("The token, and its secret this once.", NewToken)},
-        body=TokenIn,
-        problems=(409, 503),
-    ),
+@router.serves(
+    "POST /tokens",
+    Returns("The token, and its secret this once.", NewToken, status=201),
+    body=TokenIn,
+    problems=(409,),
 )
-def add_token(body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Make a token; the first one ends open access."""
     asked = read_model(TokenIn, body)
-    made = app.tokens.add(**asked.model_dump(), entry=audited.entry(201))
+    made = app.tokens.add(**asked.model_dump(), entry=change.entry(201))
     app.access.forget()
     return json_response(made, 201)
 
 
-@router.delete(
-    "/tokens/{token}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The token that was revoked.", Token)}, problems=(404, 503)),
+@router.serves(
+    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(503,)
 )
-def revoke_token(token: TokenName, app: AppDep, audited: AuditDep) -> Response:
+def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     """Revoke a token at once, with the browser sessions that were begun with it."""
-    revoked = app.tokens.revoke(token, audited.entry())
+    revoked = app.tokens.revoke(token, change.entry())
     app.access.forget()
     return json_response(revoked)
 
 
-@router.get("/audit", **route_docs({200: ResponseDoc("A page of changes.", AuditPage, LINK)}))
-def list_audit(request: Request, query: Annotated[AuditQuery, InQuery()], app: AppDep) -> Response:
+@router.serves("GET /audit", Returns("A page of changes.", AuditPage, LINK))
+def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
     with app.context.reading() as connection:
         page = list_entries(connection, query.limit, query.cursor)

@@ -1,32 +1,24 @@
 """Webhooks: events that the service sends to receivers."""
 
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
-from fastapi import APIRouter, Path
-from fastapi import Query as InQuery
-from pydantic import ConfigDict, Field, StringConstraints, model_validator
+from fastapi import Path
+from pydantic import Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access.tokens import Caller
 from service.observations.schema import Key, RunName, Wire
+from service.storage import webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
-from service.storage.webhooks.registered import (
-    Webhook,
-    WebhookDeliveryPage,
-    WebhookList,
-    WebhookQueued,
-    WebhookTest,
-    WebhookWithSecret,
-)
-from service.web.openapi.route import LINK, LOCATION, ResponseDoc, route_docs
-from service.web.requests.access import AuditDep, CallerDep, require_scope
+from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests.access import ChangeDep, require_scope
 from service.web.requests.dependencies import AppDep, json_response, page_response
-from service.web.requests.query_parameters import NO_QUERY, Cursor, PageLimit, Query, Time
+from service.web.requests.query_parameters import Cursor, FromQuery, PageLimit, Query, Time
 from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_model
 
-router = APIRouter(prefix="/api/v1", tags=["webhooks"])
+router = ApiRouter("webhooks")
 
 WebhookId = Annotated[str, Path(description="The `id` of a webhook.")]
 ALL = "*"
@@ -34,9 +26,6 @@ ALL = "*"
 
 class WebhookIn(Wire):
     """The settings of a webhook."""
-
-    component: ClassVar[str] = "WebhookIn"
-    model_config = ConfigDict(title=component)
 
     name: Annotated[
         str,
@@ -62,8 +51,7 @@ class WebhookIn(Wire):
         Field(min_length=1, max_length=200, description="Only events about these; null: all."),
     ] = None
     severity: Annotated[
-        SeverityName | None,
-        Field(description="Of alarms only those that were at least as severe."),
+        SeverityName | None, Field(description="Of alarms only those that were at least as severe.")
     ] = None
     run: Annotated[
         RunName | Literal["*"],
@@ -79,9 +67,6 @@ class WebhookIn(Wire):
 class SecretIn(Wire):
     """How long a replaced secret goes on signing."""
 
-    component: ClassVar[str] = "SecretIn"
-    model_config = ConfigDict(title=component)
-
     previous_hours: Annotated[
         int, Field(ge=0, le=168, strict=True, description="0: it signs no more.")
     ] = 24
@@ -89,9 +74,6 @@ class SecretIn(Wire):
 
 class RetryIn(Wire):
     """Which dead letters are sent again."""
-
-    component: ClassVar[str] = "RetryIn"
-    model_config = ConfigDict(title=component)
 
     events: Annotated[
         list[Annotated[int, Field(ge=1, lt=1 << 63, strict=True)]] | None,
@@ -101,9 +83,6 @@ class RetryIn(Wire):
 
 class ReplayEventsIn(Wire):
     """Which events are sent again, by the time at which they were recorded."""
-
-    component: ClassVar[str] = "ReplayEventsIn"
-    model_config = ConfigDict(title=component)
 
     since: Annotated[Time, Field(description="By the service's clock, included.")]
     until: Annotated[Time | None, Field(description="Excluded; null: now.")] = None
@@ -131,108 +110,86 @@ class DeliveryQuery(Query):
     cursor: Cursor = None
 
 
-@router.get(
-    "/webhooks",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("All webhooks.", WebhookList)}),
-)
+@router.serves("GET /webhooks", Returns("All webhooks.", webhooks.WebhookList))
 def list_webhooks(app: AppDep) -> Response:
     """Every webhook, with its state and its last failure."""
     return json_response({"items": app.webhooks.all()})
 
 
-@router.get(
-    "/webhooks/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The webhook.", Webhook)}, problems=(404,)),
-)
+@router.serves("GET /webhooks/{id}", Returns("The webhook.", webhooks.Webhook))
 def get_webhook(id: WebhookId, app: AppDep) -> Response:
     """One webhook."""
     return json_response(app.webhooks.get(id))
 
 
-@router.post(
-    "/webhooks",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {201: ResponseDoc("The webhook, and its secret this once.", WebhookWithSecret, LOCATION)},
-        body=WebhookIn,
-        problems=(409, 503),
+@router.serves(
+    "POST /webhooks",
+    Returns(
+        "The webhook, and its secret this once.", webhooks.WebhookWithSecret, LOCATION, status=201
     ),
+    body=WebhookIn,
+    problems=(409,),
 )
-def add_webhook(body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep) -> Response:
+def add_webhook(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Register a receiver, which is sent the events from now on, signed (Standard Webhooks)."""
-    _require_reader(caller)
+    _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    added = app.webhooks.add(asked.settings(), caller, audited.entry(201))
+    added = app.webhooks.add(asked.settings(), change.caller, change.entry(201))
     return json_response(added, 201, {"Location": f"/api/v1/webhooks/{added.id}"})
 
 
-@router.put(
-    "/webhooks/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The webhook.", Webhook)}, body=WebhookIn, problems=(404, 503)),
-)
-def change_webhook(
-    id: WebhookId, body: JsonBody, app: AppDep, caller: CallerDep, audited: AuditDep
-) -> Response:
+@router.serves("PUT /webhooks/{id}", Returns("The webhook.", webhooks.Webhook), body=WebhookIn)
+def change_webhook(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Replace all settings; a webhook that was paused or disabled goes on where it stopped."""
-    _require_reader(caller)
+    _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    return json_response(app.webhooks.change(id, asked.settings(), caller, audited.entry()))
+    return json_response(app.webhooks.change(id, asked.settings(), change.caller, change.entry()))
 
 
-@router.delete(
-    "/webhooks/{id}",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The webhook that was deleted.", Webhook)}, problems=(404, 503)),
+@router.serves(
+    "DELETE /webhooks/{id}",
+    Returns("The webhook that was deleted.", webhooks.Webhook),
+    problems=(503,),
 )
-def delete_webhook(id: WebhookId, app: AppDep, audited: AuditDep) -> Response:
+def delete_webhook(id: WebhookId, app: AppDep, change: ChangeDep) -> Response:
     """Delete a webhook with its queue and its dead letters."""
-    return json_response(app.webhooks.delete(id, audited.entry()))
+    return json_response(app.webhooks.delete(id, change.entry()))
 
 
-@router.post(
-    "/webhooks/{id}/secret",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("The webhook, and its new secret this once.", WebhookWithSecret)},
-        body=SecretIn,
-        body_required=False,
-        problems=(404, 409, 503),
-    ),
+@router.serves(
+    "POST /webhooks/{id}/secret",
+    Returns("The webhook, and its new secret this once.", webhooks.WebhookWithSecret),
+    body=SecretIn,
+    body_required=False,
+    problems=(409,),
 )
 def rotate_webhook_secret(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Make a new secret; deliveries are signed by the previous one too for some hours.
 
     A second time within these hours only with `previous_hours` 0, which ends both.
     """
     asked = read_model(SecretIn, body)
-    return json_response(app.webhooks.rotate(id, asked.previous_hours, audited.entry()))
+    return json_response(app.webhooks.rotate(id, asked.previous_hours, change.entry()))
 
 
-@router.post(
-    "/webhooks/{id}/test",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("What came of the attempt.", WebhookTest)}, problems=(404, 409, 503)
-    ),
+@router.serves(
+    "POST /webhooks/{id}/test",
+    Returns("What came of the attempt.", webhooks.WebhookTest),
+    problems=(409, 503),
 )
 def test_webhook(id: WebhookId, app: AppDep) -> Response:
     """Send an event of the type `test` at once, and wait for the receiver's answer."""
     return json_response(app.webhooks.try_out(id))
 
 
-@router.get(
-    "/webhooks/{id}/deliveries",
-    **route_docs(
-        {200: ResponseDoc("A page of deliveries.", WebhookDeliveryPage, LINK)}, problems=(404,)
-    ),
+@router.serves(
+    "GET /webhooks/{id}/deliveries",
+    Returns("A page of deliveries.", webhooks.WebhookDeliveryPage, LINK),
 )
 def list_webhook_deliveries(
-    id: WebhookId, request: Request, query: Annotated[DeliveryQuery, InQuery()], app: AppDep
+    id: WebhookId, request: Request, query: FromQuery[DeliveryQuery], app: AppDep
 ) -> Response:
     """Events that wait for a webhook, and its dead letters; by default the latest event first."""
     dead = None if query.state is None else query.state == "dead"
@@ -242,37 +199,29 @@ def list_webhook_deliveries(
     return page_response(request, page)
 
 
-@router.post(
-    "/webhooks/{id}/retry",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("How many were queued.", WebhookQueued)},
-        body=RetryIn,
-        body_required=False,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /webhooks/{id}/retry",
+    Returns("How many were queued.", webhooks.WebhookQueued),
+    body=RetryIn,
+    body_required=False,
 )
 def retry_dead_letters(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, audited: AuditDep
+    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
     """Send dead letters again; new events of the spacecraft do not wait for them."""
     asked = read_model(RetryIn, body)
-    return json_response(app.webhooks.retry(id, asked.events, audited.entry()))
+    return json_response(app.webhooks.retry(id, asked.events, change.entry()))
 
 
-@router.post(
-    "/webhooks/{id}/replay",
-    dependencies=[NO_QUERY],
-    **route_docs(
-        {200: ResponseDoc("How many were queued.", WebhookQueued)},
-        body=ReplayEventsIn,
-        problems=(404, 503),
-    ),
+@router.serves(
+    "POST /webhooks/{id}/replay",
+    Returns("How many were queued.", webhooks.WebhookQueued),
+    body=ReplayEventsIn,
 )
-def replay_events(id: WebhookId, body: JsonBody, app: AppDep, audited: AuditDep) -> Response:
+def replay_events(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Send the kept events of a period again, with the ids that they had."""
     asked = read_model(ReplayEventsIn, body)
-    return json_response(app.webhooks.replay(id, asked.since, asked.until, audited.entry()))
+    return json_response(app.webhooks.replay(id, asked.since, asked.until, change.entry()))
 
 
 def _require_reader(caller: Caller) -> None:

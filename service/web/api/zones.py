@@ -2,20 +2,18 @@
 
 from typing import Annotated
 
-from fastapi import APIRouter
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
 from service.observations.schema import APrioriIn, Key, Wire
 from service.storage.models.overview import Dropped, ZoneCache, ZoneList
-from service.web.openapi.route import ResponseDoc, route_docs
+from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.query_parameters import NO_QUERY, Query, SpacecraftFilter, Time
+from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter, Time
 from service.web.requests.request_body import JsonBody, read_model
 
-router = APIRouter(prefix="/api/v1/zones", tags=["zones"])
+router = ApiRouter("zones")
 
 MAX_WARMED = 1000
 
@@ -36,7 +34,7 @@ class DropQuery(Query):
     spacecraft: SpacecraftFilter = None
 
 
-@router.get("", dependencies=[NO_QUERY], **route_docs({200: ResponseDoc("The cache.", ZoneCache)}))
+@router.serves("GET /zones", Returns("The cache.", ZoneCache))
 def list_zones(app: AppDep) -> Response:
     """The cached zones, their size, hits, misses and build times.
 
@@ -45,11 +43,7 @@ def list_zones(app: AppDep) -> Response:
     return json_response(app.zones.state())
 
 
-@router.post(
-    "",
-    dependencies=[NO_QUERY],
-    **route_docs({200: ResponseDoc("The zones, now cached.", ZoneList)}, body=WarmIn),
-)
+@router.serves("POST /zones", Returns("The zones, now cached.", ZoneList), body=WarmIn)
 def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Build the zones that batches with these a priori attitudes will use."""
     asked = read_model(WarmIn, body)
@@ -58,7 +52,7 @@ def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     return json_response(ZoneList(items=warmed))
 
 
-@router.delete("", **route_docs({200: ResponseDoc("The number of dropped zones.", Dropped)}))
-def drop_zones(query: Annotated[DropQuery, InQuery()], app: AppDep) -> Response:
+@router.serves("DELETE /zones", Returns("The number of dropped zones.", Dropped))
+def drop_zones(query: FromQuery[DropQuery], app: AppDep) -> Response:
     """Drop cached zones; the next batch builds its zones again."""
     return json_response(Dropped(dropped=app.zones.drop(query.spacecraft)))

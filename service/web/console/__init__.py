@@ -3,8 +3,7 @@
 from fastapi import APIRouter
 
 from service.web.console import pages as pages
-from service.web.console.registry import PAGES
-from service.web.console.rendering import PageRoute
+from service.web.console.page import PAGES, PageRoute
 
 
 def console_router() -> APIRouter:

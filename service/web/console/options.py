@@ -63,7 +63,10 @@ def asked_options(query: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
         group, _, leaf = name.removeprefix(prefix).rpartition(".")
         place = nested.setdefault(group, {}) if group else nested
         place[leaf] = _value(name, group, leaf, text.strip())
-    _checked(nested, prefix)
+    try:
+        OptionsIn.model_validate(nested)
+    except ValidationError as error:
+        raise BadBatch(faults_of_form(error, prefix)) from None
     return nested
 
 
@@ -80,18 +83,16 @@ def _value(name: str, group: str, leaf: str, text: str) -> Any:
     return text
 
 
-def _checked(nested: Mapping[str, Any], prefix: str) -> OptionsIn:
-    try:
-        return OptionsIn.model_validate(nested)
-    except ValidationError as error:
-        raise BadBatch(
-            Fault(
-                prefix + ".".join(str(part)[:80] for part in each["loc"]),
-                str(each["msg"]),
-                shown_value(each["input"]),
-            )
-            for each in error.errors()
-        ) from None
+def faults_of_form(error: ValidationError, prefix: str = "") -> list[Fault]:
+    """The faults of a form, by the names of its fields."""
+    return [
+        Fault(
+            prefix + ".".join(str(part)[:80] for part in each["loc"]),
+            str(each["msg"]),
+            shown_value(each["input"]),
+        )
+        for each in error.errors()
+    ]
 
 
 def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
@@ -110,23 +111,21 @@ def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
 
 def batch_settings(choices: Choices) -> dict[str, Any]:
     """The settings in force for a batch, nested like options."""
-    return {
-        "identifier": choices.identifier,
-        "solver": choices.solver,
-        "tests": choices.tests.model_dump(),
-        "tolerances": choices.tolerances.model_dump(),
-        "zone_grid_deg": choices.zone_grid_deg,
-    }
+    return _nested(choices, choices.zone_grid_deg)
 
 
 def settings_of_mission(mission: Mission) -> dict[str, Any]:
     """The settings in force where neither batch nor form has others."""
+    return _nested(mission, mission.zone.grid_deg)
+
+
+def _nested(settings: Choices | Mission, zone_grid_deg: float | None) -> dict[str, Any]:
     return {
-        "identifier": mission.identifier,
-        "solver": mission.solver,
-        "tests": mission.tests.model_dump(),
-        "tolerances": mission.tolerances.model_dump(),
-        "zone_grid_deg": mission.zone.grid_deg,
+        "identifier": settings.identifier,
+        "solver": settings.solver,
+        "tests": settings.tests.model_dump(),
+        "tolerances": settings.tolerances.model_dump(),
+        "zone_grid_deg": zone_grid_deg,
     }
 
 

@@ -172,7 +172,7 @@ async def authorize(request: Request) -> None:
     """Let a request through to its handler, or raise what it lacks.
 
     What a caller with the scope `operate` changes, and what a policy marks as `audited`, gets
-    its audit entry with the change (`AuditDep`), or once it is answered
+    its audit entry with the change (`ChangeDep`), or once it is answered
     (`service.web.middleware`) where it was refused or changed no record.
     """
     route = request.scope["route"]
@@ -256,11 +256,16 @@ def entry_of(scope: HttpScope, access: Access, status: int) -> Entry:
     return access.entry(state["caller"].name, state["changes"], about, text, status)
 
 
-class AuditEntries:
-    """Gives a handler the audit entry to store with its change."""
+class Change:
+    """What a handler stores with a change: its author, and its entry in the audit list."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
+        self.caller: Caller = request.state.caller
+
+    def author(self, named: str | None) -> str:
+        """The name of the token; without tokens, the name that the request gives."""
+        return author(self.caller, named)
 
     def entry(self, status: int = 200) -> Entry:
         """The entry for a change that is answered with this status.
@@ -272,11 +277,11 @@ class AuditEntries:
         return entry_of(request.scope, request.app.state.app.access, status)
 
 
-async def _audit_entries(request: Request) -> AuditEntries:
-    return AuditEntries(request)
+async def _change(request: Request) -> Change:
+    return Change(request)
 
 
-AuditDep = Annotated[AuditEntries, Depends(_audit_entries)]
+ChangeDep = Annotated[Change, Depends(_change)]
 
 
 def require_scope(caller: Caller, *scopes: Scope) -> None:

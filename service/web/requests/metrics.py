@@ -32,7 +32,7 @@ from service.storage.models.overview import ZoneCache
 from service.storage.projections.projector import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
-from service.storage.webhooks.registered import Webhook
+from service.storage.webhooks import Webhook
 from service.times import recorded_utc, unix_seconds, utc_now
 from service.webhooks.messages import Result
 
@@ -128,31 +128,23 @@ class _GaugeCollector(Collector):
 
 
 def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
-    """The cache of zones and run catalogs."""
     yield CounterMetricFamily(
         "starid_zone_cache_hits",
         "Zones and run catalogs found in the cache; replays have others.",
         value=cache.hits,
     )
     yield CounterMetricFamily(
-        "starid_zone_cache_misses",
-        "Zones and run catalogs built.",
-        value=cache.misses,
+        "starid_zone_cache_misses", "Zones and run catalogs built.", value=cache.misses
     )
     yield CounterMetricFamily(
-        "starid_zone_build_seconds",
-        "Time spent building them.",
-        value=cache.build_us / 1e6,
+        "starid_zone_build_seconds", "Time spent building them.", value=cache.build_us / 1e6
     )
     yield GaugeMetricFamily(
-        "starid_zone_cache_bytes",
-        "Memory that the cache holds.",
-        value=cache.bytes,
+        "starid_zone_cache_bytes", "Memory that the cache holds.", value=cache.bytes
     )
 
 
 def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
-    """The live alarms that are not cleared."""
     family = GaugeMetricFamily(
         "starid_alarms",
         "Alarms of live batches that are not cleared.",
@@ -168,7 +160,6 @@ def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
 
 
 def _of_backlog(backlog: Backlog, lag: Lag | None) -> Iterator[Metric]:
-    """The queues, and the state of the writes."""
     posts, writes = backlog.posts, backlog.writes
     yield CounterMetricFamily(
         "starid_writes_failed",
@@ -201,7 +192,6 @@ def _of_backlog(backlog: Backlog, lag: Lag | None) -> Iterator[Metric]:
 
 
 def _of_expiries(dates: Expiries) -> Iterator[Metric]:
-    """When the leap seconds and each of the tokens end."""
     yield GaugeMetricFamily(
         "starid_leap_seconds_end_timestamp_seconds",
         "Until when the table of leap seconds is certain.",
@@ -255,7 +245,6 @@ def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
 
 
 def _of_attempts(counts: Mapping[tuple[str, str, Result], int]) -> Metric:
-    """The outcomes of the attempts to deliver."""
     family = CounterMetricFamily(
         "starid_webhook_attempts",
         "Attempts to deliver an event to a webhook; of dead ones it was the last.",

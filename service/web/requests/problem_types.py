@@ -3,19 +3,7 @@
 from dataclasses import dataclass
 from http import HTTPStatus
 
-from service.errors import (
-    AcquisitionError,
-    BadInput,
-    Busy,
-    Conflict,
-    Forbidden,
-    KeyReused,
-    NotAvailable,
-    NotFound,
-    RateLimited,
-    Unauthenticated,
-    WrongState,
-)
+from service import errors
 from service.gyro import SampleTaken
 
 
@@ -38,11 +26,11 @@ class ProblemType:
         return "about:blank" if self.slug is None else f"/problems/{self.slug}"
 
 
-class NotJson(BadInput):
+class NotJson(errors.BadInput):
     """A body that is not JSON: truncated, empty, or in another encoding."""
 
 
-PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
+PROBLEM_TYPES: dict[type[errors.AcquisitionError], ProblemType] = {
     NotJson: ProblemType(
         400,
         "The body is not JSON",
@@ -51,7 +39,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Check that the client sends the whole body. The detail names the place of the first "
         "fault.",
     ),
-    BadInput: ProblemType(
+    errors.BadInput: ProblemType(
         422,
         "Invalid input",
         "bad-input",
@@ -60,7 +48,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Correct every field that errors names; each entry has the field, what is expected and "
         "the value that was received. The same request will fail again.",
     ),
-    NotAvailable: ProblemType(
+    errors.NotAvailable: ProblemType(
         422,
         "Not available",
         "not-available",
@@ -68,7 +56,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Choose another value, or ask the operator of the service for the missing part; the "
         "detail names it.",
     ),
-    Unauthenticated: ProblemType(
+    errors.Unauthenticated: ProblemType(
         401,
         "Unauthorized",
         "not-admitted",
@@ -78,7 +66,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "service, acquire token list shows the valid ones and acquire token create makes another. "
         "In a browser, sign in again.",
     ),
-    Forbidden: ProblemType(
+    errors.Forbidden: ProblemType(
         403,
         "Forbidden",
         "not-allowed",
@@ -87,7 +75,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Use a token with the scope that the detail names. A token that is bound to spacecraft "
         "must name one of them.",
     ),
-    RateLimited: ProblemType(
+    errors.RateLimited: ProblemType(
         429,
         "Too many requests",
         "too-often",
@@ -96,7 +84,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Wait for as many seconds as the header Retry-After says, then send the same request "
         "again.",
     ),
-    NotFound: ProblemType(
+    errors.NotFound: ProblemType(
         404,
         "Not found",
         "not-found",
@@ -105,7 +93,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Check the name in the address. GET /api/v1/spacecraft and GET /api/v1/batches list the "
         "existing ones.",
     ),
-    Conflict: ProblemType(
+    errors.Conflict: ProblemType(
         409,
         "Already recorded with another body",
         "conflict",
@@ -124,7 +112,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "The detail names both blocks and the time. If the samples are the recorded ones, leave "
         "them out; if a clock was wrong, correct the times.",
     ),
-    WrongState: ProblemType(
+    errors.WrongState: ProblemType(
         409,
         "The state does not allow this",
         "not-now",
@@ -133,7 +121,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "calibration is not done. The detail says what.",
         "Read the object again: another client may have changed it in the meantime.",
     ),
-    KeyReused: ProblemType(
+    errors.KeyReused: ProblemType(
         422,
         "The Idempotency-Key was used with another body",
         "key-reused",
@@ -141,7 +129,7 @@ PROBLEM_TYPES: dict[type[AcquisitionError], ProblemType] = {
         "Use a new key for each new body. A batch needs no key: its batch id already makes a "
         "repeat harmless.",
     ),
-    Busy: ProblemType(
+    errors.Busy: ProblemType(
         503,
         "The service is busy",
         "busy",
@@ -163,7 +151,7 @@ WRONG_HOST = ProblemType(
 INTERNAL_ERROR = ProblemType(500, HTTPStatus(500).phrase)
 
 
-def problem_type_of(error: AcquisitionError) -> ProblemType:
+def problem_type_of(error: errors.AcquisitionError) -> ProblemType:
     """The problem type of an error: that of its class, or of the nearest base class."""
     return next(
         (PROBLEM_TYPES[each] for each in type(error).__mro__ if each in PROBLEM_TYPES),

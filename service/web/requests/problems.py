@@ -18,24 +18,10 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 from starlette.routing import Match
 
-from service.errors import (
-    AcquisitionError,
-    BadInput,
-    Busy,
-    Fault,
-    RateLimited,
-    Unauthenticated,
-    problem_of,
-    problem_of_faults,
-    shown_value,
-)
+from service import errors
 from service.storage.models.base import Problem
-from service.web.requests.problem_types import (
-    INTERNAL_ERROR,
-    PROBLEM_TYPES,
-    ProblemType,
-    problem_type_of,
-)
+from service.web.requests import problem_types as types
+from service.web.requests.problem_types import ProblemType
 
 MEDIA_TYPE = "application/problem+json"
 
@@ -77,36 +63,41 @@ def _content(request: Request, kind: ProblemType, details: Mapping[str, Any]) ->
 
 def problem_within(request: Request, error: BaseException) -> Problem:
     """The problem of a part of a request whose other parts are answered."""
-    if not isinstance(error, AcquisitionError) or problem_type_of(error) is INTERNAL_ERROR:
+    if (
+        not isinstance(error, errors.AcquisitionError)
+        or types.problem_type_of(error) is types.INTERNAL_ERROR
+    ):
         log.error("%s %s failed in part", request.method, request.url.path, exc_info=error)
-        return convert(_content(request, INTERNAL_ERROR, _FAILED), Problem)
-    return convert(_content(request, problem_type_of(error), problem_of(error)), Problem)
+        return convert(_content(request, types.INTERNAL_ERROR, _FAILED), Problem)
+    return convert(
+        _content(request, types.problem_type_of(error), errors.problem_of(error)), Problem
+    )
 
 
 async def _on_acquisition_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, AcquisitionError)
-    kind = problem_type_of(error)
+    assert isinstance(error, errors.AcquisitionError)
+    kind = types.problem_type_of(error)
     if kind.status == 500:
         return internal_error(request, error)
-    return problem_response(request, kind, problem_of(error), _headers_of(error))
+    return problem_response(request, kind, errors.problem_of(error), _headers_of(error))
 
 
-def _headers_of(error: AcquisitionError) -> dict[str, str] | None:
-    if isinstance(error, Busy | RateLimited):
+def _headers_of(error: errors.AcquisitionError) -> dict[str, str] | None:
+    if isinstance(error, errors.Busy | errors.RateLimited):
         return {"Retry-After": str(error.retry_after_s)}
-    if isinstance(error, Unauthenticated):
+    if isinstance(error, errors.Unauthenticated):
         return {"WWW-Authenticate": 'Bearer realm="attitude acquisition"'}
     return None
 
 
-def faults_in_query(error: RequestValidationError) -> list[Fault]:
+def faults_in_query(error: RequestValidationError) -> list[errors.Fault]:
     """The faults of a query, parameter by parameter."""
     return [
-        Fault(
+        errors.Fault(
             # Below the parameter, `loc` names the form of it that was tried.
             str(each["loc"][min(1, len(each["loc"]) - 1)])[:80],
             str(each["msg"]).removeprefix("Value error, "),
-            None if each["type"] == "missing" else shown_value(each["input"]),
+            None if each["type"] == "missing" else errors.shown_value(each["input"]),
         )
         for each in error.errors()
     ]
@@ -115,7 +106,9 @@ def faults_in_query(error: RequestValidationError) -> list[Fault]:
 async def _on_query_fault(request: Request, error: Exception) -> Response:
     assert isinstance(error, RequestValidationError)
     return problem_response(
-        request, PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
+        request,
+        types.PROBLEM_TYPES[errors.BadInput],
+        errors.problem_of_faults(faults_in_query(error)),
     )
 
 
@@ -150,7 +143,7 @@ def _methods_at(request: Request) -> list[str]:
 def internal_error(request: Request, error: Exception) -> Response:
     """Log an unexpected error, and answer without details of it."""
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(request, INTERNAL_ERROR, _FAILED)
+    return problem_response(request, types.INTERNAL_ERROR, _FAILED)
 
 
 async def _on_disconnect(request: Request, error: Exception) -> Response:
@@ -159,7 +152,7 @@ async def _on_disconnect(request: Request, error: Exception) -> Response:
 
 
 _HANDLERS: Mapping[type[Exception], Callable[[Request, Exception], Awaitable[Response]]] = {
-    AcquisitionError: _on_acquisition_error,
+    errors.AcquisitionError: _on_acquisition_error,
     RequestValidationError: _on_query_fault,
     HTTPException: on_http_error,
     ClientDisconnect: _on_disconnect,

@@ -1,24 +1,21 @@
 """Parameters of requests: each is checked, unknown ones are refused."""
 
-from collections.abc import Callable
-from typing import Annotated, Any, Literal, Self, TypedDict
+from typing import Annotated, Any, Literal, Self, TypeAlias, TypedDict, TypeVar
 
 from fastapi import Depends, Path
+from fastapi import Query as InQuery
 from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
-    GetCoreSchemaHandler,
-    GetJsonSchemaHandler,
     PlainValidator,
     WithJsonSchema,
     field_validator,
     model_validator,
 )
-from pydantic_core import CoreSchema, core_schema
 
-from service.alarms.quantities import QuantityName, RankedName, trend_names
+from service.alarms.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.app.products import TableKind
 from service.errors import BadInput
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
@@ -26,14 +23,18 @@ from service.observations.schema import Key, RunName
 from service.products.attitudes import ProductGrade, StatusWanted
 from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
 from service.products.moment import AtMethod
-from service.storage.projections.rollups import Bucket
 from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
+from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
 from service.web.requests.request_body import require_no_query
 
 MAX_LIMIT = 500
+
+T = TypeVar("T")
+FromQuery: TypeAlias = Annotated[T, InQuery()]
+"""A model whose fields are the query parameters of a route."""
 
 
 def _time(value: object) -> Utc:
@@ -53,6 +54,11 @@ TIME_SCHEMA: dict[str, Any] = {
 Time = Annotated[Utc, PlainValidator(_time), WithJsonSchema(TIME_SCHEMA)]
 """UTC text, calendar or day-of-year, as the core's own type."""
 
+Run = Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")]
+RunOrAll = Annotated[
+    RunName | Literal["*"],
+    Field(description="The run: `live` for the batches of pipelines, `*` for all runs."),
+]
 Start = Annotated[Time | None, Field(description="Start of the period, included.")]
 End = Annotated[Time | None, Field(description="End of the period, excluded.")]
 PageLimit = Annotated[
@@ -103,9 +109,7 @@ class RunAndTimes(TypedDict):
 class PeriodQuery(Query):
     """A period and a run."""
 
-    run: Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")] = (
-        "live"
-    )
+    run: Run = "live"
     start: Start = None
     end: End = None
 
@@ -137,10 +141,7 @@ class AuditQuery(Query):
 class BatchQuery(PeriodPageQuery):
     """Which of the recorded batches."""
 
-    run: Annotated[
-        RunName | Literal["*"],
-        Field(description="The run: `live` for the batches of pipelines, `*` for all runs."),
-    ] = "live"
+    run: RunOrAll = "live"
     spacecraft: SpacecraftFilter = None
     outcome: Annotated[
         OutcomeName | None,
@@ -151,8 +152,7 @@ class BatchQuery(PeriodPageQuery):
         Field(description="Only batches with a good attitude, with a suspect one, or with none."),
     ] = None
     batch: Annotated[
-        Key | None,
-        Field(description="Only the batch with this batch id; needs `spacecraft`."),
+        Key | None, Field(description="Only the batch with this batch id; needs `spacecraft`.")
     ] = None
 
     @model_validator(mode="after")
@@ -165,43 +165,13 @@ class BatchQuery(PeriodPageQuery):
 class RunQuery(Query):
     """A run."""
 
-    run: Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")] = (
-        "live"
-    )
+    run: Run = "live"
 
 
 class RatesQuery(PeriodQuery):
     """Star rates of a period, in buckets."""
 
     bucket: Annotated[Bucket, Field(description="The width of a bucket, in UTC.")] = "hour"
-
-
-class FormatNames:
-    """Checks a parameter `format`, and puts the names that it may have into the OpenAPI document.
-
-    `names` gives those that are registered by now.
-    """
-
-    def __init__(self, names: Callable[[], list[str]]) -> None:
-        self._names = names
-
-    def __get_pydantic_core_schema__(
-        self, source: Any, handler: GetCoreSchemaHandler
-    ) -> CoreSchema:
-        """Text that is one of the names."""
-        return core_schema.no_info_after_validator_function(self._checked, handler(source))
-
-    def _checked(self, name: str) -> str:
-        names = [repr(each) for each in self._names()]
-        if repr(name) not in names:
-            raise ValueError(f"Input should be {', '.join(names[:-1])} or {names[-1]}")
-        return name
-
-    def __get_pydantic_json_schema__(
-        self, schema: CoreSchema, handler: GetJsonSchemaHandler
-    ) -> dict[str, Any]:
-        """The schema of the parameter, with the formats that are registered by now."""
-        return {"enum": self._names(), "type": "string"}
 
 
 class HistoryQuery(PeriodQuery):
@@ -234,7 +204,7 @@ class HistoryQuery(PeriodQuery):
     ] = None
     format: Annotated[
         str,
-        FormatNames(lambda: [JSON_FORMAT, *table_formats()]),
+        OneOf(lambda: (JSON_FORMAT, *table_formats())),
         Field(description="`json`: columns; any other: a table, as a file."),
     ] = JSON_FORMAT
 
@@ -256,8 +226,7 @@ class WorstQuery(PeriodQuery):
     """Which batches are worst, by what."""
 
     by: Annotated[
-        RankedName,
-        Field(description="The quantity. For an offset, its absolute value."),
+        RankedName, Field(description="The quantity. For an offset, its absolute value.")
     ] = "ambiguous_share"
     tracker: OfTracker = None
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20
@@ -266,10 +235,7 @@ class WorstQuery(PeriodQuery):
 class AlarmQuery(Query):
     """Which alarms."""
 
-    run: Annotated[
-        RunName | Literal["*"],
-        Field(description="The run: `live` for the batches of pipelines, `*` for all runs."),
-    ] = "live"
+    run: RunOrAll = "live"
     spacecraft: SpacecraftFilter = None
     state: Annotated[
         StateFilter, Field(description="`active`: all alarms that are not cleared.")
@@ -314,9 +280,7 @@ Who = Annotated[
     AfterValidator(without_nul),
 ]
 Comment = Annotated[
-    str | None,
-    Field(max_length=2_000, description="A comment."),
-    AfterValidator(without_nul),
+    str | None, Field(max_length=2_000, description="A comment."), AfterValidator(without_nul)
 ]
 
 
@@ -368,8 +332,7 @@ LargestGap = Annotated[
     ),
 ]
 Statuses = Annotated[
-    StatusWanted,
-    Field(description="Only good attitudes, only suspect ones, or `all`."),
+    StatusWanted, Field(description="Only good attitudes, only suspect ones, or `all`.")
 ]
 Grades = Annotated[
     ProductGrade,
@@ -392,7 +355,7 @@ class AttitudeQuery(PeriodQuery):
 
     format: Annotated[
         str,
-        FormatNames(lambda: [*attitude_formats()]),
+        OneOf(lambda: tuple(attitude_formats())),
         Field(description="`json`: objects; any other: a file."),
     ] = JSON_FORMAT
     grade: Grades = "raw"
@@ -449,7 +412,5 @@ class TableQuery(PeriodQuery):
     """A table of a period, in a format."""
 
     format: Annotated[
-        str,
-        FormatNames(lambda: [*table_formats()]),
-        Field(description="The format of the file."),
+        str, OneOf(lambda: tuple(table_formats())), Field(description="The format of the file.")
     ] = "csv"

@@ -27,14 +27,7 @@ from service.web.requests.problem_types import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
-FRAMES = (
-    "application/fits",
-    "image/fits",
-    "image/tiff",
-    "image/png",
-    "application/x-npy",
-    BINARY,
-)
+FRAMES = ("application/fits", "image/fits", "image/tiff", "image/png", "application/x-npy", BINARY)
 """Media types of frames; the first bytes tell the format."""
 NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
 """Generated clients can send the last one: most know no type for lines."""
@@ -118,11 +111,8 @@ def trim_memory() -> None:
         trim(0)
 
 
-def _media_type(request: Request) -> str:
-    return request.headers.get("content-type", "").partition(";")[0].strip().lower()
-
-
-def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
+def _require_type(request: Request, allowed: tuple[str, ...]) -> str:
+    """The media type of a body, which must be one of these."""
     # Also a protection: pages of other sites can send only form types without a preflight.
     sent = request.headers.get("content-type", "")
     kind, _, parameters = sent.partition(";")
@@ -132,6 +122,7 @@ def _require_type(request: Request, allowed: tuple[str, ...]) -> None:
         raise HTTPException(415, f"Content-Type must be {allowed[0]}, not {sent[:80] or 'absent'}")
     if parameters.startswith("charset=") and parameters not in ("charset=utf-8", "charset=utf8"):
         raise HTTPException(415, f"the body must be in UTF-8, not {parameters[:40]}")
+    return kind
 
 
 def _coding(request: Request, allowed: tuple[Coding, ...]) -> Coding:
@@ -212,16 +203,13 @@ class Spooled:
 
 
 async def telemetry_body(
-    request: Request,
-    new_file: Callable[[], IO[bytes]],
-    discard: Callable[[IO[bytes]], object],
+    request: Request, new_file: Callable[[], IO[bytes]], discard: Callable[[IO[bytes]], object]
 ) -> Spooled:
     """A body of lines or of packets in a new file; one that did not arrive is discarded.
 
     Lines (NDJSON) may be compressed.
     """
-    _require_type(request, (*NDJSON, PACKETS))
-    is_packets = _media_type(request) == PACKETS
+    is_packets = _require_type(request, (*NDJSON, PACKETS)) == PACKETS
     coding = _coding(request, ("identity",) if is_packets else ("identity", "gzip", "zstd"))
     limits: BodyLimits = request.app.state.limits
     file = new_file()

@@ -1,6 +1,6 @@
 """The zones that the paper counts hold about as many stars and pairs in today's catalog."""
 
-from studies.paper_1994.zone_counts import counts
+from tests.reference.zone_counts import counts
 
 
 def test_stars_agree_within_eight_and_pairs_within_fifteen_percent(sky):

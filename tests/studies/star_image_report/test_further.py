@@ -7,7 +7,7 @@ import pytest
 
 from service.imaging.centroids.sequential import diffuse
 from studies.star_image_report.correlate import misaligned
-from studies.star_image_report.further.measurements import (
+from studies.star_image_report.measurements import (
     HUMP,
     SIGMA,
     best_order,
@@ -18,15 +18,16 @@ from studies.star_image_report.further.measurements import (
     spread_of,
     spreads_along,
 )
-from studies.star_image_report.further.rotation import (
+from studies.star_image_report.optics import DIAMETER_M, LASER_M
+from studies.star_image_report.rotation import (
     FIELD,
     SIGMA_PX,
     align,
     correlation_of_field,
     field_image,
 )
-from studies.star_image_report.further.sun_acquisition import ThreeDetectors
-from studies.star_image_report.further.wires_and_lines import (
+from studies.star_image_report.sun_acquisition import ThreeDetectors
+from studies.star_image_report.wires_and_lines import (
     THICK_M,
     THIN_M,
     THIRD_M,
@@ -35,7 +36,6 @@ from studies.star_image_report.further.wires_and_lines import (
     tail_of_wires,
     wires,
 )
-from studies.star_image_report.optics import DIAMETER_M, LASER_M
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.2, -2.5])

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.sky.zones import SearchRegion
-from service.storage.models.charts import PeriodStars, TrackerStarsOfPeriod
+from service.storage.queries.period import PeriodStars, TrackerStarsOfPeriod
 from service.vectors import Vector, angle_between_deg, from_ra_dec, to_ra_dec, unit
 
 WIDTH, HEIGHT = 720.0, 360.0

@@ -1,19 +1,16 @@
 """Attitude, rate and their standard deviations about the body axes over a period, in panels."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from service.attitude.rotations import rotation_vectors
-from service.storage.models.charts import PeriodAttitudes
+from service.storage.queries.period import PeriodAttitudes
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAxis, Values, band_of
 
-WIDTH, HEIGHT = 1280, 176
-"""Units of a panel, which is drawn half as large."""
-PAD = 10
 AXES = ("x", "y", "z")
 LARGEST_STEP_S = 600.0
 """A rate is formed of attitudes that are no farther apart."""
@@ -23,8 +20,6 @@ LEAST_BAND = 1.5
 """Units; a band of one sigma to either side that is narrower cannot be seen."""
 SMALL_DEG, SMALL_DEG_PER_S = 0.05, 0.005
 """Values that are all below these are given in arcseconds."""
-
-Flags = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -62,8 +57,8 @@ class _Values:
     time_ns: npt.NDArray[np.int64]
     value: Vector
     sigma: Vector | None
-    is_suspect: Flags
-    joins: Flags
+    is_suspect: Mask
+    joins: Mask
 
 
 def attitude_charts(attitudes: PeriodAttitudes, start: Utc, end: Utc) -> list[AttitudeChart]:
@@ -72,6 +67,7 @@ def attitude_charts(attitudes: PeriodAttitudes, start: Utc, end: Utc) -> list[At
     The attitude is the turn from the first good one; the rate that between neighbouring
     attitudes, at the middle of their time.
     """
+    axis = TimeAxis(start, end)
     known = np.isfinite(attitudes.quaternion[:, 0])
     if not known.any():
         return []
@@ -86,12 +82,12 @@ def attitude_charts(attitudes: PeriodAttitudes, start: Utc, end: Utc) -> list[At
     joins = follows & _is_near(time_ns, follows)
     # Beyond half a turn the shorter way round begins on the other side.
     joins[1:] &= np.max(np.abs(np.diff(turned, axis=0)), axis=1) < np.pi / 2
-    drawn = [_chart("attitude", _Values(time_ns, turned, sigma, is_suspect, joins), start, end)]
+    drawn = [_chart("attitude", _Values(time_ns, turned, sigma, is_suspect, joins), axis)]
     rates = _rates(time_ns, quaternion, sigma, is_suspect, follows)
     if len(rates.time_ns):
-        drawn.append(_chart("rate", rates, start, end))
+        drawn.append(_chart("rate", rates, axis))
     sigmas = _Values(time_ns, sigma, None, is_suspect, joins)
-    return [*drawn, _chart("sigma", sigmas, start, end)]
+    return [*drawn, _chart("sigma", sigmas, axis)]
 
 
 def _sigma_rad(covariance_arcsec2: Vector) -> Vector:
@@ -99,7 +95,7 @@ def _sigma_rad(covariance_arcsec2: Vector) -> Vector:
     return np.asarray(np.sqrt(np.maximum(squares, 0.0)) / ARCSEC_PER_RADIAN)
 
 
-def _is_near(time_ns: npt.NDArray[np.int64], follows: Flags) -> Flags:
+def _is_near(time_ns: npt.NDArray[np.int64], follows: Mask) -> Mask:
     """Marks of the moments as near to the one before as is usual among neighbours."""
     step = np.diff(time_ns, prepend=time_ns[0])
     usual = float(np.median(step[follows])) if follows.any() else 0.0
@@ -110,8 +106,8 @@ def _rates(
     time_ns: npt.NDArray[np.int64],
     quaternion: Vector,
     sigma: Vector,
-    is_suspect: Flags,
-    follows: Flags,
+    is_suspect: Mask,
+    follows: Mask,
 ) -> _Values:
     step_s = np.diff(time_ns, prepend=time_ns[0]) * 1e-9
     own = np.flatnonzero(follows & (step_s > 0.0) & (step_s <= LARGEST_STEP_S))
@@ -134,17 +130,15 @@ _TITLES = {
 }
 
 
-def _chart(id: str, values: _Values, start: Utc, end: Utc) -> AttitudeChart:
+def _chart(id: str, values: _Values, time: TimeAxis) -> AttitudeChart:
     unit, scale = _unit(id, values.value)
-    along = (values.time_ns - start.tai_ns) / max(end.tai_ns - start.tai_ns, 1)
-    x = np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(int)
-    panels = tuple(_panel(axis, x, values, scale, from_zero=id == "sigma") for axis in range(3))
+    panels = tuple(_panel(axis, values, time, scale, from_zero=id == "sigma") for axis in range(3))
     return AttitudeChart(
         id=id,
         title=f"{_TITLES[id]}, about the body axes",
         unit=unit,
         panels=panels,
-        count=len(x),
+        count=len(values.time_ns),
         has_band=any(panel.band for panel in panels),
     )
 
@@ -160,59 +154,25 @@ def _unit(id: str, values: Vector) -> tuple[str, float]:
     return ("″", ARCSEC_PER_RADIAN) if degrees < SMALL_DEG else ("°", np.degrees(1.0))
 
 
-def _panel(
-    axis: int, x: npt.NDArray[np.int64], values: _Values, scale: float, *, from_zero: bool
-) -> Panel:
-    value = values.value[:, axis] * scale
-    sigma = np.zeros_like(value) if values.sigma is None else values.sigma[:, axis] * scale
+def _panel(axis: int, values: _Values, time: TimeAxis, unit: float, *, from_zero: bool) -> Panel:
+    value = values.value[:, axis] * unit
+    sigma = np.zeros_like(value) if values.sigma is None else values.sigma[:, axis] * unit
     low = 0.0 if from_zero else float(np.min(value - sigma))
-    high = float(np.max(value + sigma))
-    room = 0.04 * (high - low) or 1.0
-
-    def y(level: Vector) -> npt.NDArray[np.int64]:
-        part = (level - low + room) / (high - low + 2 * room)
-        return np.rint(HEIGHT * (1.0 - part)).astype(int)
-
-    is_wide = float(np.max(sigma)) / (high - low + 2 * room) * HEIGHT > LEAST_BAND
-    parts = np.split(np.arange(len(x)), np.flatnonzero(~values.joins)[1:])
-    at = y(value)
+    scale = Scale(low, float(np.max(value + sigma)))
+    drawn = Values(values.time_ns, value, values.joins).trace("", time, scale)
+    is_wide = float(np.max(sigma)) / scale.range_with_room * HEIGHT > LEAST_BAND
+    x, at = time.x(values.time_ns[values.is_suspect]), scale.y(value[values.is_suspect])
     return Panel(
         axis=AXES[axis],
-        line="".join(line_path(x[part], at[part]) for part in parts if len(part) > 1),
-        band=band_path(x, y(value + sigma), y(value - sigma), parts) if is_wide else "",
-        dots="".join(line_path(x[part], at[part]) + "h0" for part in parts if len(part) == 1),
+        line=drawn.line,
+        band=band_of(values.time_ns, value - sigma, value + sigma, values.joins, time, scale)
+        if is_wide
+        else "",
+        dots=drawn.dots,
         suspect="".join(
-            f"M{a} {b - 9}l8 15h-16z"
-            for a, b in zip(
-                x[values.is_suspect].tolist(), at[values.is_suspect].tolist(), strict=True
-            )
+            f"M{a} {b - 9}l8 15h-16z" for a, b in zip(x.tolist(), at.tolist(), strict=True)
         ),
         low=float(np.min(value)),
         high=float(np.max(value)),
         median_sigma=None if values.sigma is None else float(np.median(sigma)),
     )
-
-
-def line_path(x: npt.NDArray[np.int64], y: npt.NDArray[np.int64]) -> str:
-    """A path in whole units, each step from the point before."""
-    steps = zip(np.diff(x).tolist(), np.diff(y).tolist(), strict=True)
-    return f"M{x[0]} {y[0]}" + "".join(f"l{a} {b}" for a, b in steps)
-
-
-def band_path(
-    x: npt.NDArray[np.int64],
-    upper: npt.NDArray[np.int64],
-    lower: npt.NDArray[np.int64],
-    parts: Sequence[npt.NDArray[np.int64]],
-) -> str:
-    """The area between two lines; a bar where a part has one point."""
-    text = []
-    for part in parts:
-        if len(part) == 1:
-            k = int(part[0])
-            text.append(f"M{x[k] - 1} {upper[k]}h2V{lower[k]}h-2z")
-            continue
-        forward = line_path(x[part], upper[part])
-        back = line_path(x[part][::-1], lower[part][::-1])
-        text.append(f"{forward}L{back[1:]}z")
-    return "".join(text)

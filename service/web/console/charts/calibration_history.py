@@ -1,7 +1,7 @@
 """Parameters of trackers over the versions of a calibration, with their sigmas."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -128,15 +128,12 @@ def _drawn(name: str, unit: str, points: Sequence[Point]) -> ParameterHistory:
         return HEIGHT - PAD - part * (HEIGHT - 2.0 * PAD)
 
     drawn = tuple(
-        Point(
-            each.version,
-            each.time,
-            each.value,
-            each.sigma,
-            PAD + float(x) * (WIDTH - 2.0 * PAD),
-            y_of(each.value),
-            y_of(each.value - SIGMAS * each.sigma),
-            y_of(each.value + SIGMAS * each.sigma),
+        replace(
+            each,
+            x=PAD + float(x) * (WIDTH - 2.0 * PAD),
+            y=y_of(each.value),
+            low=y_of(each.value - SIGMAS * each.sigma),
+            high=y_of(each.value + SIGMAS * each.sigma),
         )
         for each, x in zip(ordered, xs, strict=True)
     )

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from service.storage.calibrations import ResidualCell, ResidualMap
-from service.storage.models.charts import TrackerStarsOfPeriod
+from service.storage.queries.period import TrackerStarsOfPeriod
 from service.vectors import Vector
 
 SIZE = 420.0

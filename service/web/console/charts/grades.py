@@ -14,7 +14,7 @@ from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
 from service.vectors import Vector, to_ra_dec
 from service.web.console.charts.attitude import AXES, SMALL_DEG, SMALL_DEG_PER_S
-from service.web.console.charts.grade_panels import (
+from service.web.console.charts.panels import (
     FINE_HEIGHT,
     GradeChart,
     GradePanel,
@@ -83,11 +83,7 @@ def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> 
     roll = np.arctan2(np.sum(up * east, axis=1), np.sum(up * north, axis=1))
     joins = _joins(found, axis)
     panels, rows = [], []
-    for name, value in (
-        ("RA", ra_deg),
-        ("Dec", dec_deg),
-        ("roll", np.degrees(roll) % 360.0),
-    ):
+    for name, value in (("RA", ra_deg), ("Dec", dec_deg), ("roll", np.degrees(roll) % 360.0)):
         shown = np.where(known, value, np.nan)
         wrapped = np.abs(np.diff(shown, prepend=shown[:1])) > 180.0
         scale = replace(scale_of({"smoothed": shown}) or Scale(0.0, 360.0), height=FINE_HEIGHT)

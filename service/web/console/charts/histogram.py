@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.storage.models.charts import TrackerStarsOfPeriod
+from service.storage.queries.period import TrackerStarsOfPeriod
 from service.vectors import Vector
 
 WIDTH, HEIGHT = 420.0, 210.0

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.storage.models.charts import Boresight, ObservedStarPlace, TrackerField
+from service.storage.queries.star_field import Boresight, ObservedStarPlace, TrackerField
 
 SIZE = 640
 """Width and height of the picture."""

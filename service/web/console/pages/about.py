@@ -5,9 +5,7 @@ import shutil
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
 from service.app.factory import App
@@ -15,9 +13,7 @@ from service.errors import AcquisitionError
 from service.storage.projections.projector import WAIT_S
 from service.times import recorded_utc, utc_now
 from service.web.console.formatting import age, count, plural, size
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 
 LEAST_FREE = 0.1
@@ -39,12 +35,12 @@ class Check:
 
 
 @console_page("/about", "Service", Policy("read", "nothing"), position=80)
-def about_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """The service's health, version, catalog, missions, database and credits."""
     about = context.app.service.about(context.caller.spacecraft)
     # Queues and machine tell what others send: a token of some spacecraft does not see them.
     checks = list(_checks(context)) if context.caller.spacecraft is None else []
-    return rendered("about.html.jinja", context.layout(query.run), about=about, checks=checks)
+    return context.rendered("about.html.jinja", query.run, about=about, checks=checks)
 
 
 def _checks(context: PageContext) -> Iterator[Check]:
@@ -82,7 +78,7 @@ def _checks(context: PageContext) -> Iterator[Check]:
         lag.seconds <= WAIT_S,
         "They catch up by themselves; until then the newest batches are missing in them.",
     )
-    if "operate" in context.caller.scopes:
+    if context.may_operate:
         webhooks = app.webhooks.all()
         dead = sum(each.dead for each in webhooks)
         yield Check(

@@ -5,8 +5,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
@@ -19,13 +17,15 @@ from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, L
 from service.storage.queries.alarms import TimeOut
 from service.times import Utc, parse_utc, recorded_utc, shifted
 from service.web.console.formatting import with_day_of_year
-from service.web.console.page_context import ContextDep, PageContext, PageQuery, SortedQuery
-from service.web.console.pages.spacecraft import (
-    charts_by_quantity,
-    history_address,
+from service.web.console.page import (
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    SortedQuery,
+    console_page,
 )
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.pages.spacecraft import charts_by_quantity, history_address
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor, Query
 
@@ -102,7 +102,7 @@ class AlarmGroup:
 
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
-def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -> Response:
+def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
     """The alarms of a run, those that left their limits last first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -114,9 +114,9 @@ def alarms_page(query: Annotated[AlarmsQuery, InQuery()], context: ContextDep) -
         for alarm, times in zip(found, context.app.alarms.times_out(found), strict=True)
     ]
     lines = _sorted(lines, query)
-    return rendered(
+    return context.rendered(
         "alarms.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         groups=_grouped(lines[:ROWS], query.group),
         left_out=max(0, len(lines) - ROWS),
@@ -210,9 +210,7 @@ class AlarmQuery(Query):
 
 
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
-def alarm_page(
-    id: Annotated[str, Path()], query: Annotated[AlarmQuery, InQuery()], context: ContextDep
-) -> Response:
+def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Response:
     """One alarm: how it was raised, its usual cause, and what operators did about it."""
     alarm = context.app.alarms.get(id)
     if not context.caller.may_see(alarm.spacecraft):
@@ -223,9 +221,9 @@ def alarm_page(
     of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
     is_retired = context.app.alarms.is_retired(alarm.spacecraft, alarm.tracker)
     (times,) = context.app.alarms.times_out([alarm])
-    return rendered(
+    return context.rendered(
         "alarm.html.jinja",
-        context.layout(alarm.run),
+        alarm.run,
         alarm=alarm,
         line=AlarmLine(alarm, times),
         is_retired=is_retired,
@@ -312,15 +310,13 @@ class LimitsQuery(PageQuery):
 
 
 @console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
-def limits_page(
-    name: Annotated[str, Path()], query: Annotated[LimitsQuery, InQuery()], context: ContextDep
-) -> Response:
+def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -> Response:
     """The bounds of every quantity, which can be previewed and changed, with their history."""
     app, tracker = context.app, query.tracker
     limits = app.limits.all(name, tracker)
-    return rendered(
+    return context.rendered(
         "limits.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         tracker=tracker,
         trackers=limited_trackers(app.context.known[name]),
@@ -328,7 +324,7 @@ def limits_page(
         severities=SEVERITIES,
         days=PREVIEW_DAYS,
         charts=charts_by_quantity(),
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
     )
 
 
@@ -352,9 +348,7 @@ class AnnotationsQuery(PageQuery):
 
 
 @console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
-def annotations_page(
-    query: Annotated[AnnotationsQuery, InQuery()], context: ContextDep
-) -> Response:
+def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) -> Response:
     """The annotations of a period, the latest written first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -367,9 +361,9 @@ def annotations_page(
         limit=ANNOTATION_ROWS,
         cursor=query.cursor,
     )
-    return rendered(
+    return context.rendered(
         "annotations.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         page=page,
         around=_around,

@@ -3,28 +3,31 @@
 import html
 import json
 import re
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import FastAPI, Path
-from fastapi import Query as InQuery
+from fastapi import FastAPI
 from markupsafe import Markup, escape
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.errors import NotFound
-from service.web.console.page_context import PageQuery, open_layout
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered, rendered_part
-from service.web.openapi.route import SCHEMAS
+from service.web.console.page import (
+    FromQuery,
+    PageQuery,
+    console_page,
+    open_layout,
+    rendered,
+    rendered_part,
+)
+from service.web.openapi import SCHEMAS
 from service.web.requests.access import OPEN
 from service.web.requests.problem_types import types_with_pages
 
 
 @console_page("/docs", "API", OPEN)
-def api_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+def api_page(request: Request, query: FromQuery[PageQuery]) -> Response:
     """Every route of the API with its parameters, answers and examples."""
     layout = open_layout(query.run, "API", "/docs")
     shown = _operations(request.app)
@@ -32,7 +35,7 @@ def api_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Respon
 
 
 @console_page("/docs/shapes", "API shapes", OPEN, section="/docs")
-def api_shapes_page(request: Request, query: Annotated[PageQuery, InQuery()]) -> Response:
+def api_shapes_page(request: Request, query: FromQuery[PageQuery]) -> Response:
     """The shapes of requests and answers, field by field."""
     layout = open_layout(query.run, "API shapes", "/docs")
     shown = _shapes(request.app)
@@ -43,16 +46,31 @@ def api_shapes_page(request: Request, query: Annotated[PageQuery, InQuery()]) ->
 # opens and closes several keeps no other.
 @lru_cache(maxsize=1)
 def _operations(app: FastAPI) -> Markup:
-    return rendered_part("_api.html.jinja", reference=reference_for_people(app))
+    document = app.openapi()
+    return rendered_part(
+        "_api.html.jinja",
+        document=document,
+        operations=[
+            (method.upper(), path, described, described.get("requestBody", {}).get("content", {}))
+            for path, methods in document["paths"].items()
+            for method, described in methods.items()
+        ],
+        prose=prose,
+        parameter_kind=_parameter_kind,
+        contents=_content,
+        command=_command,
+        example=_example,
+    )
 
 
 @lru_cache(maxsize=1)
 def _shapes(app: FastAPI) -> Markup:
-    return rendered_part("_api_shapes.html.jinja", reference=reference_for_people(app))
+    shapes = app.openapi()["components"]["schemas"]
+    return rendered_part("_api_shapes.html.jinja", shapes=shapes, prose=prose, kind_of=kind_of)
 
 
 @console_page("/problems", "Problems", OPEN, section="/docs")
-def problems_page(query: Annotated[PageQuery, InQuery()]) -> Response:
+def problems_page(query: FromQuery[PageQuery]) -> Response:
     """Every type of problem."""
     kinds = list(types_with_pages().values())
     return rendered(
@@ -64,7 +82,7 @@ def problems_page(query: Annotated[PageQuery, InQuery()]) -> Response:
 
 
 @console_page("/problems/{slug}", "Problem", OPEN, section="/docs")
-def problem_page(slug: Annotated[str, Path()], query: Annotated[PageQuery, InQuery()]) -> Response:
+def problem_page(slug: str, query: FromQuery[PageQuery]) -> Response:
     """One type of problem."""
     kind = types_with_pages().get(slug)
     if kind is None:
@@ -86,92 +104,6 @@ _CODE = re.compile(r"`([^`]+)`")
 _IN_A_PATH = {"{name}": "XTE", "{quantity}": "residual_ratio", "{run}": "pass-7", "{id}": "ID"}
 _LOW = {"minimum": "from ", "exclusiveMinimum": "above ", "minLength": "length from "}
 _HIGH = {"maximum": "to ", "exclusiveMaximum": "below ", "maxLength": "length to "}
-
-
-@dataclass(frozen=True)
-class Field:
-    """A parameter, or a field of a shape."""
-
-    name: str
-    kind: Markup
-    text: Markup
-    is_required: bool
-    place: str = ""
-    """Where a parameter stands: `path`, `query` or `header`."""
-
-
-@dataclass(frozen=True)
-class Answer:
-    """An answer of an operation by its status."""
-
-    status: str
-    kind: Markup
-    text: Markup
-
-
-@dataclass(frozen=True)
-class Operation:
-    """A route with one of its methods."""
-
-    id: str
-    method: str
-    path: str
-    title: str
-    text: Markup
-    scopes: tuple[str, ...]
-    parameters: list[Field]
-    request: Markup | None
-    answers: list[Answer]
-    problems: tuple[str, ...]
-    """The statuses of its problems."""
-    command: str
-    request_example: Markup | None
-    answer_example: Markup | None
-
-
-@dataclass(frozen=True)
-class Subject:
-    """The operations of one subject."""
-
-    name: str
-    text: str
-    operations: list[Operation]
-
-
-@dataclass(frozen=True)
-class Shape:
-    """A component: what a request or an answer is made of."""
-
-    name: str
-    text: Markup
-    fields: list[Field]
-    kind: Markup
-
-
-@dataclass(frozen=True)
-class Reference:
-    """All of the page."""
-
-    paragraphs: list[Markup]
-    subjects: list[Subject]
-    shapes: list[Shape]
-
-
-def reference_for_people(app: FastAPI) -> Reference:
-    """The page of an app, from its description."""
-    document = app.openapi()
-    operations = list(_operations_by_subject(document))
-    subjects = [
-        Subject(
-            tag["name"],
-            tag["description"],
-            [each for name, each in operations if name == tag["name"]],
-        )
-        for tag in document["tags"]
-    ]
-    shapes = [_shape(name, each) for name, each in document["components"]["schemas"].items()]
-    paragraphs = document["info"]["description"].split("\n\n")
-    return Reference([prose(each) for each in paragraphs], subjects, shapes)
 
 
 def prose(text: str) -> Markup:
@@ -204,40 +136,11 @@ def _array(schema: Json) -> Markup:
     return Markup("array of {}{}").format(count, kind_of(inner))
 
 
-def _operations_by_subject(document: Json) -> Iterator[tuple[str, Operation]]:
-    for path, methods in document["paths"].items():
-        for method, described in methods.items():
-            title, _, text = described["summary"].partition("\n\n")
-            request = described.get("requestBody", {}).get("content", {})
-            good = next(each for status, each in described["responses"].items() if status < "300")
-            operation = Operation(
-                described["operationId"],
-                method.upper(),
-                path,
-                title.replace("\n", " "),
-                prose(text),
-                tuple(described[key] for key in ("x-scope", "x-scope-or") if key in described),
-                [_parameter(each) for each in described.get("parameters", ())],
-                _content(request) if request else None,
-                [
-                    Answer(status, _content(each["content"]), prose(each["description"]))
-                    for status, each in described["responses"].items()
-                    if status < "400"
-                ],
-                tuple(each for each in described["responses"] if "400" <= each < "600"),
-                _command(method.upper(), path, request),
-                _example(request),
-                _example(good["content"]),
-            )
-            yield described["tags"][0], operation
-
-
-def _parameter(described: Json) -> Field:
+def _parameter_kind(described: Json) -> Markup:
     kind = kind_of(described["schema"])
     if described["schema"].get("default") is not None:
         kind += Markup(", default <code>{}</code>").format(described["schema"]["default"])
-    text = prose(described["description"])
-    return Field(described["name"], kind, text, described.get("required", False), described["in"])
+    return kind
 
 
 def _content(content: Json) -> Markup:
@@ -272,13 +175,3 @@ def _command(method: str, path: str, request: Json) -> str:
         file = "request.json" if "json" in kind and "nd" not in kind else "FILE"
         words += [f"-H 'content-type: {kind}'", f"--data-binary @{file}"]
     return " ".join(words)
-
-
-def _shape(name: str, schema: Json) -> Shape:
-    required = schema.get("required", ())
-    fields = [
-        Field(field, kind_of(each), prose(each.get("description", "")), field in required)
-        for field, each in schema.get("properties", {}).items()
-    ]
-    kind = Markup("") if fields else kind_of(schema)
-    return Shape(name, prose(schema.get("description", "")), fields, kind)

@@ -1,11 +1,10 @@
-"""The pages of batches: the list of a run, and one batch with star field, votes and what-if."""
+"""The pages of batches: the list, one with star field, votes and what-if; and of a picture."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
 from fastapi import Path
-from fastapi import Query as InQuery
 from msgspec import structs
 from pydantic import Field
 from starlette.requests import Request
@@ -18,8 +17,8 @@ from service.observations.schema import Key
 from service.storage.models.answers import Answer, Summary
 from service.storage.models.answers import Star as FoundStar
 from service.storage.models.base import Page
-from service.storage.models.charts import ObservedStarPlace, StarField
 from service.storage.queries.results import OutcomeName, StatusName, answer_from_json
+from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.tracks import TrackList
@@ -33,9 +32,14 @@ from service.web.console.options import (
     fields_of,
     toml_of,
 )
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import (
+    HEADERS,
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    console_page,
+)
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
 
@@ -95,10 +99,9 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     field = context.app.results.star_field(id, tried)
     mission = context.app.context.known[answer.spacecraft]
     fields = fields_of(asked, batch_settings(held), mission=mission)
-    layout = context.layout(answer.run)
-    return rendered(
+    return context.rendered(
         "batch.html.jinja",
-        layout,
+        answer.run,
         record=record,
         answer=answer,
         tried=tried,
@@ -144,9 +147,7 @@ def _adoption(before: Answer, after: Answer) -> list[str]:
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
-def latest_batch(
-    name: str, query: Annotated[PageQuery, InQuery()], context: ContextDep
-) -> Response:
+def latest_batch(name: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Redirect to the latest batch of a spacecraft in a run."""
     items = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     address = f"/batches/{items[0].id}" if items else f"/spacecraft/{quote(name)}"
@@ -236,7 +237,7 @@ class BatchesQuery(PageQuery):
 
 
 @console_page("/batches", "Batches", Policy("read", "nothing"), position=30)
-def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep) -> Response:
+def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Response:
     """The batches of a run, newest first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -250,9 +251,9 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
         if len(found) == 1:
             address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
             return RedirectResponse(address, 303)
-        return rendered(
+        return context.rendered(
             "batches.html.jinja",
-            context.layout(query.run),
+            query.run,
             query=query,
             page=Page(found, None),
             spacecraft=context.spacecraft,
@@ -267,12 +268,8 @@ def batches_page(query: Annotated[BatchesQuery, InQuery()], context: ContextDep)
         limit=ROWS,
         cursor=query.cursor,
     )
-    return rendered(
-        "batches.html.jinja",
-        context.layout(query.run),
-        query=query,
-        page=page,
-        spacecraft=context.spacecraft,
+    return context.rendered(
+        "batches.html.jinja", query.run, query=query, page=page, spacecraft=context.spacecraft
     )
 
 
@@ -298,3 +295,28 @@ def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]
 def _listed(context: PageContext, run: str, spacecraft: str | None, text: str) -> list[Summary]:
     page = context.app.results.page(spacecraft=spacecraft, run=run, batch=text, limit=ROWS)
     return [each for each in page.items if context.caller.may_see(each.spacecraft)]
+
+
+# The script shows the drawn picture, which no address of the service has.
+_POLICY = HEADERS["Content-Security-Policy"].replace("img-src 'self'", "img-src 'self' blob:")
+
+
+@console_page("/pictures", "Pictures", Policy("read", "nothing"), position=60)
+def pictures_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
+    """Drop a picture: its attitude, stars and lens, and what to try if there are none."""
+    missions = context.app.missions
+    cameras = [
+        (name, tracker.camera)
+        for name in context.spacecraft
+        if name in missions
+        for tracker in [each for each in missions[name].trackers if each.camera][:1]
+    ]
+    page = context.rendered(
+        "pictures.html.jinja",
+        query.run,
+        cameras=cameras,
+        most_mb=context.app.settings.frame_mb,
+        most_megapixels=context.app.settings.frame_megapixels,
+    )
+    page.headers["Content-Security-Policy"] = _POLICY
+    return page

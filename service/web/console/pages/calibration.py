@@ -3,8 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
@@ -15,9 +13,7 @@ from service.storage.calibrations import Calibration, CalibrationSummary
 from service.storage.recording.unsaved_result import LIVE
 from service.web.console.charts.calibration_history import parameter_histories
 from service.web.console.charts.focal_plane import residual_pictures
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 
 SHOWN = 50
@@ -34,9 +30,7 @@ class CalibrationPageQuery(PageQuery):
     "/spacecraft/{name}/calibration", "Calibration", Policy("read", "path"), section="/missions"
 )
 def calibration_page(
-    name: Annotated[str, Path()],
-    query: Annotated[CalibrationPageQuery, InQuery()],
-    context: ContextDep,
+    name: str, query: FromQuery[CalibrationPageQuery], context: ContextDep
 ) -> Response:
     """Residual maps, parameters and their history, and what was adopted when."""
     app = context.app
@@ -44,9 +38,9 @@ def calibration_page(
     versions = app.calibrations.page(name, SHOWN).items
     shown = _shown(app.calibrations.get, versions, query.version)
     result = shown.result if shown else None
-    return rendered(
+    return context.rendered(
         "calibration.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         in_force=in_force,
         holding=next((each for each in in_force.history if in_force.calibration), None),
@@ -63,7 +57,7 @@ def calibration_page(
         histories=parameter_histories(versions, app.adoptions.file_of(name)),
         largest_degree=LARGEST_DEGREE,
         sample=CALIBRATION_SAMPLE,
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
     )
 
 

@@ -5,22 +5,24 @@ from typing import Annotated
 
 import numpy as np
 from fastapi import Depends
-from fastapi import Query as InQuery
 from pydantic import Field, ValidationError
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.runs import MOST_COMPARED
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.compare import Comparison, RatesOfRuns
 from service.times import DAY_S, parse_utc, utc_now
 from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.options import asked_options, fields_of, settings_of_mission
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.options import (
+    asked_options,
+    faults_of_form,
+    fields_of,
+    settings_of_mission,
+)
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
 SAMPLE = 100
@@ -63,10 +65,7 @@ async def _query(request: Request) -> CompareQuery:
     try:
         return CompareQuery.model_validate(plain)
     except ValidationError as error:
-        raise BadBatch(
-            Fault(".".join(map(str, each["loc"]))[:80], each["msg"], shown_value(each["input"]))
-            for each in error.errors()
-        ) from None
+        raise BadBatch(faults_of_form(error)) from None
 
 
 @console_page("/compare", "Compare", Policy("read", "nothing"), position=40)
@@ -101,9 +100,9 @@ def compare_page(
     run = pair[0] if pair and runs else query.run
     name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
     mission = context.app.context.known.get(name)
-    return rendered(
+    return context.rendered(
         "compare.html.jinja",
-        context.layout(run),
+        run,
         query=query,
         name=name,
         other=pair[1] if pair else None,
@@ -149,15 +148,15 @@ def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
 
 
 @console_page("/runs", "Runs", Policy("read", "nothing"), position=50)
-def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every run, and the replays and reprocessings with their progress.
 
     A token that is bound to spacecraft sees the runs of these, and the replays into these runs.
     """
     bound = context.caller.spacecraft is not None
-    return rendered(
+    return context.rendered(
         "runs.html.jinja",
-        context.layout(query.run),
+        query.run,
         runs=context.app.runs.all(context.caller.spacecraft),
         reprocessings=[] if bound else context.app.runs.reprocessings(),
         replays=context.app.replays.all(context.caller.spacecraft),
@@ -167,10 +166,6 @@ def runs_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Re
 
 
 @console_page("/replays/{id}", "Replay", READ, section="/runs")
-def replay_page(id: str, query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """One replay: how far it is, and every line that was refused."""
-    return rendered(
-        "replay.html.jinja",
-        context.layout(query.run),
-        replay=context.app.replays.get(id),
-    )
+    return context.rendered("replay.html.jinja", query.run, replay=context.app.replays.get(id))

@@ -5,8 +5,6 @@ from itertools import islice
 from typing import Annotated
 from urllib.parse import quote, urlencode
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from pydantic import Field, field_validator
 from starlette.responses import Response
 
@@ -14,15 +12,13 @@ from service.app.products import TABLE_KINDS
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products.attitudes import AttitudeSeries, ProductGrade
 from service.products.formats import attitude_formats, table_formats
-from service.web.console.page_context import ContextDep, PageContext
+from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.spacecraft import (
     RANGES_S,
     ShownPeriod,
     SpacecraftQuery,
     shown_period,
 )
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
 GRADES: dict[ProductGrade, str] = {
@@ -70,13 +66,10 @@ class GradeOfFile:
 
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
-def files_page(
-    name: Annotated[str, Path()], query: Annotated[FilesQuery, InQuery()], context: ContextDep
-) -> Response:
+def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Attitudes of a period as files of every grade and format, and its tables."""
     context.app.context.mission(name)
-    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
-    shown = shown_period(context, name, query, latest)
+    shown = shown_period(context, name, query)
 
     def address(product: str, format: str, **more: str) -> str:
         assert shown is not None
@@ -90,9 +83,9 @@ def files_page(
             asked["largest_gap_s"] = f"{query.gap_s:g}"
         return f"/api/v1/spacecraft/{quote(name)}/{product}?{urlencode(asked | more)}"
 
-    return rendered(
+    return context.rendered(
         "files.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         query=query,
         stretch=shown,

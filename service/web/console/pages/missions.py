@@ -2,10 +2,9 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 from urllib.parse import urlencode
 
-from fastapi import Query as InQuery
 from pydantic import model_validator
 from starlette.responses import Response
 
@@ -17,9 +16,7 @@ from service.observations.schema import Key
 from service.storage.models.spacecraft import MissionThen
 from service.web.api.spacecraft import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.options import SYMBOLS
-from service.web.console.page_context import ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
 MOST_SHOWN = 8
@@ -62,7 +59,7 @@ class MissionsQuery(PageQuery):
 
 
 @console_page("/missions", "Missions", Policy("read", "nothing"), position=70)
-def missions_page(query: Annotated[MissionsQuery, InQuery()], context: ContextDep) -> Response:
+def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Response:
     """Settings with their history: of a few missions all, of many those of the chosen one."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
@@ -90,9 +87,9 @@ def missions_page(query: Annotated[MissionsQuery, InQuery()], context: ContextDe
                 "history": list(reversed(_entries(state.history))),
             }
         )
-    return rendered(
+    return context.rendered(
         "missions.html.jinja",
-        context.layout(query.run),
+        query.run,
         missions=missions,
         known=[context.app.context.known[name] for name in names],
         changed=changed,
@@ -158,15 +155,15 @@ class ZonesQuery(PageQuery):
 
 
 @console_page("/zones", "Zones", READ, position=75)
-def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> Response:
+def zones_page(query: FromQuery[ZonesQuery], context: ContextDep) -> Response:
     """The size of a zone, and cached zones and run catalogs, the most recently used first."""
     name = query.spacecraft or context.filled_spacecraft(query.run)
     size, costs = context.app.zones.size(name, query.run)
     cache = context.app.zones.state()
     epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
-    return rendered(
+    return context.rendered(
         "zones.html.jinja",
-        context.layout(query.run),
+        query.run,
         cache=cache,
         zones=cache.items[::-1][:MOST_ZONES_SHOWN],
         epochs=epochs,
@@ -175,7 +172,7 @@ def zones_page(query: Annotated[ZonesQuery, InQuery()], context: ContextDep) -> 
         size=size,
         costs=costs,
         verdicts=VERDICTS,
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
     )
 
 
@@ -192,14 +189,12 @@ class AdviceForm(AdviceQuery):
 
 
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
-def advice_page(
-    name: str, query: Annotated[AdviceForm, InQuery()], context: ContextDep
-) -> Response:
+def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
     """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
     advice = context.app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S)
-    return rendered(
+    return context.rendered(
         "advice.html.jinja",
-        context.layout(query.run),
+        query.run,
         advice=advice,
         query=query,
         asked=urlencode(

@@ -4,26 +4,24 @@ from dataclasses import dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
 from service.alarms.limits import Severity
 from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
-from service.storage.models.overview import Fleet, FleetCells, FleetRow
-from service.storage.queries.fleet import PERIODS_S, Period
+from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
-from service.web.console.page_context import (
+from service.web.console.page import (
     ContextDep,
+    FromQuery,
     PageContext,
     SortedQuery,
     alarm_counts,
+    console_page,
 )
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
@@ -117,7 +115,7 @@ def _is_long(seconds: float | None) -> bool:
 
 
 @console_page("/", "Overview", Policy("read", "nothing"), position=10)
-def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDep) -> Response:
+def overview_page(query: FromQuery[OverviewQuery], context: ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
     fleet = context.app.spacecraft.fleet(
         context.spacecraft, query.run, query.period, context.caller.spacecraft
@@ -131,9 +129,9 @@ def overview_page(query: Annotated[OverviewQuery, InQuery()], context: ContextDe
         for place in range(len(fleet.rows))
     ]
     lines = _sorted([line for line in every if _is_shown(line, query)], query)
-    return rendered(
+    return context.rendered(
         "overview.html.jinja",
-        context.layout(query.run),
+        query.run,
         query=query,
         fleet=fleet,
         lines=lines,

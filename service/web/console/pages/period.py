@@ -1,30 +1,25 @@
-"""The page of a period's stars and attitudes: sky, residuals, magnitudes, attitude and rate."""
+"""The pages of a period of a spacecraft: stars and attitudes, and the definitive attitude."""
 
 from dataclasses import dataclass
-from typing import Annotated
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from starlette.responses import Response
 
-from service.storage.models.charts import TrackerStarsOfPeriod
+from service.products.formats import attitude_formats
+from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
+from service.storage.queries.period import TrackerStarsOfPeriod
 from service.web.console.charts.all_sky import all_sky_chart
 from service.web.console.charts.attitude import attitude_charts
 from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
+from service.web.console.charts.grades import grade_charts, innovation_charts
 from service.web.console.charts.histogram import (
     Histogram,
     MagnitudeChart,
     magnitude_chart,
     residual_histogram,
 )
-from service.web.console.page_context import ContextDep
-from service.web.console.pages.spacecraft import (
-    RANGES_S,
-    SpacecraftQuery,
-    shown_period,
-)
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
+from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
 MOST_LINKED = 600
@@ -45,16 +40,13 @@ class TrackerCharts:
 @console_page(
     "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
 )
-def period_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
     mission = context.app.context.mission(name)
     retired = context.app.context.retired.trackers.get(name, ())
     if query.tracker is not None and query.tracker not in retired:
         mission.tracker(query.tracker, "tracker")
-    latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
-    shown = shown_period(context, name, query, latest)
+    shown = shown_period(context, name, query)
     found, tracks, trackers = None, None, list[TrackerStarsOfPeriod]()
     if shown is not None:
         found = context.app.results.period(name, run=query.run, start=shown.start, end=shown.end)
@@ -64,9 +56,9 @@ def period_page(
             )
         trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
     is_any = found is not None and found.read > 0
-    return rendered(
+    return context.rendered(
         "period.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         tracker=query.tracker,
         tracker_names=[*(each.name for each in mission.trackers), *retired],
@@ -90,4 +82,54 @@ def _tracker_charts(tracker: TrackerStarsOfPeriod) -> TrackerCharts:
         focal_plane=focal_plane_map(tracker),
         histogram=residual_histogram(tracker),
         magnitudes=magnitude_chart(tracker),
+    )
+
+
+JOBS = 8
+"""The latest that the page lists."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The drawings of a period."""
+
+    found: GradesOfPeriod
+    charts: list[GradeChart]
+    innovations: list[GradeChart]
+    strips: list[Strip]
+    ticks: list[tuple[float, str]]
+    """The ticks of the time axis: percent from the left, and their text."""
+
+
+@console_page(
+    "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
+)
+def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
+    """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
+    mission = context.app.context.mission(name)
+    shown = shown_period(context, name, query)
+    drawn = None
+    if shown is not None:
+        found = context.app.grades.of_period(name, query.run, shown.start, shown.end)
+        if found is not None:
+            axis = TimeAxis(shown.start, shown.end)
+            met = found.innovations
+            drawn = Drawn(
+                found,
+                grade_charts(found, axis, mission.trackers[0]),
+                [] if met is None else innovation_charts(met, axis),
+                strips(found, axis),
+                axis.ticks(),
+            )
+    return context.rendered(
+        "grades.html.jinja",
+        query.run,
+        name=name,
+        has_gyro=mission.gyro is not None,
+        stretch=shown,
+        ranges=list(RANGES_S),
+        drawn=drawn,
+        most_blocks=MOST_BLOCKS,
+        attitude_formats=attitude_formats(),
+        jobs=context.app.definitive.all(name)[:JOBS],
     )

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
-from fastapi import Path
-from fastapi import Query as InQuery
 from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
@@ -21,9 +19,7 @@ from service.storage.models.base import Page
 from service.storage.models.spacecraft import MissionThen, Ranking
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
-from service.web.console.page_context import ContextDep, PageContext, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import End, Start
 
@@ -130,9 +126,7 @@ class ShownPeriod:
 
 
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
-def spacecraft_page(
-    name: Annotated[str, Path()], query: Annotated[SpacecraftQuery, InQuery()], context: ContextDep
-) -> Response:
+def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
     state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
@@ -141,9 +135,9 @@ def spacecraft_page(
     ranking = _worst(context, name, query, stretch)
     notes = _annotations(context, name, stretch)
     ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
-    return rendered(
+    return context.rendered(
         "spacecraft.html.jinja",
-        context.layout(query.run),
+        query.run,
         name=name,
         description=state.description,
         retired=state.retired,
@@ -171,7 +165,7 @@ def spacecraft_page(
         changes=_changes(context, name, state.history, query, stretch),
         annotations=sorted(notes.items, key=lambda each: recorded_utc(each.start).tai_ns),
         more_annotations=notes.next_cursor is not None,
-        may_write="operate" in context.caller.scopes,
+        may_write=context.may_operate,
         may_write_of_all=context.caller.spacecraft is None,
         history=lambda **more: (
             stretch
@@ -181,9 +175,14 @@ def spacecraft_page(
 
 
 def shown_period(
-    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary]
+    context: PageContext, name: str, query: SpacecraftQuery, latest: list[Summary] | None = None
 ) -> ShownPeriod | None:
-    """The period that the address names; None without any batch."""
+    """The period that the address names; None without any batch.
+
+    It ends with the first of the `latest` batches, which are read where they are not known yet.
+    """
+    if latest is None:
+        latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     if not latest:
         return None
     # The latest batch belongs to the stretch, whose end does not.
@@ -321,11 +320,7 @@ CHARTS: Sequence[tuple[str, str, tuple[str, ...]]] = (
         "Batches without an attitude, or with a suspect one",
         ("no_attitude_share", "suspect_share"),
     ),
-    (
-        "residual",
-        "Residual rms and predicted rms",
-        ("residual_rms_arcsec", "predicted_rms_arcsec"),
-    ),
+    ("residual", "Residual rms and predicted rms", ("residual_rms_arcsec", "predicted_rms_arcsec")),
     ("magnitude", "Magnitude offset, observed minus catalog", ("magnitude_offset_mag",)),
     ("scale", "Scale offset, observed over catalog", ("scale_offset_ppm",)),
     ("alignment", "Angle between trackers, observed minus catalog", ("alignment_offset_arcsec",)),

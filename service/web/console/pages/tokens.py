@@ -2,16 +2,20 @@
 
 from typing import Annotated
 
-from fastapi import Query as InQuery
 from pydantic import Field
 from starlette.responses import Response
 
 from service.access.audit import list_entries
 from service.access.tokens import MAX_DAYS, SCOPES
 from service.storage.recording.events import EVENT_KINDS
-from service.web.console.page_context import EMPTY_LAYOUT, ContextDep, PageQuery
-from service.web.console.registry import console_page
-from service.web.console.rendering import rendered
+from service.web.console.page import (
+    EMPTY_LAYOUT,
+    ContextDep,
+    FromQuery,
+    PageQuery,
+    console_page,
+    rendered,
+)
 from service.web.requests.access import OPEN, OPERATE
 from service.web.requests.query_parameters import Cursor, Query
 
@@ -25,19 +29,19 @@ class AuditPageQuery(PageQuery):
 
 
 @console_page("/audit", "Audit list", OPERATE, section="/about")
-def audit_page(query: Annotated[AuditPageQuery, InQuery()], context: ContextDep) -> Response:
+def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
     with context.app.context.reading() as connection:
         page = list_entries(connection, ROWS, query.cursor)
-    return rendered("audit.html.jinja", context.layout(query.run), page=page)
+    return context.rendered("audit.html.jinja", query.run, page=page)
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")
-def tokens_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def tokens_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every token without its secret."""
-    return rendered(
+    return context.rendered(
         "tokens.html.jinja",
-        context.layout(query.run),
+        query.run,
         tokens=context.app.tokens.all(),
         scopes=SCOPES,
         max_days=MAX_DAYS,
@@ -57,7 +61,7 @@ class SignInQuery(Query):
 
 
 @console_page("/sign-in", "Sign in", OPEN)
-def sign_in_page(query: Annotated[SignInQuery, InQuery()]) -> Response:
+def sign_in_page(query: FromQuery[SignInQuery]) -> Response:
     """Ask for a token."""
     return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
 
@@ -67,7 +71,7 @@ SEVERITIES = ("watch", "warning", "critical")
 
 
 @console_page("/webhooks", "Webhooks", OPERATE, section="/about")
-def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -> Response:
+def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """Every webhook with what waits for it."""
     webhooks = context.app.webhooks.all()
     waiting = {
@@ -76,9 +80,9 @@ def webhooks_page(query: Annotated[PageQuery, InQuery()], context: ContextDep) -
         ).items
         for each in webhooks
     }
-    return rendered(
+    return context.rendered(
         "webhooks.html.jinja",
-        context.layout(query.run),
+        query.run,
         webhooks=webhooks,
         deliveries=waiting,
         most=SHOWN_DELIVERIES,

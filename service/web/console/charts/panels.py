@@ -1,4 +1,4 @@
-"""Panels of one axis: traces of several grades, a band, marks, on a linear or logarithmic scale."""
+"""Panels of one axis: traces, a band, marks, on a linear or logarithmic scale; strips."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -11,14 +11,15 @@ import numpy.typing as npt
 from service.filtering.result import Integers
 from service.filtering.state import Status
 from service.storage.grades.period import GradesOfPeriod
-from service.times import Utc
+from service.times import DAY_S, Utc
 from service.vectors import Vector
-from service.web.console.charts.attitude import HEIGHT, PAD, WIDTH, band_path, line_path
 
 Mask = npt.NDArray[np.bool_]
+WIDTH, HEIGHT = 1280, 176
+"""Units of a panel, which is drawn half as large."""
+PAD = 10
 FINE_HEIGHT = 10 * HEIGHT
 """The height of panels whose values are read to a thousandth of their range."""
-DAY_S = 86_400
 TIME_STEPS_S = (
     *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
     *(days * DAY_S for days in (1, 2, 7, 14, 28, 56, 91, 182)),
@@ -127,6 +128,11 @@ class Scale:
         first = math.ceil(low / step)
         return [k * step for k in range(first, math.floor(high / step) + 1)]
 
+    @property
+    def range_with_room(self) -> float:
+        """The range of values from the upper to the lower edge of a linear scale."""
+        return self.high - self.low + 2.0 * (ROOM * (self.high - self.low) or 1.0)
+
     def y(self, value: Vector) -> Integers:
         """Units from the top (n,); values beyond an edge are at it."""
         low, high = self.low, self.high
@@ -161,7 +167,27 @@ class Values:
         )
 
 
-def parts_of(joins: Mask) -> list[npt.NDArray[np.int64]]:
+def line_path(x: Integers, y: Integers) -> str:
+    """A path in whole units, each step from the point before."""
+    steps = zip(np.diff(x).tolist(), np.diff(y).tolist(), strict=True)
+    return f"M{x[0]} {y[0]}" + "".join(f"l{a} {b}" for a, b in steps)
+
+
+def band_path(x: Integers, upper: Integers, lower: Integers, parts: Sequence[Integers]) -> str:
+    """The area between two lines; a bar where a part has one point."""
+    text = []
+    for part in parts:
+        if len(part) == 1:
+            k = int(part[0])
+            text.append(f"M{x[k] - 1} {upper[k]}h2V{lower[k]}h-2z")
+            continue
+        forward = line_path(x[part], upper[part])
+        back = line_path(x[part][::-1], lower[part][::-1])
+        text.append(f"{forward}L{back[1:]}z")
+    return "".join(text)
+
+
+def parts_of(joins: Mask) -> list[Integers]:
     """The places of each joined part."""
     if not len(joins):
         return []
@@ -258,10 +284,7 @@ def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
 
 
 def _bars(
-    kinds: Sequence[str],
-    left: npt.NDArray[np.int64],
-    right: npt.NDArray[np.int64],
-    tops: dict[str, int],
+    kinds: Sequence[str], left: Integers, right: Integers, tops: dict[str, int]
 ) -> dict[str, str]:
     """A path for each kind; bars of a kind that touch are one."""
     paths = dict.fromkeys(tops, "")

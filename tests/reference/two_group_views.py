@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from service import vectors
 from service.missions.mission import Band, Mission
 from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import pointed, random_axis, tilted, turned_by
@@ -18,14 +19,6 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_direction
 from service.sky.model import SkyModel
 from service.times import parse_utc
-from service.vectors import (
-    ARCSEC_PER_RADIAN,
-    Matrix,
-    Vector,
-    coordinate_rotation,
-    quaternion_from_matrix,
-    read_only,
-)
 
 Rows = npt.NDArray[np.intp]
 
@@ -40,9 +33,9 @@ CAP_PRIOR_DEG, BAND_PRIOR_DEG = 3.0, 0.1
 class Group:
     """Stars of one attitude: directions in tracker axes, magnitudes, rows of the run catalog."""
 
-    attitude: Matrix
-    direction: Vector
-    magnitude_mag: Vector
+    attitude: vectors.Matrix
+    direction: vectors.Vector
+    magnitude_mag: vectors.Vector
     star: Rows
 
     def __len__(self) -> int:
@@ -62,7 +55,7 @@ class Views:
         """The run catalog that batches are identified in."""
         return self.sky.run_catalog(self.mission, MOMENT)
 
-    def attitude(self) -> Matrix:
+    def attitude(self) -> vectors.Matrix:
         """Anywhere; a mission with a band keeps its pole near the Sun."""
         roll = self.rng.uniform(0.0, math.tau)
         if isinstance(self.mission.zone, Band):
@@ -72,32 +65,32 @@ class Views:
             )
         return pointed(self.mission.axis_body, random_axis(self.rng), roll)
 
-    def prior(self, attitude: Matrix) -> QuaternionPrior:
+    def prior(self, attitude: vectors.Matrix) -> QuaternionPrior:
         """An a priori attitude that is off as the mission's is."""
         if isinstance(self.mission.zone, Band):
             roll = self.rng.uniform(0.0, math.tau)
             presumed = pointed(self.mission.axis_body, sun_direction(MOMENT, None), roll)
         else:
             psi, theta, phi = self.rng.uniform(-CAP_PRIOR_DEG, CAP_PRIOR_DEG, 3)
-            error = coordinate_rotation(0, psi) @ coordinate_rotation(1, theta)
-            presumed = (error @ coordinate_rotation(2, phi)).T @ attitude
-        return QuaternionPrior(read_only(quaternion_from_matrix(presumed)))
+            error = vectors.coordinate_rotation(0, psi) @ vectors.coordinate_rotation(1, theta)
+            presumed = (error @ vectors.coordinate_rotation(2, phi)).T @ attitude
+        return QuaternionPrior(vectors.read_only(vectors.quaternion_from_matrix(presumed)))
 
-    def visible(self, attitude: Matrix) -> Rows:
+    def visible(self, attitude: vectors.Matrix) -> Rows:
         """The stars in the field of view, in random order."""
         tracker, catalog = self.mission.trackers[0], self.run_catalog
         boresight = attitude.T @ tracker.body_from_tracker[:, 2]
         least = math.cos(math.radians(tracker.field_of_view_radius_deg))
         return self.rng.permutation(np.flatnonzero(catalog.direction @ boresight >= least))
 
-    def group(self, attitude: Matrix, star: Rows) -> Group:
+    def group(self, attitude: vectors.Matrix, star: Rows) -> Group:
         """These stars as they are measured at an attitude."""
         tracker, catalog = self.mission.trackers[0], self.run_catalog
         exact = catalog.direction[star] @ attitude.T @ tracker.body_from_tracker
         noise_mag = self.rng.normal(0.0, tracker.magnitude_sigma_mag, len(star))
         return Group(
             attitude,
-            shaken(exact, tracker.sigma_arcsec / ARCSEC_PER_RADIAN, self.rng),
+            shaken(exact, tracker.sigma_arcsec / vectors.ARCSEC_PER_RADIAN, self.rng),
             catalog.magnitude_mag[star] + noise_mag,
             star,
         )
@@ -110,7 +103,9 @@ class Views:
             if len(star) >= stars:
                 return self.group(attitude, star[:stars])
 
-    def shifted(self, attitude: Matrix, least_deg: float, most_deg: float) -> Matrix:
+    def shifted(
+        self, attitude: vectors.Matrix, least_deg: float, most_deg: float
+    ) -> vectors.Matrix:
         """The attitude after a turn across the boresight."""
         boresight = self.mission.trackers[0].body_from_tracker[:, 2]
         axis = np.cross(boresight, random_axis(self.rng))
@@ -140,7 +135,9 @@ class Views:
     def mirrored(self, stars: int) -> Group:
         """So many stars as a tracker with one axis of the wrong sign measures them."""
         group = self.field(stars)
-        return replace(group, direction=read_only(group.direction * np.array([-1.0, 1.0, 1.0])))
+        return replace(
+            group, direction=vectors.read_only(group.direction * np.array([-1.0, 1.0, 1.0]))
+        )
 
     def random_points(self, points: int) -> Group:
         """Points that are no stars, as bright as stars of the catalog."""
@@ -163,11 +160,11 @@ class Views:
         n = len(order)
         stars = TrackerStars(
             self.mission.trackers[0].name,
-            read_only(direction[order]),
-            read_only(np.full((n, 2), np.nan)),
-            read_only(magnitude[order]),
-            read_only(np.zeros(n)),
-            read_only(np.full(n, np.nan)),
+            vectors.read_only(direction[order]),
+            vectors.read_only(np.full((n, 2), np.nan)),
+            vectors.read_only(magnitude[order]),
+            vectors.read_only(np.zeros(n)),
+            vectors.read_only(np.full(n, np.nan)),
         )
         batch = ObservationBatch(
             spacecraft=self.mission.name,
@@ -175,7 +172,7 @@ class Views:
             run="benchmark",
             time=MOMENT,
             a_priori=prior,
-            body_rates_deg_per_s=read_only(np.zeros(3)),
+            body_rates_deg_per_s=vectors.read_only(np.zeros(3)),
             velocity_km_per_s=None,
             aberration="ignore",
             observations=(stars,),

@@ -1,41 +1,31 @@
-"""Spacecraft: state, attitudes and trends."""
+"""Spacecraft: state, attitudes, trends and gyro blocks."""
 
 from collections.abc import Sequence
 
-from ..base import Page
-from ..encoding import Time, path_of
-from ..models import (
-    AttitudeRow,
-    DefinitiveJob,
-    History,
-    Innovation,
-    LiveAttitude,
-    Ranking,
-    Rates,
-    SpacecraftRow,
-    SpacecraftState,
-    TrackList,
-)
-from .connection import Connection
-from .pages import Items
+from . import models
+from .calls import Call, Listing, get, get_items, paged_list, post, single_request
+from .encoding import Batch, Time, path_of
+from .retrying import Repeat
 
 
-class Spacecraft(Connection):
+class Spacecraft:
     """The part of the client that is about spacecraft.  In each period `end` is excluded."""
 
-    def fleet(self, *, run: str = "live") -> list[SpacecraftRow]:
+    @single_request
+    def fleet(self, *, run: str = "live") -> Call[list[models.SpacecraftRow]]:
         """Every spacecraft with its state in a run.
 
         >>> [each.name for each in client.fleet() if each.attitude]
         ['XTE']
         """
-        page = self.get(Page[SpacecraftRow], path_of("spacecraft"), {"run": run})
-        return page.items
+        return get_items(models.SpacecraftRow, path_of("spacecraft"), {"run": run})
 
-    def spacecraft(self, name: str, *, run: str = "live") -> SpacecraftState:
+    @single_request
+    def spacecraft(self, name: str, *, run: str = "live") -> Call[models.SpacecraftState]:
         """One spacecraft: state in a run, mission settings and their history."""
-        return self.get(SpacecraftState, path_of("spacecraft", name), {"run": run})
+        return get(models.SpacecraftState, path_of("spacecraft", name), {"run": run})
 
+    @paged_list
     def attitudes(
         self,
         spacecraft: str,
@@ -43,7 +33,7 @@ class Spacecraft(Connection):
         run: str = "live",
         start: Time | None = None,
         end: Time | None = None,
-    ) -> Items[AttitudeRow]:
+    ) -> Listing[models.AttitudeRow]:
         """The attitudes of a run, oldest first by batch time, suspect ones included.
 
         >>> [round(row.quaternion[3], 4) for row in client.attitudes("XTE")]
@@ -53,12 +43,14 @@ class Spacecraft(Connection):
         1
         """
         query = {"run": run, "start": start, "end": end}
-        return Items(self, AttitudeRow, path_of("spacecraft", spacecraft, "attitudes"), query)
+        return Listing(models.AttitudeRow, path_of("spacecraft", spacecraft, "attitudes"), query)
 
-    def live_attitude(self, spacecraft: str) -> LiveAttitude:
+    @single_request
+    def live_attitude(self, spacecraft: str) -> Call[models.LiveAttitude]:
         """The filtered attitude at the last epoch, of a mission with a live filter."""
-        return self.get(LiveAttitude, path_of("spacecraft", spacecraft, "attitude", "latest"))
+        return get(models.LiveAttitude, path_of("spacecraft", spacecraft, "attitude", "latest"))
 
+    @single_request
     def make_definitive_attitude(
         self,
         spacecraft: str,
@@ -67,17 +59,19 @@ class Spacecraft(Connection):
         start: Time | None = None,
         end: Time | None = None,
         who: str | None = None,
-    ) -> DefinitiveJob:
+    ) -> Call[models.DefinitiveJob]:
         """Let the service filter and smooth the days of a period; the job goes on beside it."""
         asked = {"run": run, "start": start, "end": end, "who": who}
         path = path_of("spacecraft", spacecraft, "definitive-attitude")
-        return self.post(DefinitiveJob, path, asked)
+        return post(models.DefinitiveJob, path, asked)
 
-    def definitive_attitude(self, spacecraft: str, id: str) -> DefinitiveJob:
+    @single_request
+    def definitive_attitude(self, spacecraft: str, id: str) -> Call[models.DefinitiveJob]:
         """How far a job is that makes a definitive attitude."""
         path = path_of("spacecraft", spacecraft, "definitive-attitude", id)
-        return self.get(DefinitiveJob, path)
+        return get(models.DefinitiveJob, path)
 
+    @paged_list
     def innovations(
         self,
         spacecraft: str,
@@ -85,7 +79,7 @@ class Spacecraft(Connection):
         run: str = "live",
         start: Time | None = None,
         end: Time | None = None,
-    ) -> Items[Innovation]:
+    ) -> Listing[models.Innovation]:
         """How the attitudes of a period met the filter, the earliest first.
 
         There are some of the days that `acquire smooth` recorded.
@@ -94,8 +88,9 @@ class Spacecraft(Connection):
         []
         """
         query = {"run": run, "start": start, "end": end}
-        return Items(self, Innovation, path_of("spacecraft", spacecraft, "innovations"), query)
+        return Listing(models.Innovation, path_of("spacecraft", spacecraft, "innovations"), query)
 
+    @single_request
     def tracks(
         self,
         spacecraft: str,
@@ -103,7 +98,7 @@ class Spacecraft(Connection):
         run: str = "live",
         start: Time | None = None,
         end: Time | None = None,
-    ) -> TrackList:
+    ) -> Call[models.TrackList]:
         """Tracks of points that no catalog star explains: objects, planets, hot pixels.
 
         The period has at most 2,000 batches.
@@ -112,8 +107,9 @@ class Spacecraft(Connection):
         []
         """
         query = {"run": run, "start": start, "end": end}
-        return self.get(TrackList, path_of("spacecraft", spacecraft, "tracks"), query)
+        return get(models.TrackList, path_of("spacecraft", spacecraft, "tracks"), query)
 
+    @single_request
     def tracks_tdm(
         self,
         spacecraft: str,
@@ -121,12 +117,13 @@ class Spacecraft(Connection):
         run: str = "live",
         start: Time | None = None,
         end: Time | None = None,
-    ) -> str:
+    ) -> Call[str]:
         """The moving tracks of a period as a CCSDS TDM; raises `NotFound` if there are none."""
         query = {"run": run, "start": start, "end": end, "format": "tdm"}
         path = path_of("spacecraft", spacecraft, "tracks")
-        return (self.request("GET", path, query=query)).text
+        return Call(lambda response: response.text, "GET", path, query)
 
+    @single_request
     def history(
         self,
         spacecraft: str,
@@ -138,7 +135,7 @@ class Spacecraft(Connection):
         tracker: str | None = None,
         strategy: str | None = None,
         size: int | None = None,
-    ) -> History:
+    ) -> Call[models.History]:
         """Quantities over a period, thinned out to at most `size` points; default: all, 500.
 
         `strategy` is `minmax` for buckets, `latest` for the newest batches one by one.
@@ -156,8 +153,9 @@ class Spacecraft(Connection):
             "strategy": strategy,
             "size": size,
         }
-        return self.get(History, path_of("spacecraft", spacecraft, "history"), query)
+        return get(models.History, path_of("spacecraft", spacecraft, "history"), query)
 
+    @single_request
     def rates(
         self,
         spacecraft: str,
@@ -166,16 +164,16 @@ class Spacecraft(Connection):
         start: Time | None = None,
         end: Time | None = None,
         bucket: str = "hour",
-    ) -> list[Rates]:
+    ) -> Call[list[models.Rates]]:
         """Stars by outcome for each hour or day with batches, oldest first.
 
         >>> [(each.start, each.observed) for each in client.rates("XTE")]
         [('1996-01-10T12:00:00.000Z', 4)]
         """
         query = {"run": run, "start": start, "end": end, "bucket": bucket}
-        page = self.get(Page[Rates], path_of("spacecraft", spacecraft, "rates"), query)
-        return page.items
+        return get_items(models.Rates, path_of("spacecraft", spacecraft, "rates"), query)
 
+    @single_request
     def worst(
         self,
         spacecraft: str,
@@ -186,7 +184,7 @@ class Spacecraft(Connection):
         end: Time | None = None,
         tracker: str | None = None,
         limit: int = 20,
-    ) -> Ranking:
+    ) -> Call[models.Ranking]:
         """The batches with the worst values of a quantity in a period, worst first."""
         query = {
             "by": by,
@@ -196,4 +194,54 @@ class Spacecraft(Connection):
             "tracker": tracker,
             "limit": limit,
         }
-        return self.get(Ranking, path_of("spacecraft", spacecraft, "worst"), query)
+        return get(models.Ranking, path_of("spacecraft", spacecraft, "worst"), query)
+
+
+class Gyro:
+    """The part of the client that is about gyro blocks."""
+
+    @single_request
+    def submit_gyro(self, spacecraft: str, block: Batch) -> Call[models.GyroBlock]:
+        """Record a block of up to 10,000 samples of rates in rad/s.
+
+        Spacecraft, run and block identify it: to send it again is harmless, and gives the
+        recorded block.  Raises `BadInput` naming each field, `Conflict` where another body has
+        the name, or another block one of the times.
+
+        >>> sorted(block)
+        ['block', 'rates_rad_per_s', 'start', 'step_s']
+        >>> recorded = client.submit_gyro("XTE", block)
+        >>> recorded.end, recorded.samples
+        ('1996-01-10T12:00:00.500Z', 2)
+        """
+        path = path_of("spacecraft", spacecraft, "gyro")
+        return post(models.GyroBlock, path, block, Repeat.ALWAYS)
+
+    @paged_list
+    def gyro(
+        self,
+        spacecraft: str,
+        *,
+        run: str = "live",
+        start: Time | None = None,
+        end: Time | None = None,
+    ) -> Listing[models.GyroBlock]:
+        """The blocks that touch a period, the earliest first; `end` is excluded.
+
+        >>> recorded = client.submit_gyro("XTE", block)
+        >>> [found.block for found in client.gyro("XTE")]
+        ['g1']
+        """
+        query = {"run": run, "start": start, "end": end}
+        return Listing(models.GyroBlock, path_of("spacecraft", spacecraft, "gyro"), query)
+
+    @single_request
+    def gyro_samples(self, spacecraft: str, id: str) -> Call[models.GyroSamples]:
+        """One block with its samples; raises `NotFound`.
+
+        >>> recorded = client.submit_gyro("XTE", block)
+        >>> samples = client.gyro_samples("XTE", recorded.id)
+        >>> samples.times_s, samples.rates_rad_per_s[1]
+        ([0.0, 0.5], [0.0011, 0.0, 1e-05])
+        """
+        return get(models.GyroSamples, path_of("spacecraft", spacecraft, "gyro", id))

@@ -18,13 +18,7 @@ import numpy as np
 
 from service.attitude.rotations import matrices
 from service.errors import AcquisitionError, BadConfiguration
-from service.products.attitudes import (
-    AttitudeBlock,
-    AttitudeSeries,
-    Integers,
-    SeriesInfo,
-    stretches,
-)
+from service.products import attitudes
 from service.products.spool import folder, pieces
 from service.vectors import Vector
 
@@ -33,7 +27,7 @@ CHILD_S = 600.0
 _CHILD = Path(__file__).with_name("ck_child.py")
 
 
-def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
+def write_ck(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
     """Write a zip file with the C-kernel, clock, frame, leap seconds and their list."""
     about = series.about
     name = body_name(about).lower()
@@ -59,7 +53,7 @@ def write_ck(series: AttitudeSeries) -> Iterator[bytes]:
             yield from pieces(whole)
 
 
-def _clock(about: SeriesInfo) -> str:
+def _clock(about: attitudes.SeriesInfo) -> str:
     """The kernel of the spacecraft's clock: its own, or the one that we define."""
     if about.sclk_kernel is None:
         return clock_kernel(about)
@@ -69,12 +63,12 @@ def _clock(about: SeriesInfo) -> str:
         raise BadConfiguration(f"{about.sclk_kernel}: cannot be read: {error.strerror}") from None
 
 
-def _keep_records(series: AttitudeSeries, place: Path) -> None:
+def _keep_records(series: attitudes.AttitudeSeries, place: Path) -> None:
     """Write for the child what the kernel is made of: the records, and where stretches begin."""
     count = 0
     begins: list[tuple[int, int]] = []
     with (place / "records").open("wb") as file:
-        for stretch in stretches(series):
+        for stretch in attitudes.stretches(series):
             for number, part in enumerate(stretch):
                 if number == 0:
                     begins.append((count, int(not np.isnan(part.rate_deg_per_s[0, 0]))))
@@ -83,7 +77,7 @@ def _keep_records(series: AttitudeSeries, place: Path) -> None:
     np.array(begins, dtype=np.int64).tofile(place / "begins")
 
 
-def _records(part: AttitudeBlock) -> Vector:
+def _records(part: attitudes.AttitudeBlock) -> Vector:
     """Rows of encoded clock (of ours), SPICE's quaternion, and angular velocity in J2000, rad/s."""
     ticks = clock_ticks(part.time_ns)[:, None]
     vector, scalar = part.quaternion[:, :3], part.quaternion[:, 3:]
@@ -110,27 +104,27 @@ _TT_LESS_TAI_S = 32.184
 _MONTHS = {1: "JAN", 7: "JUL"}
 
 
-def clock_ticks(tai_ns: Integers) -> Vector:
+def clock_ticks(tai_ns: attitudes.Integers) -> Vector:
     """Encoded clock of moments given as `Utc.tai_ns`; exact for whole microseconds."""
     return (tai_ns - _CLOCK_ZERO_S * 10**9) / 1e3
 
 
-def body_name(about: SeriesInfo) -> str:
+def body_name(about: attitudes.SeriesInfo) -> str:
     """The name of the spacecraft in kernels: capitals, digits and underscores."""
     return re.sub("[^A-Z0-9]", "_", about.spacecraft.upper())[:20]
 
 
-def frame_name(about: SeriesInfo) -> str:
+def frame_name(about: attitudes.SeriesInfo) -> str:
     """The name of the frame of its body."""
     return f"{body_name(about)}_BODY"
 
 
-def instrument_id(about: SeriesInfo) -> int:
+def instrument_id(about: attitudes.SeriesInfo) -> int:
     """The id of the structure that the C-kernel orients, and of its frame."""
     return about.naif_id * 1000
 
 
-def clock_kernel(about: SeriesInfo) -> str:
+def clock_kernel(about: attitudes.SeriesInfo) -> str:
     """SCLK: the clock of the spacecraft."""
     id = -about.naif_id
     zero = f"{_CLOCK_ZERO_S + _TT_LESS_TAI_S:.3f}"
@@ -150,7 +144,7 @@ def clock_kernel(about: SeriesInfo) -> str:
     )
 
 
-def frame_kernel(about: SeriesInfo) -> str:
+def frame_kernel(about: attitudes.SeriesInfo) -> str:
     """FK: the frame of the body, whose orientation the C-kernel gives."""
     id, name = instrument_id(about), frame_name(about)
     return _kernel(

@@ -1,1 +1,0 @@
-"""SPICE kernels: attitudes as a C-kernel, with the kernels that it takes to use it."""

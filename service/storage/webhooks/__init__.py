@@ -1,1 +1,0 @@
-"""Webhooks in the records: what is registered, what waits, and who delivers."""

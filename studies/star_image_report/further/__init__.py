@@ -1,1 +1,0 @@
-"""What the report names and does not work out: each worked out, and held against another way."""

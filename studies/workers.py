@@ -1,0 +1,27 @@
+"""The processes that work on the tasks of a study, on all cores."""
+
+import multiprocessing
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from typing import Any
+
+from service.acquire.kernel_build import exit_after_parent
+
+
+def number_of(processes: int | None) -> int:
+    """The number of workers: one a core where it is None."""
+    return processes or len(os.sched_getaffinity(0))
+
+
+@contextmanager
+def mapping(processes: int | None) -> Iterator[Callable[..., Iterator[Any]]]:
+    """A `map` whose calls run in worker processes; with one worker they run in this process."""
+    count = number_of(processes)
+    if count == 1:
+        yield map
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(count, context, exit_after_parent) as workers:
+        yield workers.map
