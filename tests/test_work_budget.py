@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.acquire.warnings import WORK_BOUND_HIT
+from service.acquire.result import WORK_BOUND_HIT
 from service.identify.budget import MAX_WORK, WorkBudget
 from service.identify.identification import Outcome
 from service.identify.sighting import Sighting

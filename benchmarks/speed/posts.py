@@ -363,7 +363,7 @@ def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
     app = open_app(Settings(database=f"sqlite:///{database}"))
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
-        unsaved_results = [app.submissions.ingest.solver.solve(each) for each in made]
+        unsaved_results = [app.submissions.solver.solve(each) for each in made]
         app.store.writer.change(lambda connection: None).result()
         spent = 0.0
         for first in range(0, len(lines), CHUNK):

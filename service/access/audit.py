@@ -37,21 +37,6 @@ class Entry:
         connection.execute(insert(audit).values(self.row()))
 
 
-def add_entry(
-    connection: Connection,
-    *,
-    id: str,
-    moment: str,
-    who: str,
-    action: str,
-    about: str,
-    body: str | None = None,
-    status: int | None = None,
-) -> None:
-    """Add an entry: who did what to what, with what body, and the status of the answer."""
-    Entry(id, moment, who, action, about, body, status).add_to(connection)
-
-
 def _kept(body: str | None) -> str | None:
     if body is None or len(body) <= MAX_BODY_KEPT:
         return body

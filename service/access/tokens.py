@@ -1,13 +1,17 @@
-"""Access tokens: create, list, revoke, and look up by the secret that a client sends.
+"""Access tokens: create, list, revoke; and callers by token or session, with their rates.
 
 A token is 32 random bytes behind `acq_`.  The database keeps its SHA-256 alone:
 nothing can be guessed of that many random bits, so no slower digest is needed.
+Until the first token is made, access on a loopback address is open.  Callers are
+cached for a second, so a revocation takes effect in every process within a second.
 """
 
 import hashlib
 import json
 import re
 import secrets
+import threading
+import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -16,19 +20,33 @@ from typing import Any, Protocol, get_args
 from sqlalchemy import Connection, delete, insert, select, update
 
 from service.access.audit import Entry
-from service.errors import BadInput, Conflict, Fault, Forbidden, NotFound, shown_value
+from service.errors import (
+    BadInput,
+    Busy,
+    Conflict,
+    Fault,
+    Forbidden,
+    NotFound,
+    RateLimited,
+    Unauthenticated,
+    shown_value,
+)
 from service.missions.mission import Mission, mission_named
 from service.storage.models.access import NewToken, Scope, Token, TokenState
-from service.storage.recording.identity import OwnKey
 from service.storage.recording.ids import Ulids
 from service.storage.sql.access_tables import access_sessions, access_tokens
-from service.times import DAY_S, shifted, utc_now
+from service.times import DAY_S, Utc, shifted, utc_now
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 PREFIX = "acq_"
 SESSION_H = 12
 """How long a browser stays signed in, in hours."""
+MAX_DAYS = 3660
+DEFAULT_DAYS = 365
+KNOWN_FOR_S = 1.0
+MAX_KNOWN = 10_000
+LEAST_BURST = 5.0
 
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._@+-]{0,63}", re.ASCII)
 
@@ -52,16 +70,13 @@ class Caller:
 
     def require(self, spacecraft: str) -> None:
         """Raise `Forbidden` unless the caller may see a spacecraft."""
-        if not self.may_see(spacecraft):
-            theirs = ", ".join(sorted(self.spacecraft or ()))
+        if self.spacecraft is not None and spacecraft not in self.spacecraft:
+            theirs = ", ".join(sorted(self.spacecraft))
             raise Forbidden(f"{self.name} is bound to {theirs}, not to {spacecraft[:128]}")
 
 
-def own_key(caller: Caller | None, key: str | None) -> OwnKey | None:
-    """An Idempotency-Key together with its caller's token; None without a key."""
-    if key is None:
-        return None
-    return (caller and caller.token_id) or "", key
+OPEN_CALLER = Caller("local", frozenset(SCOPES))
+"""The caller of every request while access is open."""
 
 
 def new_secret() -> str:
@@ -163,46 +178,18 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
     connection.execute(delete(access_sessions).where(access_sessions.c.token_id == row.id))
 
 
-def any_token(connection: Connection) -> bool:
-    """True if a token was ever made: from then on every request needs one."""
-    return connection.execute(select(access_tokens.c.id).limit(1)).first() is not None
-
-
-def holder_of(connection: Connection, digest: str, moment: str) -> Caller | None:
-    """The caller of a token that is valid at `moment`; None for an invalid one."""
-    return _caller(connection, access_tokens.c.digest == digest, moment)
-
-
-def session_holder(connection: Connection, digest: str, moment: str) -> Caller | None:
-    """The caller of a browser's session that is valid at `moment`; else None."""
-    held = (
-        select(access_sessions.c.token_id)
-        .where(access_sessions.c.digest == digest, access_sessions.c.expires > moment)
-        .scalar_subquery()
-    )
-    return _caller(connection, access_tokens.c.id == held, moment)
-
-
-def add_session(
-    connection: Connection, *, secret: str, token_id: str, created: str, expires: str
-) -> None:
-    """Begin a browser's session; expired ones are deleted."""
-    connection.execute(delete(access_sessions).where(access_sessions.c.expires <= created))
-    connection.execute(
-        insert(access_sessions).values(
-            digest=secret_digest(secret), token_id=token_id, created=created, expires=expires
+def _caller(connection: Connection, kind: str, digest: str, moment: str) -> Caller | None:
+    """The caller of a token or of a browser's session that is valid at `moment`; else None."""
+    condition = access_tokens.c.digest == digest
+    if kind == "session":
+        held = (
+            select(access_sessions.c.token_id)
+            .where(access_sessions.c.digest == digest, access_sessions.c.expires > moment)
+            .scalar_subquery()
         )
-    )
-
-
-def end_session(connection: Connection, digest: str) -> None:
-    """End a browser's session, if there is one."""
-    connection.execute(delete(access_sessions).where(access_sessions.c.digest == digest))
-
-
-def _caller(connection: Connection, condition: object, moment: str) -> Caller | None:
+        condition = access_tokens.c.id == held
     query = select(access_tokens).where(
-        condition,  # type: ignore[arg-type]
+        condition,
         access_tokens.c.revoked.is_(None),
         access_tokens.c.expires > moment,
     )
@@ -217,10 +204,6 @@ def _caller(connection: Connection, condition: object, moment: str) -> Caller | 
         row["id"],
         row["rate_per_s"],
     )
-
-
-MAX_DAYS = 3660
-DEFAULT_DAYS = 365
 
 
 class Database(Protocol):
@@ -293,3 +276,194 @@ class Tokens:
 
         revoked: Token = self._database.change_audited(change, entry)
         return revoked
+
+
+Now = Callable[[], Utc]
+Reading = Callable[[], AbstractContextManager[Connection]]
+RunInTransaction = Callable[[Callable[[Connection], Any]], Any]
+
+
+@dataclass
+class _TokenBucket:
+    """The token bucket of a rate limit: it fills with time, up to a burst."""
+
+    left: float
+    filled_s: float
+
+
+class Access:
+    """Identifies callers; the one place that does."""
+
+    def __init__(
+        self, reading: Reading, change: RunInTransaction, loopback: bool, now: Now
+    ) -> None:
+        """`reading` gives a connection; `change` runs a change and waits for its commit.
+
+        `loopback`: whether the service listens on a loopback address only.
+        """
+        self._reading, self._change = reading, change
+        self._loopback = loopback
+        self._now = now
+        self._ids = Ulids()
+        self._lock = threading.Lock()
+        self._known: dict[tuple[str, str], tuple[Caller, float]] = {}
+        self._open_until_s = 0.0
+        self._out_of_reach_until_s = 0.0
+        self._closed = False
+        self._buckets: dict[str, _TokenBucket] = {}
+
+    @property
+    def is_open(self) -> bool:
+        """True if no token is required: on loopback, until the first one is made."""
+        if self._closed or not self._loopback:
+            return False
+        clock_s = time.monotonic()
+        if clock_s >= self._open_until_s:
+            # Rows of tokens are never deleted: closed access stays closed.
+            self._closed = self.has_tokens()
+            self._open_until_s = clock_s + KNOWN_FOR_S
+        return not self._closed
+
+    @property
+    def cached_is_open(self) -> bool | None:
+        """`is_open` where it is known without reading the database; else None."""
+        if self._closed or not self._loopback:
+            return False
+        return True if time.monotonic() < self._open_until_s else None
+
+    def database_timed_out(self) -> None:
+        """Let requests fail at once for a second, because the database did not answer in time."""
+        self._out_of_reach_until_s = time.monotonic() + KNOWN_FOR_S
+
+    def require_database(self) -> None:
+        """Raise `Busy` where the database timed out within the last second."""
+        if time.monotonic() < self._out_of_reach_until_s:
+            raise Busy("the database does not answer", 5)
+
+    def has_tokens(self) -> bool:
+        """True if a token was ever made: from then on every request needs one."""
+        with self._reading() as connection:
+            return connection.execute(select(access_tokens.c.id).limit(1)).first() is not None
+
+    def cached_caller(self, token: str | None, session: str | None) -> Caller | None:
+        """The result of `caller` where it is known without reading the database; else None."""
+        clock_s = time.monotonic()
+        if not self._closed and self._loopback:
+            return OPEN_CALLER if clock_s < self._open_until_s else None
+        kind, secret = ("session", session) if token is None else ("token", token)
+        known = None if secret is None else self._known.get((kind, secret_digest(secret)))
+        return known[0] if known is not None and clock_s < known[1] else None
+
+    def last_known_caller(self, token: str | None, session: str | None) -> Caller | None:
+        """The caller as it was at the last look-up, however long ago; None: never looked up.
+
+        For what must answer while the database does not.
+        """
+        if self.was_open:
+            return OPEN_CALLER
+        kind, secret = ("session", session) if token is None else ("token", token)
+        known = None if secret is None else self._known.get((kind, secret_digest(secret)))
+        return None if known is None else known[0]
+
+    @property
+    def was_open(self) -> bool:
+        """True if access was open when that was last asked."""
+        return self._loopback and not self._closed and self._open_until_s > 0.0
+
+    def caller(self, token: str | None, session: str | None) -> Caller:
+        """The caller of a bearer token or a session; raises `Unauthenticated`."""
+        if self.is_open:
+            return OPEN_CALLER
+        for kind, secret in (("token", token), ("session", session)):
+            if secret is not None:
+                return self._holder(kind, secret_digest(secret))
+        raise Unauthenticated("a token is needed: Authorization: Bearer acq_...")
+
+    def look_up_again(self, token: str | None, session: str | None) -> Caller:
+        """`caller` without the cache."""
+        with self._lock:
+            self._open_until_s = 0.0
+            for kind, secret in (("token", token), ("session", session)):
+                if secret is not None:
+                    self._known.pop((kind, secret_digest(secret)), None)
+        return self.caller(token, session)
+
+    def _holder(self, kind: str, digest: str) -> Caller:
+        key, clock_s = (kind, digest), time.monotonic()
+        known = self._known.get(key)
+        if known is not None and clock_s < known[1]:
+            return known[0]
+        with self._reading() as connection:
+            caller = _caller(connection, kind, digest, self._now().text)
+        with self._lock:
+            self._known.pop(key, None)
+            if caller is None:
+                raise Unauthenticated("the token is unknown, has expired or was revoked")
+            if len(self._known) >= MAX_KNOWN:
+                self._known.clear()
+            self._known[key] = (caller, clock_s + KNOWN_FOR_S)
+        return caller
+
+    def count_request(self, caller: Caller, count: int = 1) -> None:
+        """Count a request against its token's rate; raises `RateLimited`.
+
+        A request that counts as more than a burst is let through when the burst is there;
+        requests after it wait until what it took beyond that is made up for.
+        """
+        rate = caller.rate_per_s
+        if rate is None or caller.token_id is None or count < 1:
+            return
+        clock_s, burst = time.monotonic(), max(rate, LEAST_BURST)
+        with self._lock:
+            bucket = self._buckets.setdefault(caller.token_id, _TokenBucket(burst, clock_s))
+            bucket.left = min(burst, bucket.left + rate * (clock_s - bucket.filled_s))
+            bucket.filled_s = clock_s
+            needed = max(1.0, min(count, burst - 1))
+            if bucket.left < needed:
+                wait_s = max(1, round((needed - bucket.left) / rate + 0.5))
+                raise RateLimited(f"{caller.name} may send {rate:g} requests per second", wait_s)
+            bucket.left -= count
+
+    def forget(self) -> None:
+        """Look callers up again from now on, because tokens have changed."""
+        with self._lock:
+            self._known.clear()
+            self._open_until_s = 0.0
+
+    def sign_in(self, token: str) -> tuple[str, Caller]:
+        """Begin a browser's session; returns the secret for its cookie, and the caller."""
+        caller = self._holder("token", secret_digest(token))
+        if caller.token_id is None:
+            raise Unauthenticated("access is open: signing in is not needed")
+        token_id, secret, begun = caller.token_id, new_secret(), self._now()
+        row = {
+            "digest": secret_digest(secret),
+            "token_id": token_id,
+            "created": begun.text,
+            "expires": shifted(begun, SESSION_H * 3600).text,
+        }
+
+        def begin(connection: Connection) -> None:
+            # Expired ones are deleted.
+            expired = access_sessions.c.expires <= begun.text
+            connection.execute(delete(access_sessions).where(expired))
+            connection.execute(insert(access_sessions).values(row))
+
+        self._change(begin)
+        return secret, caller
+
+    def sign_out(self, session: str) -> None:
+        """End a browser's session."""
+        digest = secret_digest(session)
+        ended = delete(access_sessions).where(access_sessions.c.digest == digest)
+        self._change(lambda connection: connection.execute(ended))
+        with self._lock:
+            self._known.pop(("session", digest), None)
+
+    def entry(self, who: str, action: str, about: str, body: str | None, status: int) -> Entry:
+        """A new entry for the audit list."""
+        return Entry(self._ids.new(), self._now().text, who, action, about, body, status)
+
+    def add_entry(self, entry: Entry) -> None:
+        """Store an entry without a change; returns after the commit."""
+        self._change(entry.add_to)

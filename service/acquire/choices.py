@@ -83,21 +83,27 @@ def choices_of(batch: ObservationBatch, mission: Mission) -> Choices:
     has in bands too, and tests that compare with the presumed roll where an a priori
     boresight leaves it open.  About a prediction the cross product test is stricter.
     """
-    options = batch.options
-    grid_deg = options.zone_grid_deg
+    options, grid_deg = batch.options, batch.options.zone_grid_deg
+    predicted = batch.a_priori if isinstance(batch.a_priori, PredictedPrior) else None
+    if options.tests or options.tolerances or predicted:
+        rules = _own_rules(batch, mission, predicted)
+    elif isinstance(batch.a_priori, BoresightPrior):
+        rules = mission.rules_without_roll
+    else:
+        rules = mission.rules
     return Choices(
         options.identifier or mission.identifier,
         options.solver or mission.solver,
-        _rules(batch, mission),
+        rules,
         mission.zone.grid_deg if grid_deg is None else grid_deg,
     )
 
 
-def _rules(batch: ObservationBatch, mission: Mission) -> Rules:
-    options, roll_open = batch.options, isinstance(batch.a_priori, BoresightPrior)
-    predicted = batch.a_priori if isinstance(batch.a_priori, PredictedPrior) else None
-    if not (options.tests or options.tolerances or predicted):
-        return mission.rules_without_roll if roll_open else mission.rules
+def _own_rules(
+    batch: ObservationBatch, mission: Mission, predicted: PredictedPrior | None
+) -> Rules:
+    """The rules of a batch with tests or tolerances of its own, or with a prediction."""
+    options = batch.options
     tests = {**options.tests, **dict.fromkeys(impossible_tests(batch, mission), False)}
     tolerances = options.tolerances
     if predicted is not None:

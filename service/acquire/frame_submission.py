@@ -10,16 +10,9 @@ import numpy as np
 
 from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, solve_picture
 from service.identify.blind.lens import Lens
+from service.imaging import submit
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
-from service.imaging.submit import (
-    FrameIn,
-    batch_of_stars,
-    choices_of,
-    preview_png,
-    submission_of_frame,
-    time_of,
-)
 from service.missions.camera import Camera
 from service.missions.mission import Mission
 from service.observations.frame_record import FrameRecord
@@ -36,7 +29,7 @@ LEAST_SIGMA_PX = 0.05
 def submit_frame(
     file: IO[bytes],
     digest: str,
-    known: FrameIn,
+    known: submit.FrameIn,
     mission: Mission,
     catalog: Catalog,
     max_pixels: int,
@@ -48,14 +41,14 @@ def submit_frame(
     """
     _, camera = mission.camera_tracker(known.tracker, "tracker")
     if camera.calibrated:
-        return submission_of_frame(file, digest, known, mission, max_pixels)
+        return submit.submission_of_frame(file, digest, known, mission, max_pixels)
     return _of_unknown_lens(file, digest, known, mission, catalog, max_pixels)
 
 
 def _of_unknown_lens(
     file: IO[bytes],
     digest: str,
-    known: FrameIn,
+    known: submit.FrameIn,
     mission: Mission,
     catalog: Catalog,
     max_pixels: int,
@@ -65,7 +58,7 @@ def _of_unknown_lens(
     limits = FrameLimits(max_pixels, camera.shape, tracker.name, known.image)
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
-    time, remarks = time_of(known, frame)
+    time, remarks = submit.time_of(known, frame)
     exposure_s = known.exposure_s or frame.exposure_s or camera.exposure_s
     frame = replace(frame, exposure_s=exposure_s)
     read = perf_counter_ns()
@@ -79,20 +72,20 @@ def _of_unknown_lens(
         # The search of the whole sky is done.  What is found about it still stands or falls
         # by its own evidence.
         prior = {"a_priori": {"quaternion": _unit(found.quaternion)}}
-        known = FrameIn.model_validate_json(json.dumps(_sent_fields(known) | prior))
+        known = submit.FrameIn.model_validate_json(json.dumps(_sent_fields(known) | prior))
     stars = _observed(result, chosen, camera)
-    model = batch_of_stars(mission.name, known, digest, time, tracker, stars)
+    model = submit.batch_of_stars(mission.name, known, digest, time, tracker, stars)
     done = perf_counter_ns()
     timings = {"read": (read - start) // 1000, "detect": (done - read) // 1000, "centroid": 0}
     record = _record(result, chosen, stars, camera, tracker.name, timings)
-    record = replace(record, remarks=[*record.remarks, *remarks, *choices_of(result.frame)])
+    record = replace(record, remarks=[*record.remarks, *remarks, *submit.choices_of(result.frame)])
     submission = submission_from_model(model)
     return Submission(
         submission.batch, submission.text, known.fingerprint(mission.name, digest), record
     )
 
 
-def _sent_fields(known: FrameIn) -> dict[str, Any]:
+def _sent_fields(known: submit.FrameIn) -> dict[str, Any]:
     fields: dict[str, Any] = json.loads(known.model_dump_json(exclude_defaults=True))
     return fields
 
@@ -171,7 +164,7 @@ def _record(
     timings_us: dict[str, int],
 ) -> FrameRecord:
     points = result.points
-    preview, step = preview_png(points.light, points.noise_counts)
+    preview, step = submit.preview_png(points.light, points.noise_counts)
     remarks = list(result.remarks)
     if result.attitude is not None:
         lens, scale = result.attitude.lens, result.attitude.sigma_scale

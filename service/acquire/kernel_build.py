@@ -57,12 +57,8 @@ class KernelBuild:
         self._cancelled = False
         self.is_needed = not _is_complete()
         """True until a build has succeeded: an answer must not depend on what is compiled."""
-        self._zones_needed = self.is_needed
-
-    def require_zones_built(self) -> None:
-        """Raise `Busy` until the kernels of batches with a zone are compiled."""
-        if self._zones_needed:
-            self.require_built()
+        self.zones_needed = self.is_needed
+        """True until the kernels of batches with a zone are compiled."""
 
     def require_built(self) -> None:
         """Raise `Busy` until the kernels are compiled."""
@@ -95,7 +91,7 @@ class KernelBuild:
                 sender.close()
                 receivers.append(receiver)
         if all(_has_reported(each) for each in receivers):
-            self._zones_needed = False
+            self.zones_needed = False
             zones_built()
         for child in self._children:
             child.join()

@@ -10,6 +10,7 @@ An answer depends on the batch, the mission and the catalog alone, not on the ba
 with it.  Not finding a star is a result; only bad input raises.
 """
 
+import operator
 from collections.abc import Sequence
 
 from msgspec import Struct
@@ -18,6 +19,7 @@ from msgspec.structs import replace
 from service import __version__
 from service.acquire.choices import aberration_velocity, choices_of
 from service.acquire.result import (
+    WORK_BOUND_HIT,
     Acquisition,
     Path,
     Provenance,
@@ -26,17 +28,14 @@ from service.acquire.result import (
     outcome_counts,
     tracker_results,
     unmatched_results,
-)
-from service.acquire.rivals import find_groups
-from service.acquire.search import SearchResult
-from service.acquire.warnings import (
-    WORK_BOUND_HIT,
     warning_of_rival,
     warnings_of_attitude,
     warnings_of_batch,
     warnings_of_trackers,
     warnings_of_tracking,
 )
+from service.acquire.rivals import find_groups
+from service.acquire.search import SearchResult
 from service.acquire.zone_search import Search, StepTimer, ZoneSearch, as_row_error
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.errors import BadBatch, Fault, shown_value
@@ -130,7 +129,10 @@ def acquire_many(
     for row, batch in enumerate(batches.batches):
         its_trackers: Sequence[Tracker | None] = [None] * len(batch.observations)
         try:
-            batch = _reduced(batch, mission)
+            if batch.tracking is not None and not batch.tracking.resolved:
+                message = "last needs the record of a service, which predicts the attitude from it"
+                raise BadBatch(Fault("a_priori.from", message, shown_value("last")))
+            batch = reduced(batch, mission)
             if batch.measurement is not None:
                 finished[row] = _measured(batch, mission, sky)
             else:
@@ -142,7 +144,7 @@ def acquire_many(
             finished[row] = as_row_error(error)
         several.append(batch)
         trackers += its_trackers
-    if any(one is not other for one, other in zip(several, batches.batches, strict=True)):
+    if not all(map(operator.is_, several, batches.batches)):
         # Scans became angles.
         batches = BatchColumns.of(several)
     stars = correct_columns(batches, trackers)
@@ -164,17 +166,6 @@ def acquire_many(
         if at_once and search.budget.was_hit and isinstance(finished.get(row), Acquisition | None):
             finished[row] = NotAtHand()
     return ResultColumns(searches, stars, zones, finished)
-
-
-def _reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
-    """The batch with angles in the place of scans; raises what `reduced` does.
-
-    And `BadBatch` where the attitude to search about is still to be predicted.
-    """
-    if batch.tracking is not None and not batch.tracking.resolved:
-        message = "last needs the record of a service, which predicts the attitude from it"
-        raise BadBatch(Fault("a_priori.from", message, shown_value("last")))
-    return reduced(batch, mission)
 
 
 def _search(

@@ -14,15 +14,7 @@ from service.acquire.result import RivalAttitude
 from service.acquire.search import SearchResult, find
 from service.acquire.zone_search import Search, ZoneResult, ZoneSearch
 from service.attitude.solution import AttitudeSolution
-from service.identify.hypotheses.groups import (
-    Mask,
-    first_share,
-    log_weight_of_group,
-    may_be_a_group,
-    of_all,
-    part_of,
-    shared,
-)
+from service.identify.hypotheses import groups
 from service.observations.calibrate import CorrectedColumns, CorrectedObservations
 from service.vectors import attitude_error_arcsec, read_only
 
@@ -72,16 +64,16 @@ def find_groups(
 
 
 def _group(
-    search: Search, corrected: tuple[CorrectedObservations, ...], masks: Sequence[Mask]
+    search: Search, corrected: tuple[CorrectedObservations, ...], masks: Sequence[groups.Mask]
 ) -> SearchResult | None:
     """The search for these stars alone, as of all; None where they have no attitude.
 
     There must be three stars, two of which are named: the others may lie beyond the zone.
     An attitude that its residuals speak against counts: one sound group in a thousand has such.
     """
-    if not may_be_a_group(masks):
+    if not groups.may_be_a_group(masks):
         return None
-    found = find(search, part_of(corrected, masks))
+    found = find(search, groups.part_of(corrected, masks))
     if found.in_zones is None or not isinstance(found.in_zones.solved, AttitudeSolution):
         return None
     has_attitude = any(int(mask.sum()) >= FEWEST_NAMED for mask in found.unique)
@@ -102,10 +94,10 @@ def _weigh(
     assert first is not None
     assert second is not None
     stars = tuple(each.star for each in second.identifications)
-    share = first_share(*weights, sum(int((rows >= 0).sum()) for rows in stars))
+    share = groups.first_share(*weights, sum(int((rows >= 0).sum()) for rows in stars))
     apart_arcsec = attitude_error_arcsec(other.solution.matrix, one.solution.matrix)
     identifications = [
-        shared(mine, its, share)
+        groups.shared(mine, its, share)
         for mine, its in zip(first.identifications, second.identifications, strict=True)
     ]
     in_zones = replace(
@@ -130,7 +122,7 @@ def _log_weight(
     zones = ZoneSearch(CorrectedColumns.of(corrected))
     zones.add(0, search, prior, regions=regions)
     return sum(
-        log_weight_of_group(
+        groups.log_weight_of_group(
             zones.seen, s, search.zone(region)[0], identification.star, search.run_catalog
         )
         for s, (region, identification) in enumerate(
@@ -147,7 +139,7 @@ def _differ(one: AttitudeSolution, other: AttitudeSolution) -> bool:
     return weighted > DIFFERENT_CHI_SQUARE
 
 
-def _of_all(found: SearchResult, masks: Sequence[Mask]) -> SearchResult:
+def _of_all(found: SearchResult, masks: Sequence[groups.Mask]) -> SearchResult:
     """The search for a part of the stars as one of all, the others unmatched."""
     in_zones, solution = found.in_zones, found.solution
     assert in_zones is not None
@@ -159,7 +151,7 @@ def _of_all(found: SearchResult, masks: Sequence[Mask]) -> SearchResult:
         in_zones=replace(
             in_zones,
             identifications=[
-                of_all(each, mask)
+                groups.of_all(each, mask)
                 for each, mask in zip(in_zones.identifications, masks, strict=True)
             ],
             solved=replace(solution, residual_arcsec=read_only(residual)),

@@ -7,8 +7,7 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from service.acquire.result import Path
-from service.acquire.warnings import PREDICTION_CONTRADICTED, WORK_BOUND_HIT
+from service.acquire.result import PREDICTION_CONTRADICTED, WORK_BOUND_HIT, Path
 from service.acquire.zone_search import Search, ZoneResult, ZoneSearch
 from service.attitude.solution import AttitudeSolution, NoAttitude
 from service.identify.attitude_from_matches import attitude_of

@@ -23,25 +23,12 @@ from service.advice.tolerances import ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
 from service.advice.trials import VariantOutcome
 from service.app.context import Context
-from service.app.submissions import Submissions
 from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
+from service.ingest.submit import SubmissionService
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
-from service.storage.models.advice import (
-    Advice,
-    AlignmentAdvice,
-    Change,
-    Estimate,
-    GroupAdvice,
-    InnovationAdvice,
-    MagnitudeAdvice,
-    NoiseAdvice,
-    NoisePeriodAdvice,
-    ToleranceAdvice,
-    Trial,
-    ZoneAdvice,
-)
+from service.storage.models import advice as records
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import BatchSample, sample_batches
 from service.storage.recording.unsaved_result import LIVE
@@ -56,7 +43,7 @@ NO_TOLERANCES = TolerancesIn()
 class AdviceService:
     """Computes advice, for one caller at a time."""
 
-    def __init__(self, context: Context, submissions: Submissions, zones: Zones) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService, zones: Zones) -> None:
         self._context = context
         self._zones = zones
         self._submissions = submissions
@@ -73,7 +60,7 @@ class AdviceService:
         tolerances: TolerancesIn = NO_TOLERANCES,
         limit_s: float = math.inf,
         step: Callable[[], object] = lambda: None,
-    ) -> Advice:
+    ) -> records.Advice:
         """Advice on a mission's settings from the batches of a run; see `service.advice`.
 
         Of the batches at most `sample` are run again, fewer where `limit_s`
@@ -97,8 +84,8 @@ class AdviceService:
             began = time.monotonic()
             pace = WorkLimit(lambda share: time.monotonic() - began < share * limit_s, step)
             # Without the search of the whole sky, which would hide faults of the settings.
-            run_again = partial(self._submissions.ingest.run_again, mission=mission.within_zones)
-            run_freely = partial(self._submissions.ingest.run_again, mission=mission)
+            run_again = partial(self._submissions.run_again, mission=mission.within_zones)
+            run_freely = partial(self._submissions.run_again, mission=mission)
             findings = advise(mission, drawn.batches, run_again, run_freely, own, pace)
             zone = zone_statements(mission, *self._zones.advised_size(name, run))
         finally:
@@ -114,7 +101,7 @@ def advice_record(
     findings: Findings,
     zone: Sequence[Statement],
     innovations: Sequence[InnovationFinding] = (),
-) -> Advice:
+) -> records.Advice:
     """The findings with their figures and sentences, the trials, and the lines to change."""
     tolerances = [(each, tolerance_statement(each, findings)) for each in findings.tolerances]
     noise = [(each, noise_statement(each)) for each in findings.noise]
@@ -125,7 +112,7 @@ def advice_record(
         each for pairs in (tolerances, noise, magnitudes, alignment) for _, each in pairs
     ]
     statements += [each.statement for each in innovations]
-    return Advice(
+    return records.Advice(
         spacecraft=spacecraft,
         run=run,
         first=sample.first,
@@ -138,9 +125,10 @@ def advice_record(
         mission=findings.mission.digest,
         identifier=findings.mission.identifier,
         groups=[
-            GroupAdvice(action=each.action, text=each.text) for each in group_statements(findings)
+            records.GroupAdvice(action=each.action, text=each.text)
+            for each in group_statements(findings)
         ],
-        zone=[ZoneAdvice(action=each.action, text=each.text) for each in zone],
+        zone=[records.ZoneAdvice(action=each.action, text=each.text) for each in zone],
         tolerances=[_tolerance(*each, findings.uses_voting) for each in tolerances],
         noise=[_noise(*each) for each in noise],
         magnitudes=[_magnitude(*each) for each in magnitudes],
@@ -151,8 +139,10 @@ def advice_record(
     )
 
 
-def _tolerance(finding: ToleranceFinding, statement: Statement, is_used: bool) -> ToleranceAdvice:
-    return ToleranceAdvice(
+def _tolerance(
+    finding: ToleranceFinding, statement: Statement, is_used: bool
+) -> records.ToleranceAdvice:
+    return records.ToleranceAdvice(
         tolerance=finding.tolerance.name,
         symbol=finding.symbol,
         unit=finding.tolerance.unit,
@@ -169,8 +159,8 @@ def _tolerance(finding: ToleranceFinding, statement: Statement, is_used: bool) -
     )
 
 
-def _noise(finding: NoiseFinding, statement: Statement) -> NoiseAdvice:
-    return NoiseAdvice(
+def _noise(finding: NoiseFinding, statement: Statement) -> records.NoiseAdvice:
+    return records.NoiseAdvice(
         tracker=finding.tracker,
         now_arcsec=finding.now_arcsec,
         sigma_arcsec=_estimate(finding.sigma_arcsec),
@@ -182,10 +172,10 @@ def _noise(finding: NoiseFinding, statement: Statement) -> NoiseAdvice:
     )
 
 
-def _noise_period(found: NoisePeriod | None) -> NoisePeriodAdvice | None:
+def _noise_period(found: NoisePeriod | None) -> records.NoisePeriodAdvice | None:
     if found is None:
         return None
-    return NoisePeriodAdvice(
+    return records.NoisePeriodAdvice(
         sigma_arcsec=_bounded(found.sigma_arcsec),
         batches=found.batches,
         first=found.first.text,
@@ -193,8 +183,8 @@ def _noise_period(found: NoisePeriod | None) -> NoisePeriodAdvice | None:
     )
 
 
-def _magnitude(finding: MagnitudeFinding, statement: Statement) -> MagnitudeAdvice:
-    return MagnitudeAdvice(
+def _magnitude(finding: MagnitudeFinding, statement: Statement) -> records.MagnitudeAdvice:
+    return records.MagnitudeAdvice(
         tracker=finding.tracker,
         pivot_mag=None if math.isnan(finding.pivot_mag) else finding.pivot_mag,
         offset_mag=_estimate(finding.offset_mag),
@@ -209,9 +199,9 @@ def _magnitude(finding: MagnitudeFinding, statement: Statement) -> MagnitudeAdvi
     )
 
 
-def _alignment(finding: AlignmentFinding, statement: Statement) -> AlignmentAdvice:
+def _alignment(finding: AlignmentFinding, statement: Statement) -> records.AlignmentAdvice:
     rotation, axes = finding.rotation_arcsec, finding.axes_body
-    return AlignmentAdvice(
+    return records.AlignmentAdvice(
         tracker=finding.tracker,
         reference=finding.reference,
         rotation_arcsec=None if rotation is None else [_bounded(part) for part in rotation],
@@ -223,8 +213,8 @@ def _alignment(finding: AlignmentFinding, statement: Statement) -> AlignmentAdvi
     )
 
 
-def _innovation(finding: InnovationFinding) -> InnovationAdvice:
-    return InnovationAdvice(
+def _innovation(finding: InnovationFinding) -> records.InnovationAdvice:
+    return records.InnovationAdvice(
         subject=finding.subject,
         ratio=_estimate(finding.ratio),
         measurements=finding.measurements,
@@ -233,8 +223,8 @@ def _innovation(finding: InnovationFinding) -> InnovationAdvice:
     )
 
 
-def _trial(outcome: VariantOutcome) -> Trial:
-    return Trial(
+def _trial(outcome: VariantOutcome) -> records.Trial:
+    return records.Trial(
         name=outcome.variant.name,
         identifier=outcome.variant.identifier,
         tolerances=dict(outcome.variant.tolerances),
@@ -248,26 +238,28 @@ def _trial(outcome: VariantOutcome) -> Trial:
     )
 
 
-def _changes(statements: Iterable[Statement]) -> list[Change]:
+def _changes(statements: Iterable[Statement]) -> list[records.Change]:
     """The lines to write, a key of a table once: trackers may share one."""
-    lines: dict[tuple[str, str | None, str], Change] = {}
+    lines: dict[tuple[str, str | None, str], records.Change] = {}
     for each in (change for statement in statements for change in statement.changes):
         key = each.table, each.tracker, each.line.partition(" = ")[0]
-        lines.setdefault(key, Change(table=each.table, tracker=each.tracker, line=each.line))
+        lines.setdefault(
+            key, records.Change(table=each.table, tracker=each.tracker, line=each.line)
+        )
     return list(lines.values())
 
 
-def _estimate(found: Interval | None) -> Estimate | None:
+def _estimate(found: Interval | None) -> records.Estimate | None:
     return None if found is None else _bounded(found)
 
 
-def _bounded(found: Interval) -> Estimate:
+def _bounded(found: Interval) -> records.Estimate:
     """The interval, with null for a bound that the sample does not give."""
     low, high = (part if math.isfinite(part) else None for part in (found.low, found.high))
-    return Estimate(value=found.value, low=low, high=high)
+    return records.Estimate(value=found.value, low=low, high=high)
 
 
-def no_changes_text(advice: Advice) -> str:
+def no_changes_text(advice: records.Advice) -> str:
     """The text shown when no line of the mission file should change."""
     findings = (
         advice.groups,

@@ -18,18 +18,7 @@ from service.errors import BadBatch, Fault, shown_value
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission, mission_named
 from service.storage.grades.period import rejected_samples
-from service.storage.models.alarms import (
-    Alarm,
-    AlarmSpan,
-    AlarmWithActions,
-    Annotation,
-    Limit,
-    LimitExcursion,
-    LimitHistory,
-    LimitPreview,
-    LimitTrial,
-    SeverityName,
-)
+from service.storage.models import alarms as records
 from service.storage.models.base import Page
 from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms, limits
@@ -56,7 +45,7 @@ class Alarms:
         state: alarms.StateFilter = "active",
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[Alarm]:
+    ) -> Page[records.Alarm]:
         """Alarms, newest first; the run `*` stands for every run."""
         with self._context.reading() as connection:
             return alarms.list_alarms(
@@ -69,22 +58,22 @@ class Alarms:
                 now=utc_now().text,
             )
 
-    def active(self, run: str = LIVE) -> list[Alarm]:
+    def active(self, run: str = LIVE) -> list[records.Alarm]:
         """Every alarm of a run that is not cleared, the worst first."""
         with self._context.reading() as connection:
             return alarms.active_alarms(connection, run, utc_now().text)
 
-    def of_period(self, spacecraft: str, run: str, start: Utc, end: Utc) -> list[AlarmSpan]:
+    def of_period(self, spacecraft: str, run: str, start: Utc, end: Utc) -> list[records.AlarmSpan]:
         """When alarms of a spacecraft were out of their limits; see `alarm_spans`."""
         with self._context.reading() as connection:
             return alarm_spans(connection, run, spacecraft, start, end)
 
-    def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
+    def times_out(self, found: Sequence[records.Alarm]) -> list[list[TimeOut]]:
         """For each alarm, when it was out of its limits; see `period.alarms.times_out`."""
         with self._context.reading() as connection:
             return times_out(connection, found)
 
-    def get(self, id: str) -> AlarmWithActions:
+    def get(self, id: str) -> records.AlarmWithActions:
         """One alarm with its history."""
         with self._context.reading() as connection:
             return alarms.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
@@ -96,7 +85,7 @@ class Alarms:
 
     def acknowledge(
         self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
-    ) -> AlarmWithActions:
+    ) -> records.AlarmWithActions:
         """Acknowledge an alarm; with the quantity back in limits, or retired, it is cleared."""
         moment = utc_now().text
         return self._act(
@@ -120,7 +109,7 @@ class Alarms:
         minutes: int,
         comment: str | None = None,
         entry: Entry | None = None,
-    ) -> AlarmWithActions:
+    ) -> records.AlarmWithActions:
         """Shelve an alarm for some minutes."""
         now = utc_now()
         until = shifted(now, 60.0 * minutes).text
@@ -135,13 +124,13 @@ class Alarms:
 
     def unshelve(
         self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
-    ) -> AlarmWithActions:
+    ) -> records.AlarmWithActions:
         """End the shelving of an alarm."""
         return self._act(id, state_machine.unshelved, who, comment, utc_now().text, entry)
 
     def comment(
         self, id: str, who: str, comment: str, entry: Entry | None = None
-    ) -> AlarmWithActions:
+    ) -> records.AlarmWithActions:
         """Comment on an alarm, cleared ones included."""
         return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text, entry)
 
@@ -164,7 +153,7 @@ class Alarms:
         comment: str | None,
         moment: str,
         entry: Entry | None,
-    ) -> AlarmWithActions:
+    ) -> records.AlarmWithActions:
         known = known_id(id, "alarm")
         return self._context.change_audited(
             lambda connection: alarms.act(
@@ -186,14 +175,16 @@ class Limits:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def all(self, name: str, tracker: str | None = None) -> list[Limit]:
+    def all(self, name: str, tracker: str | None = None) -> list[records.Limit]:
         """The limit of every quantity of a spacecraft, or of one of its trackers."""
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker)
         with self._context.reading() as connection:
             return limits.list_limits(connection, mission, own)
 
-    def get(self, name: str, quantity: QuantityName, tracker: str | None = None) -> LimitHistory:
+    def get(
+        self, name: str, quantity: QuantityName, tracker: str | None = None
+    ) -> records.LimitHistory:
         """The limit of one quantity, the shipped limit, and the history of changes."""
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
@@ -210,7 +201,7 @@ class Limits:
         comment: str | None = None,
         entry: Entry | None = None,
         tracker: str | None = None,
-    ) -> Limit:
+    ) -> records.Limit:
         """Set a limit, which holds from the next batch on; None restores the shipped one.
 
         `entry` goes to the audit list with the change.
@@ -240,7 +231,7 @@ class Limits:
         run: str | None = None,
         days: int = PREVIEW_DAYS,
         tracker: str | None = None,
-    ) -> LimitPreview:
+    ) -> records.LimitPreview:
         """How a limit and the one in force evaluate the days up to the run's latest batch.
 
         Of more than `MOST_PREVIEWED` batches it takes the latest ones.  They are evaluated in the
@@ -270,12 +261,12 @@ class Limits:
             assert last is not None
             return shifted(last, (at_ns - last.tai_ns) / 1e9).text
 
-        def trial(tried: LimitSettings) -> LimitTrial:
+        def trial(tried: LimitSettings) -> records.LimitTrial:
             of_gaps = quantity == SILENCE
             found = preview_of_gaps(time_ns, tried) if of_gaps else preview_of(samples, tried)
             return _trial(found, tried, moment)
 
-        return LimitPreview(
+        return records.LimitPreview(
             spacecraft=name,
             run=run or LIVE,
             quantity=quantity,
@@ -289,18 +280,21 @@ class Limits:
         )
 
 
-def _trial(found: Preview, tried: LimitSettings, moment: Callable[[int], str]) -> LimitTrial:
+def _trial(
+    found: Preview, tried: LimitSettings, moment: Callable[[int], str]
+) -> records.LimitTrial:
     """A preview as the interface shows it; `moment` gives the text of a time in TAI ns."""
-    return LimitTrial(
+    return records.LimitTrial(
         settings=tried.model_dump(mode="json"),
         evaluated=found.evaluated,
         beyond={
-            cast(SeverityName, severity.word): count for severity, count in found.beyond.items()
+            cast(records.SeverityName, severity.word): count
+            for severity, count in found.beyond.items()
         },
         alarms=len(found.excursions),
         excursions=[
-            LimitExcursion(
-                severity=cast(SeverityName, each.severity.word),
+            records.LimitExcursion(
+                severity=cast(records.SeverityName, each.severity.word),
                 start=moment(each.start_ns),
                 end=None if each.end_ns is None else moment(each.end_ns),
                 worst=each.worst,
@@ -345,14 +339,14 @@ class Annotations:
         end: Utc | None = None,
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[Annotation]:
+    ) -> Page[records.Annotation]:
         """Annotations of a period, the latest written first; see `list_annotations`."""
         with self._context.reading() as connection:
             return events.list_annotations(
                 connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
             )
 
-    def get(self, id: str) -> Annotation:
+    def get(self, id: str) -> records.Annotation:
         """One annotation."""
         with self._context.reading() as connection:
             return events.read_annotation(connection, known_id(id, "annotation"))
@@ -366,7 +360,7 @@ class Annotations:
         end: Utc | None = None,
         spacecraft: str | None = None,
         entry: Entry | None = None,
-    ) -> Annotation:
+    ) -> records.Annotation:
         """Write an annotation; without an end about a moment, without a spacecraft about all.
 
         Raises `BadInput` for a spacecraft without a mission file.
@@ -388,11 +382,11 @@ class Annotations:
             lambda connection: events.add_annotation(connection, row), entry
         )
 
-    def delete(self, id: str, entry: Entry | None = None) -> Annotation:
+    def delete(self, id: str, entry: Entry | None = None) -> records.Annotation:
         """Delete an annotation; the audit list keeps what it said."""
         known = known_id(id, "annotation")
 
-        def change(connection: Connection) -> Annotation:
+        def change(connection: Connection) -> records.Annotation:
             deleted = events.delete_annotation(connection, known)
             if entry is not None:
                 body = msgspec.json.encode(deleted).decode()

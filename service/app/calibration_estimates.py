@@ -15,7 +15,6 @@ from msgspec import structs
 
 from service.acquire import Acquisition
 from service.app.context import Context
-from service.app.submissions import Submissions
 from service.calibration.elimination import NotObservable
 from service.calibration.estimate import (
     Calibration,
@@ -36,23 +35,12 @@ from service.calibration.mission_file import Lines, magnitude_lines, tracker_lin
 from service.calibration.stars import IdentifiedStars, joined
 from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.ingest.submit import SubmissionService
 from service.missions.corrections import AS_MEASURED, Magnitudes
 from service.missions.corrections import Calibration as FocalPlaneSettings
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch
-from service.storage.calibrations import (
-    CalibrationBatches,
-    CalibrationHeldOut,
-    CalibrationNotObservable,
-    CalibrationResiduals,
-    CalibrationResult,
-    CalibrationUnknown,
-    FocalPlane,
-    ResidualCell,
-    ResidualMap,
-    TrackerGeometry,
-    TrackerMagnitudes,
-)
+from service.storage import calibrations
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.recorded_batch import sample_batches
 from service.storage.recording.unsaved_result import LIVE
@@ -145,7 +133,7 @@ class CalibrationRun:
 class Estimator:
     """Estimates calibrations; nothing is recorded and no setting is changed."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
 
@@ -198,7 +186,7 @@ class Estimator:
         until_s = time.monotonic() + LONGEST_WAIT_S
         while True:
             try:
-                return self._submissions.ingest.run_again(batch, mission.within_zones)
+                return self._submissions.run_again(batch, mission.within_zones)
             except Stopping:
                 raise
             except Busy:
@@ -233,11 +221,11 @@ MAP_CELLS = 12
 """Cells of a residual map across the field of view."""
 
 
-def result_of(run: CalibrationRun) -> CalibrationResult:
+def result_of(run: CalibrationRun) -> calibrations.CalibrationResult:
     """A calibration as a record, without its covariance."""
     found = run.found
-    return CalibrationResult(
-        batches=CalibrationBatches(
+    return calibrations.CalibrationResult(
+        batches=calibrations.CalibrationBatches(
             total=run.total,
             sampled=run.sampled,
             used=run.used,
@@ -249,7 +237,7 @@ def result_of(run: CalibrationRun) -> CalibrationResult:
         stars_left_out=int(np.sum(~found.used)),
         degree=found.model.degree,
         held_out=[
-            CalibrationHeldOut(
+            calibrations.CalibrationHeldOut(
                 degree=each.degree,
                 residual_over_sigma=each.residual_over_sigma,
                 chosen=each.chosen,
@@ -260,7 +248,7 @@ def result_of(run: CalibrationRun) -> CalibrationResult:
         residuals=residuals_by_tracker(found),
         unknowns=unknowns_of(run),
         not_observable=[
-            CalibrationNotObservable(name=each.name, reason=each.reason)
+            calibrations.CalibrationNotObservable(name=each.name, reason=each.reason)
             for each in not_observable_of(run)
         ],
         notes=notes(run),
@@ -270,12 +258,12 @@ def result_of(run: CalibrationRun) -> CalibrationResult:
     )
 
 
-def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
+def unknowns_of(run: CalibrationRun) -> list[calibrations.CalibrationUnknown]:
     """The names of the estimated parameters, in the order of the covariance."""
     found = run.found
     names = [each.name for each in found.stars.trackers]
     of_positions = [
-        CalibrationUnknown(
+        calibrations.CalibrationUnknown(
             name=unknown.name,
             tracker=names[unknown.tracker],
             kind=unknown.kind,
@@ -286,7 +274,7 @@ def unknowns_of(run: CalibrationRun) -> list[CalibrationUnknown]:
         for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
     ]
     return of_positions + [
-        CalibrationUnknown(
+        calibrations.CalibrationUnknown(
             name=f"{names[each.tracker]} {name}",
             tracker=names[each.tracker],
             kind="magnitude",
@@ -305,7 +293,7 @@ def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
     return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
 
-def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
+def residuals_by_tracker(found: Calibration) -> list[calibrations.CalibrationResiduals]:
     """The rms of each tracker's residuals of used stars, before and after."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     rows = []
@@ -313,7 +301,7 @@ def residuals_by_tracker(found: Calibration) -> list[CalibrationResiduals]:
         own = found.used & (found.stars.tracker == index)
         if own.any():
             rows.append(
-                CalibrationResiduals(
+                calibrations.CalibrationResiduals(
                     tracker=tracker.name,
                     stars=int(own.sum()),
                     before_arcsec=_rms((found.before * sigma_arcsec)[own]),
@@ -345,7 +333,7 @@ def _colors_differ(run: CalibrationRun) -> bool:
     return max(colors) - min(colors) > least
 
 
-def _maps(found: Calibration) -> Iterator[ResidualMap]:
+def _maps(found: Calibration) -> Iterator[calibrations.ResidualMap]:
     """The mean residuals of used stars in the cells of each tracker's focal plane."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     both = np.hstack([found.before * sigma_arcsec, found.residual * sigma_arcsec])
@@ -361,12 +349,12 @@ def _maps(found: Calibration) -> Iterator[ResidualMap]:
         sums = np.zeros((len(places), 4))
         np.add.at(sums, inverse.reshape(-1), both[own])
         means = np.round(sums / counts[:, None], 4)
-        yield ResidualMap(
+        yield calibrations.ResidualMap(
             tracker=tracker.name,
             radius_deg=radius,
             step_deg=step,
             cells=[
-                ResidualCell(
+                calibrations.ResidualCell(
                     h_deg=round((place[0] + 0.5) * step - radius, 6),
                     v_deg=round((place[1] + 0.5) * step - radius, 6),
                     stars=int(count),
@@ -378,20 +366,20 @@ def _maps(found: Calibration) -> Iterator[ResidualMap]:
         )
 
 
-def geometry_of(tracker: Tracker) -> TrackerGeometry:
+def geometry_of(tracker: Tracker) -> calibrations.TrackerGeometry:
     """Alignment, focal plane and magnitudes of a tracker."""
     plane = tracker.calibration
-    return TrackerGeometry(
+    return calibrations.TrackerGeometry(
         name=tracker.name,
         x_axis_body=list(tracker.x_axis_body),
         y_axis_body=list(tracker.y_axis_body),
         z_axis_body=list(tracker.z_axis_body),
-        calibration=FocalPlane(
+        calibration=calibrations.FocalPlane(
             scale=plane.scale,
             h_terms=[list(each) for each in plane.h_terms],
             v_terms=[list(each) for each in plane.v_terms],
         ),
-        magnitudes=TrackerMagnitudes(**tracker.magnitudes.model_dump()),
+        magnitudes=calibrations.TrackerMagnitudes(**tracker.magnitudes.model_dump()),
     )
 
 
@@ -405,7 +393,7 @@ def geometry_digest(mission: Mission) -> str:
     return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
 
 
-def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
+def with_geometry(mission: Mission, trackers: Sequence[calibrations.TrackerGeometry]) -> Mission:
     """The mission with the calibrations of these trackers; those not named stay as they are."""
     named = {each.name: each for each in trackers}
     changed = tuple(
@@ -414,7 +402,7 @@ def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Miss
     return mission.model_copy(update={"trackers": changed})
 
 
-def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
+def _with(tracker: Tracker, geometry: calibrations.TrackerGeometry) -> Tracker:
     fields = msgspec.to_builtins(geometry)
     if geometry.magnitudes is None:
         del fields["magnitudes"]
@@ -428,7 +416,7 @@ def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
 
 def calibrated_geometry(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
-) -> list[TrackerGeometry]:
+) -> list[calibrations.TrackerGeometry]:
     """Every tracker of a mission with what a calibration changes of it."""
     return [
         _calibrated_tracker(
@@ -439,7 +427,9 @@ def calibrated_geometry(
     ]
 
 
-def _calibrated_tracker(tracker: Tracker, changes: dict[str, Lines]) -> TrackerGeometry:
+def _calibrated_tracker(
+    tracker: Tracker, changes: dict[str, Lines]
+) -> calibrations.TrackerGeometry:
     own: dict[str, Any] = {
         name: tuple(value) for name, value in _values(changes["tracker"]).items()
     }

@@ -24,8 +24,8 @@ from service.app.calibration_estimates import (
 )
 from service.app.context import Context, known_id
 from service.app.results import COMPARE_SAMPLE, Comparisons, Stretch
-from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping, WrongState, shown_value
+from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, load_missions, mission_named
 from service.storage import calibrations
 from service.storage.calibrations import (
@@ -51,7 +51,7 @@ class CalibrationService:
     """Estimates and records calibrations; no setting is changed."""
 
     def __init__(
-        self, context: Context, submissions: Submissions, comparisons: Comparisons
+        self, context: Context, submissions: SubmissionService, comparisons: Comparisons
     ) -> None:
         self._context = context
         self._submissions = submissions

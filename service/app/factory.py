@@ -1,7 +1,6 @@
 """The app: every part of the service, put together in one place."""
 
-from service.access.sessions import Access
-from service.access.tokens import Tokens
+from service.access.tokens import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits
@@ -9,19 +8,20 @@ from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
 from service.app.frames import Frames
 from service.app.grades import DefinitiveAttitudes, Grades
+from service.app.gyro import Gyro
 from service.app.live_filter import LiveFilter
 from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
-from service.app.service import Audit, Events, Service
+from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Spacecraft
-from service.app.submissions import Gyro, Submissions
 from service.app.tracks import Tracks
 from service.app.webhooks import Webhooks
 from service.app.zones import Zones
 from service.ingest.spool import Spool
+from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, load_missions
 from service.settings import Settings, is_loopback
 from service.sky.cache import LruCache
@@ -53,10 +53,13 @@ class App:
         self.single_projector = SingleProjector(context.store)
         self.projector = Projector(context.store)
         self.access = Access(
-            context.reading_record, context.change, is_loopback(context.settings.host), utc_now
+            context.store.reading_record,
+            context.change,
+            is_loopback(context.settings.host),
+            utc_now,
         )
         self.tokens = Tokens(context, context.missions)
-        self.submissions = Submissions(context, kernels)
+        self.submissions = SubmissionService(context.missions, context.sky, context.store, kernels)
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
@@ -70,14 +73,13 @@ class App:
         self.alarms = Alarms(context)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
-        self.replays = Replays(context, self.submissions, self.gyro.intake)
+        self.replays = Replays(context, self.submissions, self.gyro.begin)
         self.zones = Zones(context)
         self.advice = AdviceService(context, self.submissions, self.zones)
         self.comparisons = Comparisons(context, self.submissions)
         self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
         self.adoptions = CalibrationAdoptions(context, self.replays.bulk.workers.restart)
         self.events = Events(context)
-        self.audit = Audit(context)
         self.expiries = ExpiryDates(context.reading_record)
         self.webhooks = Webhooks(context, self.access)
         self.upgrade = BackgroundUpgrade(
@@ -152,7 +154,7 @@ def open_app(
             if store.lock is None:
                 _end_left_work(app, serving)
         if store.lock is not None:
-            app.submissions.ingest.before_solving = app.adoptions.follow_in
+            app.submissions.before_solving = app.adoptions.follow_in
         app.single_projector.start(app.adoptions.follow)
         app.projector.start()
     except BaseException:

@@ -9,14 +9,14 @@ from typing import IO
 
 from msgspec.structs import replace
 
-from service.access.tokens import Caller, own_key
+from service.access.tokens import Caller
 from service.app.context import Context, known_id
-from service.app.submissions import Submissions
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import FrameLimits
 from service.imaging.overlay import draw_overlay, marks_of
 from service.imaging.submit import FrameIn
+from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import FromLastIn, Submission, submission_from_json
 from service.storage.models.pictures import Picture, picture_of
@@ -39,7 +39,7 @@ def _asks_for_last(known: FrameIn, mission: Mission) -> bool:
 class Frames:
     """Finds the stars on frames, in the solver pool: a frame takes about twenty bytes a pixel."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
         self._picture_turn = threading.BoundedSemaphore(1)
@@ -72,11 +72,11 @@ class Frames:
                 catalog = self._context.sky.catalog
                 return submit_frame(file, digest, known, mission, catalog, max_pixels)
 
-            return self._submissions.ingest.submit_made(
+            return self._submissions.queue_made(
                 (mission.name, known.run, known.batch_of(digest)),
                 known.fingerprint(mission.name, digest),
                 make,
-                own_key(caller, idempotency_key),
+                idempotency_key,
                 caller,
                 Future(),
                 is_long=True,

@@ -15,14 +15,9 @@ from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.day import LOOK_AHEAD_S, grade_day, window_of
 from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
-from service.storage.grades.days import DayKey, GradedDayRow, current_day, record_day, rows_of
+from service.storage.grades import days as recorded_days
+from service.storage.grades import period
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.grades.period import (
-    GradesOfPeriod,
-    evaluate_day,
-    grades_of_period,
-    list_innovations,
-)
 from service.storage.models.base import Page
 from service.storage.models.products import DefinitiveJob, Innovation
 from service.storage.queries.pages import ResultFilter
@@ -64,7 +59,7 @@ class SmoothProgress:
     """
 
     total: int
-    days: list[GradedDayRow] = field(default_factory=list)
+    days: list[recorded_days.GradedDayRow] = field(default_factory=list)
     new: set[str] = field(default_factory=set)
     empty: int = 0
     archived: int = 0
@@ -108,7 +103,7 @@ class Grades:
         progress = SmoothProgress(len(days))
         step(progress)
         for day in days:
-            self._smooth_day(mission, DayKey(name, run, day), progress)
+            self._smooth_day(mission, recorded_days.DayKey(name, run, day), progress)
             step(progress)
         return progress
 
@@ -126,22 +121,24 @@ class Grades:
         self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            return list_innovations(connection, selected, limit=limit, cursor=cursor)
+            return period.list_innovations(connection, selected, limit=limit, cursor=cursor)
 
-    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> GradesOfPeriod | None:
+    def of_period(self, name: str, run: str, start: Utc, end: Utc) -> period.GradesOfPeriod | None:
         """A bounded number of samples and innovations of a period; None where none are recorded."""
         self._context.mission(name)
         with self._context.reading() as connection:
-            return grades_of_period(connection, name, run, start, end)
+            return period.grades_of_period(connection, name, run, start, end)
 
-    def _smooth_day(self, mission: Mission, key: DayKey, progress: SmoothProgress) -> None:
+    def _smooth_day(
+        self, mission: Mission, key: recorded_days.DayKey, progress: SmoothProgress
+    ) -> None:
         window = window_of(key.day)
         with self._context.reading() as connection:
             if holds_any(connection, key.spacecraft, key.run, *window):
                 progress.archived += 1
                 return
             recorded = recorded_in(connection, self._context.sky, key.spacecraft, key.run, *window)
-            before = current_day(connection, key)
+            before = recorded_days.current_day(connection, key)
         inputs = inputs_digest(recorded, mission)
         if before is not None and before.inputs == inputs:
             progress.days.append(before)
@@ -150,13 +147,13 @@ class Grades:
         if before is None and not graded.samples:
             progress.empty += 1
             return
-        rows = rows_of(key, graded, inputs, self._ids.new(), utc_now())
+        rows = recorded_days.rows_of(key, graded, inputs, self._ids.new(), utc_now())
 
-        def change(connection: Connection) -> GradedDayRow:
-            recorded_day = record_day(connection, key, rows)
+        def change(connection: Connection) -> recorded_days.GradedDayRow:
+            recorded_day = recorded_days.record_day(connection, key, rows)
             # Another process may have recorded the same meanwhile.
             if recorded_day.id == rows[0]["id"]:
-                evaluate_day(connection, mission, key, recorded_day)
+                period.evaluate_day(connection, mission, key, recorded_day)
             return recorded_day
 
         row = self._context.change(change)

@@ -13,15 +13,7 @@ from service.app.calibrations import adopted_missions
 from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, load_missions, mission_named
 from service.missions.product_settings import MAX_LARGEST_GAP_S
-from service.products.attitudes import (
-    AttitudeRows,
-    AttitudeSeries,
-    ProductGrade,
-    SeriesInfo,
-    SeriesTracker,
-    StatusWanted,
-    series_of,
-)
+from service.products import attitudes as attitude_series
 from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
 from service.settings import Settings
@@ -35,7 +27,7 @@ from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.times import Utc, shifted, utc_now
 
-Pages = Iterator[AttitudeRows]
+Pages = Iterator[attitude_series.AttitudeRows]
 Order = Literal["oldest", "newest"]
 AROUND = 200
 """Batches on either side of a moment among which its attitude is looked for."""
@@ -62,14 +54,14 @@ class Products:
         run: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
-        status: StatusWanted = "good",
-        grade: ProductGrade = "raw",
+        status: attitude_series.StatusWanted = "good",
+        grade: attitude_series.ProductGrade = "raw",
         order: Order = "oldest",
         largest_gap_s: float | None = None,
         object_id: str | None = None,
         naif_id: int | None = None,
         most_batches: int | None = None,
-    ) -> AttitudeSeries:
+    ) -> attitude_series.AttitudeSeries:
         """The attitudes of a spacecraft's current results in a run; see `series_of`.
 
         Of the grades `filtered` and `smoothed` they are those of the latest revision of each day.
@@ -80,7 +72,7 @@ class Products:
         """
         mission = mission_named(self._missions, name)
         own = mission.products
-        about = SeriesInfo(
+        about = attitude_series.SeriesInfo(
             spacecraft=name,
             run=run or LIVE,
             created=utc_now().text,
@@ -96,7 +88,7 @@ class Products:
             # The mission's clock is that of its own id.
             sclk_kernel=own.sclk_kernel if naif_id in (None, own.naif_id) else None,
             trackers=tuple(
-                SeriesTracker(
+                attitude_series.SeriesTracker(
                     each.name, tuple(map(tuple, each.body_from_tracker.tolist())), each.sigma_arcsec
                 )
                 for each in mission.trackers
@@ -112,9 +104,9 @@ class Products:
         if grade == "raw" and largest_gap_s is None and not own.names_gap:
             about = replace(about, largest_gap_s=self._gap_of_cadence(about, selected))
         pages = self._pages(about, selected, newest_first=about.newest_first)
-        return series_of(about, pages)
+        return attitude_series.series_of(about, pages)
 
-    def _gap_of_cadence(self, about: SeriesInfo, selected: ResultFilter) -> float:
+    def _gap_of_cadence(self, about: attitude_series.SeriesInfo, selected: ResultFilter) -> float:
         """The largest gap of a period: its first batches tell the usual time between them."""
         first = next(self._pages(about, selected, page=AROUND), None)
         if first is None or len(first) < LEAST_OF_CADENCE:
@@ -122,7 +114,9 @@ class Products:
         usual_s = float(np.median(np.abs(np.diff(first.time_ns)))) * 1e-9
         return min(MAX_LARGEST_GAP_S, max(about.largest_gap_s, CADENCES * usual_s))
 
-    def _pages(self, about: SeriesInfo, selected: ResultFilter, **wanted: Any) -> Pages:
+    def _pages(
+        self, about: attitude_series.SeriesInfo, selected: ResultFilter, **wanted: Any
+    ) -> Pages:
         """The recorded attitudes of a period in a grade, page by page."""
         if about.grade == "raw":
             return attitude_pages(self._store.reading, self._store.archive, selected, **wanted)
@@ -135,8 +129,8 @@ class Products:
         method: AtMethod,
         *,
         run: str | None = None,
-        status: StatusWanted = "good",
-        grade: ProductGrade = "raw",
+        status: attitude_series.StatusWanted = "good",
+        grade: attitude_series.ProductGrade = "raw",
         largest_gap_s: float | None = None,
     ) -> AttitudeAt:
         """The attitude of a spacecraft at a moment; see `moment.attitude_at`."""

@@ -14,25 +14,18 @@ from sqlalchemy import Connection
 from service.access.audit import Entry
 from service.access.tokens import Caller
 from service.app.context import Context, checked_run_name, known_id
-from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
+from service.gyro import GyroBlock
 from service.ingest.bulk import Bulk, Check
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
-from service.ingest.submit import GyroIntake
+from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.readers.decompress import Coding, unpacked_lines
 from service.packets.upload import PacketLines
+from service.storage.gyro import Recorded
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
-from service.storage.queries.replays import (
-    UNFINISHED,
-    close_waiting,
-    find_replay,
-    list_replays,
-    mark_cancelled,
-    read_replay,
-    require_cancellable,
-)
+from service.storage.queries import replays
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms
 from service.times import utc_now
@@ -78,7 +71,12 @@ class UploadForm:
 class Replays:
     """Starts, cancels and reports replays."""
 
-    def __init__(self, context: Context, submissions: Submissions, gyro: GyroIntake) -> None:
+    def __init__(
+        self,
+        context: Context,
+        submissions: SubmissionService,
+        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
+    ) -> None:
         self._context = context
         config = WorkerConfig(
             context.missions,
@@ -87,12 +85,11 @@ class Replays:
             context.settings.shelf_mb << 20,
         )
         self.bulk = Bulk(
-            submissions.ingest,
-            gyro,
+            submissions,
+            begin_block,
             context.store,
             config,
             context.settings.replay_processes,
-            submissions.require_kernels,
         )
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()
@@ -168,13 +165,13 @@ class Replays:
                 log.warning("replay %s is not continued: %s", about.id, error)
                 self._given_up.add(about.id)
                 self._spool.release(about.id)
-                close = partial(close_waiting, id=about.id, now=utc_now().text)
+                close = partial(replays.close_waiting, id=about.id, now=utc_now().text)
                 self._context.change(close)
 
     def _resume(self, about: SpooledReplay) -> None:
         with self._context.reading_record() as connection:
-            stored = find_replay(connection, about.id)
-        if stored is None or stored.state not in (*UNFINISHED, "interrupted"):
+            stored = replays.find_replay(connection, about.id)
+        if stored is None or stored.state not in (*replays.UNFINISHED, "interrupted"):
             self._spool.drop(about.id)
             return
         bound = None if about.spacecraft is None else frozenset(about.spacecraft)
@@ -252,23 +249,25 @@ class Replays:
             raise NotFound(f"{caller.name} has started no replay with the id {id[:80]!r}")
         if replay is None:
             moment = utc_now().text
-            self._context.change(lambda connection: mark_cancelled(connection, known, moment))
+            self._context.change(
+                lambda connection: replays.mark_cancelled(connection, known, moment)
+            )
         elif not replay.is_over:
             replay.cancel()
             replay.wait(CANCEL_WAIT_S)
         cancelled = self.get(known)
-        require_cancellable(cancelled.state)
+        replays.require_cancellable(cancelled.state)
         return cancelled
 
     def all(self, spacecraft: Collection[str] | None = None) -> list[Replay]:
         """The latest replays, newest first; with `spacecraft`, see `list_replays`."""
         with self._context.reading() as connection:
-            return list_replays(connection, spacecraft)
+            return replays.list_replays(connection, spacecraft)
 
     def get(self, id: str) -> Replay:
         """A replay and how far it is, with the lines that were refused."""
         with self._context.reading_record() as connection:
-            return read_replay(connection, known_id(id, "replay"))
+            return replays.read_replay(connection, known_id(id, "replay"))
 
     def processes(self) -> int:
         """How many processes beside this one are ready to compute replays."""

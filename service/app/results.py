@@ -10,10 +10,10 @@ from service.access.audit import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
 from service.advice.advice import RunAgain
 from service.app.context import ALL_RUNS, Context, known_id
-from service.app.submissions import Submissions
 from service.errors import Busy, NotFound
 from service.ingest.compare_options import ComparedSample, Pair, compare
 from service.ingest.solver_pool import mission_in_input
+from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
@@ -40,7 +40,7 @@ from service.times import Utc, utc_now
 class Results:
     """Reads recorded results."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
 
@@ -174,9 +174,7 @@ class Results:
         """
         known = known_id(id, "batch")
         self._submissions.require_kernels()
-        return self._submissions.ingest.what_if(
-            known, options, record=record, adopt=adopt, entry=entry
-        )
+        return self._submissions.what_if(known, options, record=record, adopt=adopt, entry=entry)
 
 
 COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
@@ -196,7 +194,7 @@ class Stretch:
 class Comparisons:
     """Compares sets of options, or settings, for one caller at a time."""
 
-    def __init__(self, context: Context, submissions: Submissions) -> None:
+    def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
         self._lock = threading.Lock()
@@ -221,7 +219,7 @@ class Comparisons:
         `Busy` while the service is computing another comparison.
         """
         mission = mission_named(self._context.missions, name)
-        again = self._submissions.ingest.run_again
+        again = self._submissions.run_again
 
         def pair_of(row: Row) -> Pair:
             own = batch_with_options(row["input"], row["options"])
@@ -251,7 +249,7 @@ class Comparisons:
             batch = batch_with_options(row["input"], row["options"])
             return Pair(row["id"], batch, batch)
 
-        again = self._submissions.ingest.run_again
+        again = self._submissions.run_again
         sides = partial(again, mission=a), partial(again, mission=b)
         return self._compared(stretch, pair_of, sides, ({}, {}), limit_s)
 

@@ -1,4 +1,4 @@
-"""The service itself: readiness, its description, its log of events, and the audit list."""
+"""The service itself: readiness, its description, and its log of events."""
 
 import gc
 import logging
@@ -8,20 +8,17 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from msgspec import structs
 
 from service import __version__
-from service.access import audit
 from service.acquire.kernel_build import KernelBuild, progress_logged
 from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
-from service.app.submissions import Submissions
 from service.errors import AcquisitionError, Busy
 from service.ingest.solver_pool import mission_in_input
+from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.models.access import AuditEntry
-from service.storage.models.base import Page
 from service.storage.models.overview import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording import events
@@ -48,7 +45,7 @@ class Service:
     def __init__(
         self,
         context: Context,
-        submissions: Submissions,
+        submissions: SubmissionService,
         replays: Replays,
         kernels: KernelBuild | None,
         upgrade: BackgroundUpgrade,
@@ -159,7 +156,7 @@ class Service:
                 self._prewarm_sky([mission], sent.batch.time)
                 for _ in range(1 + WARM_UP_RUNS // len(inputs)):
                     batch = structs.replace(sent.batch, batch=self._ids.new())
-                    self._submissions.ingest.warm_up(structs.replace(sent, batch=batch))
+                    self._submissions.warm_up(structs.replace(sent, batch=batch))
             except Exception as error:
                 # A batch that no longer runs must not prevent the start.
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
@@ -208,15 +205,3 @@ class Events:
     def unlisten(self, listener: Callable[[], object]) -> None:
         """Stop calling a function after each commit that has events."""
         self._context.store.writer.after_events.remove(listener)
-
-
-class Audit:
-    """Reads the audit list."""
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-
-    def page(self, limit: int = 100, cursor: str | None = None) -> Page[AuditEntry]:
-        """The audit list of changes, newest first."""
-        with self._context.reading() as connection:
-            return audit.list_entries(connection, limit, cursor)

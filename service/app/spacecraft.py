@@ -13,21 +13,13 @@ from service.errors import BadBatch, Fault, shown_value
 from service.missions.mission import Mission
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
+from service.storage.models import spacecraft as records
 from service.storage.models.base import Page
 from service.storage.models.overview import Overview
-from service.storage.models.spacecraft import (
-    AttitudeRow,
-    History,
-    MissionNow,
-    Ranking,
-    Rates,
-    SpacecraftRow,
-    SpacecraftState,
-)
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
-from service.storage.recording.tracker_values import is_waiting
+from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now, utc_of_unix
 
@@ -58,7 +50,7 @@ class Spacecraft:
         with self._context.reading() as connection:
             return fleet.fleet(connection, missions, run, period, utc_now(), spacecraft)
 
-    def states(self, run: str | None = None) -> list[SpacecraftRow]:
+    def states(self, run: str | None = None) -> list[records.SpacecraftRow]:
         """Every spacecraft, retired ones included, with its state in a run."""
         moment = utc_now()
         with self._context.reading() as connection:
@@ -67,15 +59,15 @@ class Spacecraft:
                 for mission in self._context.known.values()
             ]
 
-    def state(self, name: str, run: str | None = None) -> SpacecraftState:
+    def state(self, name: str, run: str | None = None) -> records.SpacecraftState:
         """One spacecraft's state in a run, its mission's settings and their history."""
         mission = self._context.mission(name)
         with self._context.reading() as connection:
             state = histories.live_state(connection, mission, run or LIVE, utc_now())
             settings = mission.model_dump(mode="json")
-            return SpacecraftState(
+            return records.SpacecraftState(
                 **structs.asdict(state),
-                mission=MissionNow(digest=mission.digest, settings=settings),
+                mission=records.MissionNow(digest=mission.digest, settings=settings),
                 history=histories.mission_history(connection, name),
             )
 
@@ -88,7 +80,7 @@ class Spacecraft:
         end: Utc | None = None,
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[AttitudeRow]:
+    ) -> Page[records.AttitudeRow]:
         """The attitudes of current results, oldest batch time first."""
         self._context.mission(name)
         stretch = ResultFilter(run or LIVE, name, start, end)
@@ -105,7 +97,7 @@ class Spacecraft:
         start: Utc | None = None,
         end: Utc | None = None,
         bucket: time_buckets.Bucket = "hour",
-    ) -> list[Rates]:
+    ) -> list[records.Rates]:
         """Stars by outcome over all observed ones, in UTC hours or days by batch time.
 
         Raises `BadInput` for a period with too many of them.
@@ -127,7 +119,7 @@ class Spacecraft:
         size: int = 500,
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
-    ) -> History:
+    ) -> records.History:
         """Histories of quantities, all of them unless named, in at most `size` points each.
 
         `minmax` gives buckets with mean, least and greatest, `latest` the newest
@@ -150,7 +142,7 @@ class Spacecraft:
         end: Utc | None = None,
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
-    ) -> Iterator[History]:
+    ) -> Iterator[records.History]:
         """The history of every batch of a period, in pages; see `trends.every_batch`."""
         mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
@@ -168,7 +160,7 @@ class Spacecraft:
         end: Utc | None = None,
         limit: int = 20,
         tracker: str | None = None,
-    ) -> Ranking:
+    ) -> records.Ranking:
         """The batches of a period with the worst values of a quantity, worst first.
 
         With a tracker they are ranked by its own values.
@@ -179,7 +171,9 @@ class Spacecraft:
         with self._context.reading() as connection:
             own = self._split_tracker(mission, tracker)
             items = worst_batches(connection, stretch, by, limit, own)
-            return Ranking(by=by, items=items, **_named(connection, mission, run or LIVE, tracker))
+            return records.Ranking(
+                by=by, items=items, **_named(connection, mission, run or LIVE, tracker)
+            )
 
     def _split_tracker(self, mission: Mission, tracker: str | None) -> str | None:
         """The tracker whose own values are read; None where the spacecraft's are.
@@ -234,7 +228,7 @@ BUCKET_PARTS = {
 }
 
 
-def history_table(history: History) -> Table:
+def history_table(history: records.History) -> Table:
     """The table of a history; see `trends.history`."""
     if history.strategy == "latest":
         return batch_table(iter([history]))
@@ -249,7 +243,7 @@ def history_table(history: History) -> Table:
     return Table([*BUCKET_COLUMNS, *columns], [page], _about(history))
 
 
-def batch_table(pages: Iterator[History]) -> Table:
+def batch_table(pages: Iterator[records.History]) -> Table:
     """The table of pages of batches; see `trends.every_batch`.
 
     The first page is read at once: its errors are raised here.
@@ -259,7 +253,7 @@ def batch_table(pages: Iterator[History]) -> Table:
     return Table(columns, (_batch_page(page) for page in chain([first], pages)), _about(first))
 
 
-def _batch_page(page: History) -> TablePage:
+def _batch_page(page: records.History) -> TablePage:
     values: list[Any] = [each.value for each in page.series.values()]
     return [*(getattr(page, each.name) for each in BATCH_COLUMNS), *values]
 
@@ -272,7 +266,7 @@ def _column(name: QuantityName, part: str = "", meaning: str = "") -> Column:
     return Column(f"{name}_{part}" if part else name, unit=quantity.unit, description=about)
 
 
-def _about(history: History) -> dict[str, str]:
+def _about(history: records.History) -> dict[str, str]:
     return {
         "product": "history",
         "spacecraft": history.spacecraft,

@@ -8,17 +8,9 @@ from service import __version__
 from service.app.context import Context, known_id
 from service.errors import NotFound
 from service.products.tdm import TrackedObject, write_tdm
+from service.storage import tracks
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.tracks import (
-    RecordedBatches,
-    Track,
-    TrackList,
-    TrackPoint,
-    batches_around,
-    batches_of_period,
-    unexplained_points,
-)
 from service.times import Utc, shifted, utc_now
 from service.tracks.finding import Track as FoundTrack
 from service.tracks.finding import figures, find_tracks
@@ -45,7 +37,7 @@ class Tracks:
         start: Utc | None = None,
         end: Utc | None = None,
         most_batches: int = MOST_BATCHES,
-    ) -> TrackList:
+    ) -> tracks.TrackList:
         """The tracks of a spacecraft's batches in a period; see `find_tracks`.
 
         Raises `BadBatch` where the period has more than `most_batches`, or too many points.
@@ -53,16 +45,16 @@ class Tracks:
         self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
         with self._context.reading() as connection:
-            recorded = batches_of_period(connection, selected, most_batches)
+            recorded = tracks.batches_of_period(connection, selected, most_batches)
         return _tracks(name, run or LIVE, recorded)
 
-    def through_batch(self, id: str, spacecraft: str, run: str) -> TrackList:
+    def through_batch(self, id: str, spacecraft: str, run: str) -> tracks.TrackList:
         """The tracks with a point in one result, from it and `EACH_SIDE` batches on either side."""
         with self._context.reading() as connection:
-            recorded = batches_around(connection, known_id(id, "batch"), EACH_SIDE)
+            recorded = tracks.batches_around(connection, known_id(id, "batch"), EACH_SIDE)
         found = _tracks(spacecraft, run, recorded)
         own = [each for each in found.items if any(point.id == id for point in each.points)]
-        return TrackList(
+        return tracks.TrackList(
             spacecraft=spacecraft,
             run=run,
             batches=found.batches,
@@ -72,7 +64,7 @@ class Tracks:
             items=own,
         )
 
-    def tdm(self, found: TrackList) -> Iterator[bytes]:
+    def tdm(self, found: tracks.TrackList) -> Iterator[bytes]:
         """The moving tracks as a CCSDS TDM; raises `NotFound` where there is none."""
         mission = self._context.mission(found.spacecraft)
         moving = [each for each in found.items if each.kind == "moving"]
@@ -89,7 +81,7 @@ def _begin(each: TrackedObject) -> str:
     return each.time[0]
 
 
-def _tracked(track: Track) -> TrackedObject:
+def _tracked(track: tracks.Track) -> TrackedObject:
     rate, sigma = track.rate_arcsec_per_s, track.sigma_rate_arcsec_per_s
     return TrackedObject(
         name=f"TRACK-{track.time[:19]}-{track.ra_deg:.2f}{track.dec_deg:+.2f}",
@@ -105,11 +97,11 @@ def _tracked(track: Track) -> TrackedObject:
     )
 
 
-def _tracks(name: str, run: str, recorded: RecordedBatches) -> TrackList:
-    gathered = unexplained_points(recorded)
+def _tracks(name: str, run: str, recorded: tracks.RecordedBatches) -> tracks.TrackList:
+    gathered = tracks.unexplained_points(recorded)
     points, batches = gathered.points, gathered.batches
     found = find_tracks(points, batches)
-    return TrackList(
+    return tracks.TrackList(
         spacecraft=name,
         run=run,
         batches=len(recorded.rows),
@@ -120,13 +112,13 @@ def _tracks(name: str, run: str, recorded: RecordedBatches) -> TrackList:
     )
 
 
-def _record(track: FoundTrack, points: Points, batches: Batches) -> Track:
+def _record(track: FoundTrack, points: Points, batches: Batches) -> tracks.Track:
     own, numbers = track.own, figures(track, points)
     first = batches.time[0]
     moments = [shifted(first, each).text for each in points.time_s[own].tolist()]
     ra_deg, dec_deg = to_ra_dec(points.direction[own])
     magnitude = points.magnitude_mag[own]
-    return Track(
+    return tracks.Track(
         kind=track.kind,
         planet=track.planet,
         planet_offset_arcsec=track.planet_offset_arcsec,
@@ -149,7 +141,7 @@ def _record(track: FoundTrack, points: Points, batches: Batches) -> Track:
         degrees_of_freedom=numbers.degrees_of_freedom,
         log10_expected=track.log10_expected,
         points=[
-            TrackPoint(
+            tracks.TrackPoint(
                 id=batches.id[points.batch[k]],
                 tracker=points.trackers[points.tracker[k]],
                 star=int(points.number[k]),

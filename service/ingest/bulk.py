@@ -15,9 +15,8 @@ import msgspec
 from service.errors import AcquisitionError, Busy
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
-from service.ingest.outcomes import Answers
 from service.ingest.solver_pool import Solver
-from service.ingest.submit import GyroIntake, SubmissionService
+from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.batch import ObservationBatch
 from service.observations.schema import Submission, submission_from_json
@@ -169,16 +168,14 @@ class Bulk:
     def __init__(
         self,
         submissions: SubmissionService,
-        gyro: GyroIntake,
+        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
         store: Store,
         config: WorkerConfig,
         workers: int,
-        require_kernels: Require,
     ) -> None:
-        """`require_kernels` raises `Busy` while kernels are compiled."""
-        self._submissions = submissions
-        self._require_kernels = require_kernels
-        self.gyro = gyro
+        """`begin_block` queues a gyro block; see `Gyro.begin`."""
+        self.submissions = submissions
+        self.begin_block = begin_block
         self._store = store
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
             config, solve_lines, workers
@@ -206,7 +203,7 @@ class Bulk:
     @property
     def _gives_way(self) -> bool:
         """True if batches come one by one as well."""
-        return self._submissions.idle_s < INTERACTIVE_WINDOW_S
+        return self.submissions.idle_s < INTERACTIVE_WINDOW_S
 
     def begin(
         self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
@@ -217,9 +214,9 @@ class Bulk:
         ends that where it raises.
         """
         # Without them each worker would compile what it does not find.
-        self._require_kernels()
+        self.submissions.require_kernels()
         self.workers.start()
-        self._submissions.yield_to_interactive()
+        self.submissions.yield_to_interactive()
         named = [identity_in(text, run) for text in texts]
         with self._store.reading_record() as connection:
             registry = look_up(connection, {each for each in named if each is not None})
@@ -243,28 +240,16 @@ class Bulk:
             made = []
             for each in fresh:
                 require()
-                made.append(self.solve_here(each))
+                made.append(self.submissions.solve_one_of_many(each))
             return made
 
-        asks_for_last = self._submissions.solver.asks_for_last
+        asks_for_last = self.submissions.solver.asks_for_last
         return line_results(lines, unsaved_results, asks_for_last)
 
     def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
         """Record a line that asks for the last attitude, when all before it are recorded."""
-        self._submissions.yield_to_interactive()
-        return self._submissions.submit_tracked(submission_from_json(line.text))
-
-    def asks_for_last(self, submission: Submission) -> bool:
-        """True if a line asks for the last attitude."""
-        return self._submissions.solver.asks_for_last(submission.batch)
-
-    def solve_here(self, submission: Submission) -> UnsavedResult | AcquisitionError:
-        """The result of one line, computed when no single post waits."""
-        return self._submissions.solve_one_of_many(submission)
-
-    def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
-        """Queue results for a transaction of their own; the function returned waits for it."""
-        return self._submissions.begin_writing(unsaved_results)
+        self.submissions.yield_to_interactive()
+        return self.submissions.submit_tracked(submission_from_json(line.text))
 
 
 class BulkChunk:
@@ -296,11 +281,11 @@ class BulkChunk:
             if isinstance(each, GyroBlock) and place not in self._begun:
                 self._begun[place] = self._begin_block(each)
         unsaved_results = [each for each in self._decided if isinstance(each, UnsavedResult)]
-        self._finish = self._bulk.begin_writing(unsaved_results)
+        self._finish = self._bulk.submissions.begin_writing(unsaved_results)
 
     def _begin_block(self, block: GyroBlock) -> Callable[[], LineAnswer]:
         try:
-            return self._bulk.gyro.begin(block)
+            return self._bulk.begin_block(block)
         except Busy:
             raise
         except AcquisitionError as error:
@@ -375,13 +360,15 @@ class BulkChunk:
     def _repeat(
         self, text: bytes, seen: RecordedLine
     ) -> UnsavedResult | TrackedLine | Answered | AcquisitionError:
-        first = self._registry.first(seen.identity, None, seen.fingerprint)
+        first = self._registry.holder(seen.identity, None, seen.fingerprint)
+        if isinstance(first, AcquisitionError):
+            return first
         if first is None:
             # It is not called what it seemed to be called.
             submission = submission_from_json(text, run=self._lines.run)
-            if self._bulk.asks_for_last(submission):
+            if self._bulk.submissions.solver.asks_for_last(submission.batch):
                 return TrackedLine(seen.identity, submission.text)
-            return self._bulk.solve_here(submission)
+            return self._bulk.submissions.solve_one_of_many(submission)
         answer = self._stored[first.result_id]
         if isinstance(answer, AcquisitionError):
             # The archive may be out of reach for long: the other lines do not wait for it.

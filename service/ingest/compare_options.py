@@ -17,16 +17,8 @@ from service.acquire import Acquisition
 from service.advice.advice import RunAgain
 from service.alarms.quantities import QUANTITIES
 from service.observations.batch import ObservationBatch
+from service.storage.models import compare as records
 from service.storage.models.answers import StarCounts
-from service.storage.models.compare import (
-    BatchChange,
-    ComparedAttitudes,
-    ComparedSide,
-    Comparison,
-    StarChange,
-    StarSide,
-    Transition,
-)
 from service.storage.recording.answer import StarRow, star_rows
 from service.storage.recording.result_metrics import metrics_of
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
@@ -62,9 +54,9 @@ class _Side:
             self.ratios.append(ratio)
         self.work_us.append(sum(acquisition.timings_us.values()))
 
-    def record(self, options: dict[str, Any]) -> ComparedSide:
+    def record(self, options: dict[str, Any]) -> records.ComparedSide:
         names = ("observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
-        return ComparedSide(
+        return records.ComparedSide(
             options=options,
             **{name: int(self.counts[name]) for name in names},
             residual_ratio_mean=fmean(self.ratios) if self.ratios else None,
@@ -95,7 +87,7 @@ class ComparisonTally:
     renamed: int = 0
     attitudes: "Counter[str]" = field(default_factory=Counter)
     angles_arcsec: list[float] = field(default_factory=list)
-    changed: list[BatchChange] = field(default_factory=list)
+    changed: list[records.BatchChange] = field(default_factory=list)
     changed_batches: int = 0
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
@@ -123,10 +115,10 @@ class ComparisonTally:
         options: tuple[dict[str, Any], dict[str, Any]],
         *,
         cut_short: bool,
-    ) -> Comparison:
+    ) -> records.Comparison:
         """The whole comparison; `options` are those of both sides."""
         angles = self.angles_arcsec
-        return Comparison(
+        return records.Comparison(
             spacecraft=sample.spacecraft,
             run=sample.run,
             start=sample.first,
@@ -138,11 +130,11 @@ class ComparisonTally:
             a=self.a.record(options[0]),
             b=self.b.record(options[1]),
             transitions=[
-                Transition(from_=one, to=other, stars=stars)
+                records.Transition(from_=one, to=other, stars=stars)
                 for (one, other), stars in sorted(self.transitions.items())
             ],
             renamed=self.renamed,
-            attitudes=ComparedAttitudes(
+            attitudes=records.ComparedAttitudes(
                 **{name: self.attitudes[name] for name in _WHICH.values()},
                 angle_arcsec_median=median(angles) if angles else None,
                 angle_arcsec_max=max(angles) if angles else None,
@@ -178,8 +170,8 @@ def _changed(
     b: Acquisition,
     differing: Sequence[tuple[StarRow, StarRow]],
     angle_arcsec: float | None,
-) -> BatchChange:
-    return BatchChange(
+) -> records.BatchChange:
+    return records.BatchChange(
         id=pair.id,
         batch=pair.a.batch,
         time=pair.a.time.text,
@@ -187,14 +179,16 @@ def _changed(
         b=StarCounts(**b.counts),
         attitude_angle_arcsec=angle_arcsec,
         stars=[
-            StarChange(tracker=one.tracker, position=one.position, a=_star(one), b=_star(other))
+            records.StarChange(
+                tracker=one.tracker, position=one.position, a=_star(one), b=_star(other)
+            )
             for one, other in differing
         ],
     )
 
 
-def _star(star: StarRow) -> StarSide:
-    return StarSide(outcome=star.outcome, star=star.star_id)
+def _star(star: StarRow) -> records.StarSide:
+    return records.StarSide(outcome=star.outcome, star=star.star_id)
 
 
 def _named(star: StarRow) -> tuple[str, str | None]:

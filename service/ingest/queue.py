@@ -28,9 +28,15 @@ from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
 from service.storage.recording.identity import Identity, OwnKey, PredictionOutdated
-from service.storage.recording.transaction import QueuedJob, WriteOutcome, WriteOutcomes
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.recording.writer import RETRY_AFTER_S, Writer, WriterState
+from service.storage.recording.writer import (
+    RETRY_AFTER_S,
+    QueuedJob,
+    WriteOutcome,
+    WriteOutcomes,
+    Writer,
+    WriterState,
+)
 from service.times import Utc, utc_now
 
 MAX_WAITING = 2_000

@@ -14,17 +14,8 @@ from sqlalchemy import Connection
 from service.errors import AcquisitionError, Stopping, problem_of
 from service.packets.reader import PacketTotals
 from service.storage.gyro import Recorded
+from service.storage.models import runs as records
 from service.storage.models.base import FieldFault
-from service.storage.models.runs import (
-    LineProblem,
-    RefusedLine,
-    Replay,
-    ReplayCounts,
-    ReplayLines,
-    ReplayPackets,
-    ReplayProgress,
-    ReplayStateName,
-)
 from service.storage.queries.replays import (
     CANCELLED,
     insert_replay,
@@ -65,7 +56,7 @@ class ProgressRecorder:
         self,
         store: Store,
         now: Callable[[], str],
-        replay: Replay,
+        replay: records.Replay,
         on_cancelled: Callable[[], object],
     ) -> None:
         """`on_cancelled` is called in the writer's thread where the row says `cancelled`."""
@@ -98,7 +89,9 @@ class ProgressRecorder:
     def insert(self, also: Callable[[Connection], object]) -> None:
         """Store the replay as new; `also` is called in the same transaction."""
         progress = self._progress("running", None)
-        replay = Replay(**structs.asdict(progress), packets=self._packet_counts(), errors=[])
+        replay = records.Replay(
+            **structs.asdict(progress), packets=self._packet_counts(), errors=[]
+        )
 
         def store(connection: Connection) -> None:
             insert_replay(connection, replay)
@@ -121,7 +114,7 @@ class ProgressRecorder:
         """Count a refused line; an error that `ends` the replay is kept in any case."""
         self._refused += 1
         if len(self._errors) < MAX_ERRORS_KEPT or ends:
-            self._errors.append(RefusedLine(line=number, problem=_shortened_problem(error)))
+            self._errors.append(records.RefusedLine(line=number, problem=_shortened_problem(error)))
             self._errors_changed = True
 
     def save_sometimes(self) -> None:
@@ -130,7 +123,7 @@ class ProgressRecorder:
             self.save("running")
             self._saved_s = time.monotonic()
 
-    def save(self, state: ReplayStateName, finished: str | None = None) -> None:
+    def save(self, state: records.ReplayStateName, finished: str | None = None) -> None:
         """Queue the present progress for the writer; it is stored while the next chunk is solved.
 
         A replay that another process has cancelled stays cancelled.
@@ -165,7 +158,7 @@ class ProgressRecorder:
         except Exception as error:
             self._not_saved(error)
 
-    def conclude(self, state: ReplayStateName, closing: threading.Event) -> None:
+    def conclude(self, state: records.ReplayStateName, closing: threading.Event) -> None:
         """Store the state at the end; try again until that succeeds or the service closes.
 
         Nothing else would say that the replay is over.
@@ -178,25 +171,27 @@ class ProgressRecorder:
                 return
             pause_s = min(2.0 * pause_s, LONGEST_PAUSE_S)
 
-    def _progress(self, state: ReplayStateName, finished: str | None) -> ReplayProgress:
+    def _progress(
+        self, state: records.ReplayStateName, finished: str | None
+    ) -> records.ReplayProgress:
         total = self._started_as.lines.total
         return structs.replace(
             self._started_as,
             state=state,
-            lines=ReplayLines(total=total, done=self.lines_done, refused=self._refused),
-            counts=ReplayCounts(
-                **{name: self._counts[name] for name in ReplayCounts.__struct_fields__}
+            lines=records.ReplayLines(total=total, done=self.lines_done, refused=self._refused),
+            counts=records.ReplayCounts(
+                **{name: self._counts[name] for name in records.ReplayCounts.__struct_fields__}
             ),
             finished=finished,
         )
 
-    def _packet_counts(self) -> ReplayPackets | None:
+    def _packet_counts(self) -> records.ReplayPackets | None:
         totals = self.packets()
         if totals is None:
             return None
         most = sorted(totals.apids, key=lambda each: -each.packets)[:MAX_APIDS_KEPT]
         kept = structs.replace(totals, apids=sorted(most, key=lambda each: each.apid))
-        return msgspec.convert(msgspec.to_builtins(kept), ReplayPackets)
+        return msgspec.convert(msgspec.to_builtins(kept), records.ReplayPackets)
 
     def _not_saved(self, error: Exception) -> None:
         # The next save has the same and more; the batches themselves are recorded.
@@ -206,16 +201,16 @@ class ProgressRecorder:
         log.warning("progress of replay %s not stored: %s", self.id, error)
 
 
-def _shortened_problem(error: Exception) -> LineProblem:
+def _shortened_problem(error: Exception) -> records.LineProblem:
     """The problem of a line: its first faults, long texts shortened."""
     problem = problem_of(error)
     if "errors" not in problem:
-        return LineProblem(detail=_shortened(problem["detail"]), errors=UNSET)
+        return records.LineProblem(detail=_shortened(problem["detail"]), errors=UNSET)
     faults = [
         FieldFault(**{name: text and _shortened(text) for name, text in fault.items()})
         for fault in problem["errors"][:MAX_FAULTS_KEPT]
     ]
-    return LineProblem(detail=_shortened(problem["detail"]), errors=faults)
+    return records.LineProblem(detail=_shortened(problem["detail"]), errors=faults)
 
 
 def _shortened(text: str) -> str:

@@ -21,7 +21,6 @@ from service.errors import (
     Stopping,
     shown_value,
 )
-from service.ingest.tracking import asks_for_last
 from service.missions.mission import Mission, mission_named
 from service.observations.batch import ObservationBatch, TrackerStars
 from service.observations.schema import Submission
@@ -83,7 +82,12 @@ class Solver:
 
         False for an unknown spacecraft, whose batch is refused.
         """
-        return asks_for_last(batch, self.missions.get(batch.spacecraft))
+        if batch.tracking is not None:
+            return not batch.tracking.resolved
+        mission = self.missions.get(batch.spacecraft)
+        settings = None if mission is None else mission.tracking
+        is_default = settings is not None and settings.default
+        return is_default and batch.a_priori is None and batch.measurement is None
 
     def solve(
         self,
@@ -163,6 +167,8 @@ def may_take_long(batch: ObservationBatch) -> bool:
 
 def _most_stars(stars: TrackerStars) -> int:
     """The stars of a tracker; of a raster, as many as its lines can show."""
+    if not stars.readings:
+        return stars.count
     lines = [each for each in stars.readings if each is not None and each.kind == "lines"]
     # A star is a line that is brighter than its neighbours, in both directions.
     return stars.count + sum(min(len(each.h), len(each.v)) // 2 for each in lines)

@@ -1,58 +1,48 @@
-"""From a submission to its stored answer: compute, one transaction, answer; and gyro blocks."""
+"""From a submission to its stored answer: read the body, compute, one transaction, answer."""
 
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
-from typing import TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
+from msgspec import Struct
+from pydantic import Field, TypeAdapter, ValidationError
+from pydantic_core import to_json
 from sqlalchemy import Connection
 
 from service.access.audit import Entry
-from service.access.tokens import Caller, own_key
+from service.access.tokens import Caller
 from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
-from service.errors import AcquisitionError, Busy
-from service.gyro import GyroBlock, require_rates_within
-from service.ingest.outcomes import (
-    Answers,
-    Observer,
-    Recorded,
-    check_key,
-    decided,
-    holder_of,
-    note_handed_over,
-    outcome_of,
-)
+from service.acquire.kernel_build import KernelBuild
+from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
 from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.ingest.tracking import last_results, with_prediction
-from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.schema import OptionsIn, Submission
+from service.observations.faults import faults_of
+from service.observations.schema import OptionsIn, Submission, submission_from_json
 from service.sky.model import SkyModel
-from service.storage.gyro import Recorded as RecordedBlock
-from service.storage.gyro import find_block, record_block, row_of
 from service.storage.queries.recorded_batch import batch_with_options
 from service.storage.queries.results import read_parent
 from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,
     Identity,
-    OwnKey,
     Registry,
     identity_of,
     look_up,
     remember_key,
 )
-from service.storage.recording.ids import Ulids
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
+from service.storage.recording.writer import WriteOutcomes
 from service.storage.store import Store
 from service.times import utc_now
 
@@ -60,8 +50,32 @@ log = logging.getLogger(__name__)
 
 YIELD_S = 0.002
 """The longest wait of each bulk batch for single posts."""
+MAX_ARRAY = 100
+"""The most batches of an array."""
+READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
+"""A body within both bounds is read in the event loop; thirty stars fit."""
+MAX_KEY_LENGTH = 255
+
+_ARRAY: TypeAdapter[list[Any]] = TypeAdapter(
+    Annotated[list[Any], Field(min_length=1, max_length=MAX_ARRAY)]
+)
+
+Answers = list[Answered | AcquisitionError]
+Outcome = Answered | BaseException
 
 
+class Recorded(Struct, frozen=True, eq=False):
+    """A newly recorded batch, as observers receive it."""
+
+    spacecraft: str
+    run: str
+    batch: str
+    counts: Mapping[str, int]
+    """Its stars: observed, and of them unique, ambiguous and unmatched."""
+    has_attitude: bool
+
+
+Observer = Callable[[Recorded], None]
 AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
 
 
@@ -72,10 +86,19 @@ class _WarmedUp(Exception):
 class SubmissionService:
     """Each submission is identified, solved and recorded once, however often it is sent."""
 
-    def __init__(self, missions: Mapping[str, Mission], sky: SkyModel, store: Store) -> None:
+    def __init__(
+        self,
+        missions: Mapping[str, Mission],
+        sky: SkyModel,
+        store: Store,
+        kernels: KernelBuild | None = None,
+    ) -> None:
+        """With `kernels`, batches are refused until those that they need are compiled."""
         self.pool = SolverPool()
         self.solver = Solver(missions, replace(sky, builder=self.pool.builder))
         self._store = store
+        self._kernels = kernels
+        self._reader = ThreadPoolExecutor(1, "read")
         self._queue = IngestQueue(
             *(self._recorded_before, self._solve, self._solve_together, self._note_outcome),
             *(store.writer, self.pool),
@@ -83,10 +106,79 @@ class SubmissionService:
         self._single_s = -float("inf")
         self.observers: list[Observer] = []
         """Called with every batch that is new, after its commit."""
-        self.before_solving: Callable[[Connection], object] = lambda connection: None
+        self.before_solving: Callable[[Connection], object] | None = None
         """Called before each group of submissions is solved, with a connection for look-ups."""
 
+    def require_kernels(self, *, of_zones: bool = False) -> None:
+        """Raise `Busy` while kernels are compiled: no answer depends on which ones exist.
+
+        `of_zones`: those of batches with a zone suffice.  A batch that needs others, without a
+        priori attitude or with a wrong one, is refused where it needs them: by
+        `SkyModel.require_whole_sky`.
+        """
+        if self._kernels is not None and (self._kernels.zones_needed or not of_zones):
+            self._kernels.require_built()
+
+    # ---- one batch, or an array --------------------------------------------------------------
+
+    async def answered(
+        self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
+    ) -> Answered:
+        """`submit` of a JSON body, for an event loop.
+
+        A small batch is read in the event loop.  A larger one is not: every other request
+        would wait for it.
+        """
+        self.require_kernels(of_zones=True)
+        loop = asyncio.get_running_loop()
+        if len(sent) <= READ_HERE_BYTES and sent.count(b"{") <= READ_HERE_OBJECTS:
+            submission = submission_from_json(sent)
+        else:
+            submission = await loop.run_in_executor(self._reader, submission_from_json, sent)
+        future: asyncio.Future[Answered] = loop.create_future()
+        return await self.queued(submission, idempotency_key, caller, future)
+
+    async def read_array(self, sent: bytes) -> list[Submission | BadBatch]:
+        """The batches of a JSON array; in the place of one that is refused, its error.
+
+        Raises `BadBatch` where the body is no array of one to `MAX_ARRAY` elements.
+        """
+        self.require_kernels(of_zones=True)
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._reader, _submissions_of_array, sent)
+
+    async def answered_each(
+        self, read: Sequence[Submission | BadBatch], caller: Caller | None = None
+    ) -> list[Outcome]:
+        """`submit` each of the batches of an array; the answers and errors in their order."""
+        loop = asyncio.get_running_loop()
+        futures: list[asyncio.Future[Answered]] = []
+        for each in read:
+            future: asyncio.Future[Answered] = loop.create_future()
+            futures.append(future)
+            try:
+                if isinstance(each, BadBatch):
+                    raise each
+                self.queued(each, None, caller, future)
+            except AcquisitionError as error:
+                future.set_exception(error)
+        return list(await asyncio.gather(*futures, return_exceptions=True))
+
     def submit(
+        self,
+        submission: Submission,
+        idempotency_key: str | None = None,
+        caller: Caller | None = None,
+    ) -> Answered:
+        """Record a batch and answer it; a repeat gets the stored answer.
+
+        Raises what `queued` and its future raise: `KeyReused` and `Conflict` for another body
+        under a key or a batch that is taken, `BadBatch` also for an unknown spacecraft and for
+        what does not fit its mission.
+        """
+        return self.queued(submission, idempotency_key, caller, Future()).result()
+
+    def queued(
         self,
         submission: Submission,
         idempotency_key: str | None,
@@ -100,28 +192,25 @@ class SubmissionService:
         The future raises what else keeps the batch from being recorded.
         """
         batch = submission.batch
-        identity = identity_of(batch)
         if caller is not None:
-            caller.require(identity[0])
-        return self.submit_made(
-            identity,
+            caller.require(batch.spacecraft)
+        return self.queue_made(
+            identity_of(batch),
             submission.fingerprint,
             lambda: submission,
-            own_key(caller, idempotency_key),
+            idempotency_key,
             caller,
             future,
             is_long=may_take_long(batch),
-            tracked_ns=submission.batch.time.tai_ns
-            if self.solver.asks_for_last(submission.batch)
-            else None,
+            tracked_ns=batch.time.tai_ns if self.solver.asks_for_last(batch) else None,
         )
 
-    def submit_made(
+    def queue_made(
         self,
         identity: Identity,
         fingerprint: str,
         make: Callable[[], Submission],
-        key: OwnKey | None,
+        idempotency_key: str | None,
         caller: Caller | None,
         future: AnswerFuture,
         *,
@@ -129,19 +218,27 @@ class SubmissionService:
         wait_s: float = WAIT_S,
         tracked_ns: int | None = None,
     ) -> AnswerFuture:
-        """`submit` of a batch that `make` makes, in the pool, unless it is recorded already.
+        """`queued` for a batch that `make` makes, in the pool, unless it is recorded already.
 
         `tracked_ns` is the time of one that asks for the last attitude.
         """
-        if key is not None:
-            check_key(key)
-        turn = (None if caller is None else caller.token_id, identity[0])
+        token_id = None if caller is None else caller.token_id
+        key = None
+        if idempotency_key is not None:
+            is_plain = idempotency_key.isascii() and idempotency_key.isprintable()
+            if not (is_plain and 0 < len(idempotency_key) <= MAX_KEY_LENGTH):
+                message = f"must be 1 to {MAX_KEY_LENGTH} printable ASCII characters"
+                raise BadBatch(Fault("Idempotency-Key", message, shown_value(idempotency_key)))
+            key = (token_id or "", idempotency_key)
+        turn = (token_id, identity[0])
         pending = PendingBatch(identity, fingerprint, key, make, turn, is_long, future, wait_s)
         if tracked_ns is not None:
             pending.sequence, pending.time_ns = identity[:2], tracked_ns
         self._single_s = pending.since_s
         self._queue.put(pending)
         return future
+
+    # ---- many together -----------------------------------------------------------------------
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
         """Record many in one transaction; a refused one has its error in the list.
@@ -168,14 +265,20 @@ class SubmissionService:
             time_ns=batch.time.tai_ns,
         )
         self._queue.put(pending)
-        (outcome,) = decided([outcome_of(pending.future)])
-        return outcome
+        assert isinstance(pending.future, Future)
+        outcome: Answered | Exception
+        try:
+            outcome = pending.future.result()
+        except Exception as error:
+            outcome = error
+        (one,) = decided([outcome])
+        return one
 
     def _submit_together(self, submissions: Sequence[Submission]) -> Answers:
         with self._store.reading_record() as connection:
             registry = look_up(connection, {identity_of(each.batch) for each in submissions})
             holders = [
-                holder_of(registry, identity_of(each.batch), None, each.fingerprint)
+                registry.holder(identity_of(each.batch), None, each.fingerprint)
                 for each in submissions
             ]
             repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
@@ -229,7 +332,7 @@ class SubmissionService:
         )
         if entry is not None:
             unsaved.audit = entry.row()
-        note_handed_over([unsaved])
+        unsaved.handed_over_ns = time.perf_counter_ns()
         (outcome,) = decided(self._store.writer.record([unsaved]).result())
         if isinstance(outcome, AcquisitionError):
             raise outcome
@@ -284,7 +387,9 @@ class SubmissionService:
         if not unsaved_results:
             return list
         self._store.hold_back()
-        note_handed_over(unsaved_results)
+        moment_ns = time.perf_counter_ns()
+        for unsaved in unsaved_results:
+            unsaved.handed_over_ns = moment_ns
         future = self._store.writer.record(unsaved_results, low_priority=True)
 
         def finish() -> Answers:
@@ -316,6 +421,7 @@ class SubmissionService:
 
     def close(self) -> None:
         """Answer what was submitted, and take no more."""
+        self._reader.shutdown(cancel_futures=True)
         self._queue.close()
         self.pool.close()
 
@@ -338,7 +444,7 @@ class SubmissionService:
             except Exception as error:
                 found[place] = error
             else:
-                note_handed_over([unsaved])
+                unsaved.handed_over_ns = time.perf_counter_ns()
                 found[place] = unsaved
         return [found[place] for place in range(len(group))]
 
@@ -358,7 +464,7 @@ class SubmissionService:
 
         unsaved = self.solver.solve(submission, pending.received, pending.key)
         unsaved.is_outdated = is_outdated
-        note_handed_over([unsaved])
+        unsaved.handed_over_ns = time.perf_counter_ns()
         return unsaved
 
     def _recorded_before(self, group: Sequence[PendingBatch]) -> list[Found]:
@@ -368,14 +474,20 @@ class SubmissionService:
         """
         # Identities before keys, each as of its moment: a batch recorded in between is found by
         # its key, or seems new, and then the transaction finds it.
-        with self._noted_failure(len(group)), self._store.lookup() as connection:
-            registry = look_up(
-                connection,
-                {each.identity for each in group},
-                {each.key for each in group if each.key is not None},
-            )
-            self.before_solving(connection)
-        holders = [holder_of(registry, e.identity, e.key, e.fingerprint) for e in group]
+        try:
+            with self._store.lookup() as connection:
+                registry = look_up(
+                    connection,
+                    {each.identity for each in group},
+                    {each.key for each in group if each.key is not None},
+                )
+                if self.before_solving is not None:
+                    self.before_solving(connection)
+        except Busy:
+            # Batches that cannot be looked up cannot be written either.
+            self._store.writer.note_failure(len(group))
+            raise
+        holders = [registry.holder(e.identity, e.key, e.fingerprint) for e in group]
         repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
         stored: Mapping[str, bytes | AcquisitionError] = {}
         if repeats:
@@ -414,15 +526,6 @@ class SubmissionService:
 
         return keep_key
 
-    @contextmanager
-    def _noted_failure(self, count: int) -> Iterator[None]:
-        """Batches that cannot be looked up cannot be written either."""
-        try:
-            yield
-        except Busy:
-            self._store.writer.note_failure(count)
-            raise
-
     def _note_outcome(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
         """Tell the observers of a new batch; a what-if holds the stars of one that is known."""
         is_new = isinstance(outcome, Answered) and not outcome.replayed
@@ -439,30 +542,28 @@ class SubmissionService:
                 log.exception("an observer failed")
 
 
-class GyroIntake:
-    """Records gyro blocks, each once, however often it is sent."""
+def decided(outcomes: WriteOutcomes) -> Answers:
+    """Answers and errors of single batches; raises the others."""
+    answers: Answers = []
+    for outcome in outcomes:
+        # Both decide nothing about the batch.
+        if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
+            raise outcome
+        answers.append(outcome)
+    return answers
 
-    def __init__(self, missions: Mapping[str, Mission], store: Store) -> None:
-        self._missions = missions
-        self._store = store
-        self._ids = Ulids()
 
-    def begin(self, block: GyroBlock) -> Callable[[], RecordedBlock]:
-        """Queue a block for the writer; to call what it gives waits until it is recorded.
+def _submissions_of_array(sent: bytes) -> list[Submission | BadBatch]:
+    try:
+        elements = _ARRAY.validate_json(sent)
+    except ValidationError as error:
+        raise BadBatch(faults_of(error)) from None
+    return [_submission_of(each) for each in elements]
 
-        Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
-        mission, `Busy` where too much is waiting.  Both raise `Conflict` where another body has
-        its name, and `SampleTaken` where another block of the spacecraft and the run holds one
-        of its times.
-        """
-        mission = mission_in_input(self._missions, block.spacecraft)
-        require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
-        row = row_of(block, self._ids.new(), utc_now())
-        # Looked up here as well: an error in the writer's transaction would make it begin anew.
-        with self._store.reading_record() as connection:
-            found = find_block(connection, block, row)
-        if found is not None:
-            recorded = RecordedBlock(found, replayed=True)
-            return lambda: recorded
-        change = self._store.writer.change(lambda connection: record_block(connection, block, row))
-        return change.result
+
+def _submission_of(element: Any) -> Submission | BadBatch:
+    try:
+        # As text again: a batch is read by the one reader of batches, NaN and all.
+        return submission_from_json(to_json(element, inf_nan_mode="constants"))
+    except BadBatch as error:
+        return error

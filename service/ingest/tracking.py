@@ -12,15 +12,7 @@ from msgspec import structs
 from sqlalchemy import Connection
 
 from service.errors import BadInput
-from service.filtering.prediction import (
-    Known,
-    Rate,
-    derived_rate,
-    given_rate,
-    predict_at_rate,
-    predict_by_gyro,
-    unknown_rate,
-)
+from service.filtering import prediction
 from service.grades.stretches import believed, gyro_samples
 from service.missions.gyro import MotionSettings
 from service.missions.mission import Mission
@@ -38,14 +30,6 @@ LARGEST_SIGMAS = 5.0
 """Two attitudes tell no rate that is more than so many sigmas of the mission's."""
 SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
-
-
-def asks_for_last(batch: ObservationBatch, mission: Mission | None) -> bool:
-    """True if the attitude of a batch is to be predicted from the record."""
-    if batch.tracking is not None:
-        return not batch.tracking.resolved
-    is_default = mission is not None and mission.tracking is not None and mission.tracking.default
-    return is_default and batch.a_priori is None and batch.measurement is None
 
 
 def last_results(connection: Connection, batch: ObservationBatch, mission: Mission) -> list[str]:
@@ -136,7 +120,7 @@ def _predicted(
     last: RecordedAttitude,
     before: RecordedAttitude | None,
     gyro_run: str,
-) -> tuple[Known, RateSource]:
+) -> tuple[prediction.Known, RateSource]:
     """The attitude at the batch's time: by the gyro where it is recorded, else at a rate."""
     now_ns = batch.time.tai_ns
     motion = mission.motion or MotionSettings()
@@ -144,7 +128,7 @@ def _predicted(
     if by_gyro is not None:
         return by_gyro, "gyro"
     rate, source = _rate(batch, mission, last, before, motion)
-    return predict_at_rate(last.known, now_ns, rate, motion.rate_walk_rad_s1_5), source
+    return prediction.predict_at_rate(last.known, now_ns, rate, motion.rate_walk_rad_s1_5), source
 
 
 def _rate(
@@ -153,7 +137,7 @@ def _rate(
     last: RecordedAttitude,
     before: RecordedAttitude | None,
     motion: MotionSettings,
-) -> tuple[Rate, RateSource]:
+) -> tuple[prediction.Rate, RateSource]:
     passed_s = (batch.time.tai_ns - last.known.tai_ns) * 1e-9
     both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
     # Zero is what a batch has that tells nothing of its rates.
@@ -161,13 +145,13 @@ def _rate(
     if rates:
         settings = mission.tracking or TrackingSettings()
         sigma = math.radians(settings.body_rate_sigma_deg_per_s)
-        return given_rate(rates, sigma, passed_s), "body_rates"
+        return prediction.given_rate(rates, sigma, passed_s), "body_rates"
     if before is not None and before.known.tai_ns < last.known.tai_ns:
-        derived = derived_rate(before.known, last.known, passed_s)
+        derived = prediction.derived_rate(before.known, last.known, passed_s)
         # Between them there may have been a manoeuvre, such as a flip of the roll.
         if np.abs(derived.rad_s).max() <= LARGEST_SIGMAS * motion.rate_sigma_rad_s:
             return derived, "attitudes"
-    return unknown_rate(motion.rate_sigma_rad_s, passed_s), "unknown"
+    return prediction.unknown_rate(motion.rate_sigma_rad_s, passed_s), "unknown"
 
 
 def _by_gyro(
@@ -177,7 +161,7 @@ def _by_gyro(
     last: RecordedAttitude,
     motion: MotionSettings,
     gyro_run: str,
-) -> Known | None:
+) -> prediction.Known | None:
     if mission.gyro is None:
         return None
     start = shifted(last.time, -SAMPLES_BEFORE_S)
@@ -192,4 +176,4 @@ def _by_gyro(
     except BadInput:
         return None
     walk = motion.rate_walk_rad_s1_5
-    return predict_by_gyro(last.known, batch.time.tai_ns, model, samples, walk)
+    return prediction.predict_by_gyro(last.known, batch.time.tai_ns, model, samples, walk)

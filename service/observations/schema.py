@@ -458,20 +458,18 @@ class Submission(Struct, frozen=True, eq=False):
     frame: FrameRecord | None = None
 
 
-def without_byte_order_mark(body: bytes | str) -> bytes | str:
-    """The text of a body; some editors put a mark before it."""
-    if isinstance(body, bytes):
-        return body.removeprefix(codecs.BOM_UTF8)
-    return body.removeprefix("\ufeff")
-
-
 def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
     """Check one batch; `run`, where given, takes the place of the batch's own.
 
     Raises `BadBatch` with every fault, each naming field and value.
     """
+    # Some editors put a byte order mark before the text.
+    if isinstance(body, bytes):
+        body = body.removeprefix(codecs.BOM_UTF8)
+    else:
+        body = body.removeprefix("\ufeff")
     try:
-        model = BatchIn.model_validate_json(without_byte_order_mark(body))
+        model = BatchIn.model_validate_json(body)
     except ValidationError as error:
         raise BadBatch(faults_of(error)) from None
     return checked_from_model(model if run is None else model.model_copy(update={"run": run}))

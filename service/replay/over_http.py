@@ -17,16 +17,7 @@ from acquire_client.encoding import checked_address, path_of
 from acquire_client.models import Replay
 from msgspec import to_builtins
 
-from service.errors import (
-    BadInput,
-    Busy,
-    Fault,
-    Forbidden,
-    NotFound,
-    Unauthenticated,
-    problem_of_faults,
-    shown_value,
-)
+from service import errors
 from service.gyro import json_of_block
 from service.observations.readers.telemetry import read_lines
 from service.packets.upload import archive_of
@@ -70,7 +61,7 @@ def checked_url(url: str) -> str:
         checked_address(url)
     except ValueError:
         message = "must be the address of a service, such as http://127.0.0.1:8000"
-        raise BadInput(Fault("--url", message, shown_value(url))) from None
+        raise errors.BadInput(errors.Fault("--url", message, errors.shown_value(url))) from None
     return url.rstrip("/")
 
 
@@ -80,26 +71,26 @@ def translated(url: str) -> Iterator[None]:
     try:
         yield
     except answers.Unauthenticated as error:
-        raise Unauthenticated(
+        raise errors.Unauthenticated(
             f"{url} asks for a token ({error}): set ACQUIRE_TOKEN to one of its "
             "`acquire token create`"
         ) from None
     except answers.Forbidden as error:
-        raise Forbidden(f"{url}: {error}") from None
+        raise errors.Forbidden(f"{url}: {error}") from None
     except answers.NotFound as error:
-        raise NotFound(f"{url}: {error}") from None
+        raise errors.NotFound(f"{url}: {error}") from None
     except (answers.BadInput, answers.Conflict, answers.WrongState) as error:
-        raise BadInput(Fault("replay", str(error))) from None
+        raise errors.BadInput(errors.Fault("replay", str(error))) from None
     except answers.ClientError as error:
-        raise Busy(
+        raise errors.Busy(
             f"{url} no longer answers ({error}); run the same command again to go on "
             "from here: nothing is recorded twice"
         ) from None
 
 
-def no_service(url: str, error: answers.NoAnswer) -> Busy:
+def no_service(url: str, error: answers.NoAnswer) -> errors.Busy:
     """The error where no service answers from the beginning."""
-    return Busy(
+    return errors.Busy(
         f"no service answers at {url} ({error}); "
         "start one with `acquire serve`, or replay with --in-process"
     )
@@ -151,7 +142,7 @@ async def _require_service(client: AsyncClient, url: str) -> None:
     except answers.NoAnswer as error:
         raise no_service(url, error) from None
     except answers.UnexpectedAnswer as error:
-        raise Busy(str(error)) from None
+        raise errors.Busy(str(error)) from None
     await client.session()
 
 
@@ -159,7 +150,7 @@ async def _watch(client: AsyncClient, run: str) -> None:
     try:
         await client.watch_run(run)
     except answers.Problem as problem:
-        raise BadInput(Fault("--alarms", problem.detail, run)) from None
+        raise errors.BadInput(errors.Fault("--alarms", problem.detail, run)) from None
 
 
 async def _outcome(client: AsyncClient, item: Item) -> LineOutcome:
@@ -189,8 +180,8 @@ def _problem(problem: answers.Problem) -> Problem:
     """The part of a problem that does not depend on how the batch was sent."""
     if not problem.errors:
         return {"detail": problem.detail}
-    faults = [Fault(each.field, each.message, each.value) for each in problem.errors]
-    return {**problem_of_faults(faults), "detail": problem.detail}
+    faults = [errors.Fault(each.field, each.message, each.value) for each in problem.errors]
+    return {**errors.problem_of_faults(faults), "detail": problem.detail}
 
 
 # Replay through a running service as one upload, and poll its progress.
@@ -219,7 +210,7 @@ class _SentLines:
             for line in read_lines(file):
                 if line.body is None:
                     assert line.fault is not None
-                    problem = problem_of_faults([line.fault])
+                    problem = errors.problem_of_faults([line.fault])
                     self._report(LineOutcome(Item(file, line.number, None), None, problem=problem))
                     continue
                 self._places.append(line.number)
@@ -283,7 +274,7 @@ def replay_in_bulk(
         except answers.NoAnswer as error:
             raise no_service(url, error) from None
         except answers.Busy as problem:
-            raise Busy(f"{url}: {problem}") from None
+            raise errors.Busy(f"{url}: {problem}") from None
         try:
             for state in client.follow_replay(begun.id):
                 progress(state)
@@ -298,7 +289,7 @@ def replay_in_bulk(
     for each in state.errors:
         report(LineOutcome(lines.item(each.line), None, problem=to_builtins(each.problem)))
     if state.state != "done":
-        raise Busy(
+        raise errors.Busy(
             f"{url} ended the replay before its end ({state.state}, "
             f"{state.lines.done} lines in); run the same command again to go on from "
             "here: nothing is recorded twice"

@@ -12,8 +12,7 @@ from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
 from service.storage.recording.events import HeardEvents
-from service.storage.recording.transaction import may_pass
-from service.storage.recording.writer import RETRY_AFTER_S, Writer, remove_probe
+from service.storage.recording.writer import RETRY_AFTER_S, Writer, may_pass, remove_probe
 from service.storage.sql import engines
 from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile, FileLock
@@ -53,9 +52,13 @@ class Readers:
             engines.LONGEST_WAIT_S if serving else None,
         )
 
+    def reading(self) -> AbstractContextManager[Connection]:
+        """A connection that sees one snapshot of the database and cannot write."""
+        return self.reading_record()
+
     @contextmanager
-    def reading(self) -> Iterator[Connection]:
-        """A connection that sees one snapshot of the database and cannot write.
+    def reading_record(self) -> Iterator[Connection]:
+        """A connection for what reads no projection, and so waits for none.
 
         Raises `Busy` where the database is out of reach or every reader taken.
         """
@@ -175,10 +178,6 @@ class Store(Readers):
             request.behind_s = behind_s
         with self.reading_record() as connection:
             yield connection
-
-    def reading_record(self) -> AbstractContextManager[Connection]:
-        """A connection for what reads no projection, and so waits for none."""
-        return super().reading()
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:

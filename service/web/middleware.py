@@ -18,7 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
-from service.access.sessions import Access
+from service.access.tokens import Access
 from service.errors import Busy
 from service.settings import is_loopback
 from service.web.requests.access import authorize, entry_of, is_open
@@ -86,7 +86,8 @@ class AroundRequests:
             nonlocal status
             if message["type"] == "http.response.start":
                 status = message["status"]
-                await self._audit(inner, status)
+                if "changes" in inner.get("state", ()):
+                    await self._audit(inner, status)
                 headers = [*message["headers"], _NO_SNIFF, (b"x-request-id", about.id.encode())]
                 if about.behind_s:
                     headers.append((b"x-behind-seconds", b"%.1f" % about.behind_s))
@@ -112,7 +113,13 @@ class AroundRequests:
                 await self.app(inner, receive, sent)
             else:
                 inner["route"] = route
-                response = await _answered(route, Request(inner, receive))
+                request = Request(inner, receive)
+                response: Response
+                try:
+                    await authorize(request)
+                    response = await route.endpoint(request)
+                except Exception as error:
+                    response = await error_response(request, error)
                 await response(inner, receive, sent)
         except Busy as error:
             # The database did not tell whether access is open.
@@ -161,10 +168,10 @@ class AroundRequests:
         )
 
     async def _audit(self, scope: Scope, status: int) -> None:
-        state = scope.get("state", {})
-        action = state.get("changes")
+        state = scope["state"]
+        action = state["changes"]
         # A change carries its own entry.  A 503 decides nothing, and its cause may be the database.
-        if action is None or status == 503 or (state.get("noted") and status < 400):
+        if status == 503 or (state.get("noted") and status < 400):
             return
         try:
             entry = entry_of(scope, self.access, status)
@@ -228,20 +235,17 @@ class ProbesOnly:
         await problem_response(Request(scope), NOT_FOUND, details)(scope, receive, send)
 
 
-async def _answered(route: APIRoute, request: Request) -> Response:
-    """The response of a direct route, with the access check of every route."""
-    try:
-        await authorize(request)
-        response: Response = await route.endpoint(request)
-    except Exception as error:
-        return await error_response(request, error)
-    return response
+def _header(scope: Scope, name: bytes) -> bytes | None:
+    for each, value in scope["headers"]:
+        if each == name:
+            return bytes(value)
+    return None
 
 
 def _request_id(scope: Scope) -> str:
     """The id that a client or a proxy gave a request, where it is a plain word; else a new one."""
     # Not by `secrets`: its system call gives up the interpreter's lock, and an id may be guessed.
-    sent = next((value for name, value in scope["headers"] if name == b"x-request-id"), b"")
+    sent = _header(scope, b"x-request-id") or b""
     return sent.decode() if _SANE_ID.fullmatch(sent) else f"{getrandbits(64):016x}"
 
 
@@ -256,7 +260,7 @@ def _run(scope: Scope) -> str | None:
 
 def _host(scope: Scope) -> str | None:
     """The name that a request is for, without its port; None where it names none."""
-    text = next((value for name, value in scope["headers"] if name == b"host"), None)
+    text = _header(scope, b"host")
     if text is None:
         return None
     host: str = text.decode("latin-1")[:255].lower()

@@ -28,18 +28,7 @@ from service.storage.recording.ids import unguessable_ulid
 from service.storage.store import Store
 from service.storage.webhooks import Attempt, Queue, Registered, Waiting
 from service.times import DAY_S, recorded_utc, shifted, utc_now
-from service.webhooks.messages import (
-    GONE,
-    TOO_MANY,
-    TOTAL_S,
-    UNAVAILABLE,
-    DeliveryLog,
-    Outcome,
-    delivery_row,
-    signed_headers,
-    test_message,
-    wants,
-)
+from service.webhooks import messages
 
 if TYPE_CHECKING:
     from service.webhooks.posts import Poster
@@ -105,7 +94,7 @@ class WebhookSender:
         self._poster: Poster | None = None
         self._started = threading.Event()
         self._thread: threading.Thread | None = None
-        self.log = DeliveryLog()
+        self.log = messages.DeliveryLog()
 
     def start(self) -> None:
         """Begin to deliver, unless that has begun."""
@@ -136,7 +125,7 @@ class WebhookSender:
         if self._thread is not None:
             self._poke()
 
-    def try_out(self, webhook: Registered) -> tuple[str, Outcome]:
+    def try_out(self, webhook: Registered) -> tuple[str, messages.Outcome]:
         """Send a test event, and wait for what comes of it; returns its id too.
 
         Raises `Busy` while too many are sent, or where nothing is sent from this process.
@@ -144,8 +133,8 @@ class WebhookSender:
         if self._thread is None:
             raise Busy("webhooks are not delivered by this process now")
         if not self._tests.acquire(blocking=False):
-            raise Busy(f"{MAX_TESTS} tests of webhooks are under way", int(TOTAL_S))
-        id, body = test_message(webhook.id, utc_now().text)
+            raise Busy(f"{MAX_TESTS} tests of webhooks are under way", int(messages.TOTAL_S))
+        id, body = messages.test_message(webhook.id, utc_now().text)
         sending = self._post(webhook, id, body)
         try:
             return id, asyncio.run_coroutine_threadsafe(sending, self._loop).result()
@@ -225,8 +214,8 @@ class WebhookSender:
         while position < last and room > 0:
             found, missed = await self._read(self._after, position)
             now = utc_now().text
-            wanted = [event for event in found if wants(webhook, event)]
-            rows = [delivery_row(webhook.id, event, now) for event in wanted]
+            wanted = [event for event in found if messages.wants(webhook, event)]
+            rows = [messages.delivery_row(webhook.id, event, now) for event in wanted]
             after = found[-1].id if found else last
             if missed:
                 log.warning("webhook %s misses %d events that were deleted", webhook.id, missed)
@@ -317,9 +306,9 @@ class WebhookSender:
                 log.warning("deliveries of a webhook cannot be noted yet: %s", error)
             await asyncio.sleep(NOTE_AGAIN_S)
 
-    async def _post(self, webhook: Registered, message_id: str, body: bytes) -> Outcome:
+    async def _post(self, webhook: Registered, message_id: str, body: bytes) -> messages.Outcome:
         now, unix_s = utc_now().text, int(time.time())
-        headers = signed_headers(webhook.secrets(now), message_id, unix_s, body)
+        headers = messages.signed_headers(webhook.secrets(now), message_id, unix_s, body)
         if self._poster is None:
             # Not before: httpx, and the certificates of all authorities, take a while to read.
             from service.webhooks.posts import Poster
@@ -333,18 +322,18 @@ class WebhookSender:
         queue: Queue,
         done: Sequence[int],
         failed: Waiting | None,
-        outcome: Outcome,
+        outcome: messages.Outcome,
     ) -> Attempt:
         now = utc_now()
         self.log.delivered(webhook, len(done))
         if failed is None:
             return Attempt(queue, now.text, done, status=outcome.status)
         end = shifted(recorded_utc(failed.queued), DEAD_AFTER_S).text
-        is_dead = end <= now.text and outcome.status != GONE
+        is_dead = end <= now.text and outcome.status != messages.GONE
         self.log.failed(webhook, failed.event_id, outcome.fault, is_dead)
         asked_s = min(outcome.retry_after_s or 0.0, DEAD_AFTER_S)
         delay_s = max(retry_delay_s(failed.attempts + 1, random.random()), asked_s)
-        holds = asked_s > 0 and outcome.status in (TOO_MANY, UNAVAILABLE)
+        holds = asked_s > 0 and outcome.status in (messages.TOO_MANY, messages.UNAVAILABLE)
         return Attempt(
             queue,
             now.text,
@@ -354,7 +343,7 @@ class WebhookSender:
             status=outcome.status,
             fault=outcome.fault,
             held_until=shifted(now, asked_s).text if holds else None,
-            gone=outcome.status == GONE,
+            gone=outcome.status == messages.GONE,
         )
 
     # ---- the records -------------------------------------------------------------------------

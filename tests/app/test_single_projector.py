@@ -191,7 +191,7 @@ def test_a_batch_that_asks_for_the_last_attitude_gets_the_one_another_service_re
 ):
     first, second = services
     begin = submitted(first, sky, missions, "begin")
-    solver = second.submissions.ingest.solver
+    solver = second.submissions.solver
     solve, solved, go_on = solver.solve, threading.Event(), threading.Event()
 
     def solve_and_wait(*arguments, **wanted):

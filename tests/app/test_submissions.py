@@ -160,7 +160,7 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
     begun, go_on = threading.Event(), threading.Event()
 
     def run(build, missions, zones_built):
-        build._zones_needed = False
+        build.zones_needed = False
         zones_built()
         begun.set()
         assert go_on.wait(30)
@@ -247,7 +247,7 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
 @pytest.mark.both_databases
 def test_no_moment_of_the_database_is_held_while_many_are_worked_on(app, make):
     held = []
-    solver = app.submissions.ingest.solver
+    solver = app.submissions.solver
     solver.acquire = lambda *asked, own=solver.acquire, **how: (
         held.append(app.store._readers.pool.checkedout()),
         own(*asked, **how),
@@ -288,7 +288,7 @@ def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
 def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
     app, make, monkeypatch
 ):
-    solver = app.submissions.ingest.solver
+    solver = app.submissions.solver
     begun = []
 
     def slowed(acquire):
@@ -313,7 +313,7 @@ def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
 
 def test_a_batch_that_no_processor_takes_for_long_may_come_again(app, make, monkeypatch):
     monkeypatch.setattr(solver_pool, "WAIT_S", 0.01)
-    pool, go_on = app.submissions.ingest.pool, threading.Event()
+    pool, go_on = app.submissions.pool, threading.Event()
     give_up_s, begun = time.monotonic() + 30, threading.Barrier(len(pool._threads) + 1)
 
     def hold():
@@ -325,7 +325,7 @@ def test_a_batch_that_no_processor_takes_for_long_may_come_again(app, make, monk
     begun.wait(30)
     with ThreadPoolExecutor(2) as threads:
         batch = make().batch
-        single = threads.submit(app.submissions.ingest.run_again, batch)
+        single = threads.submit(app.submissions.run_again, batch)
         many = threads.submit(app.submissions.submit_many, [make()])
         time.sleep(0.1)
         go_on.set()

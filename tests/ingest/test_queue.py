@@ -53,7 +53,7 @@ class Held:
 @pytest.fixture
 def send(app):
     def sent(submission, caller=None):
-        return app.submissions.ingest.submit(submission, None, caller, Future())
+        return app.submissions.queued(submission, None, caller, Future())
 
     return sent
 
@@ -91,7 +91,7 @@ def test_what_takes_long_is_told_as_soon_as_it_shows(app, make, monkeypatch):
 
 
 def test_what_the_pool_computes_before_its_caller_goes_on_is_recorded_once(app, make, monkeypatch):
-    pool = app.submissions.ingest.pool
+    pool = app.submissions.pool
     monkeypatch.setattr(pool, "put", lambda task, turn, is_long: task.work())
     app.zones.drop()
     answer = app.submissions.submit(make("quick"))
@@ -149,17 +149,17 @@ def test_those_that_are_too_many_are_refused_at_once(send, make, monkeypatch):
 
 def test_what_waited_too_long_may_come_again(app, send, make, monkeypatch):
     begun, go_on = threading.Event(), threading.Event()
-    look_up = app.submissions.ingest._queue._look_up
+    look_up = app.submissions._queue._look_up
 
     def slowly(group):
         begun.set()
         go_on.wait(PATIENCE_S)
         return look_up(group)
 
-    monkeypatch.setattr(app.submissions.ingest._queue, "_look_up", slowly)
+    monkeypatch.setattr(app.submissions._queue, "_look_up", slowly)
     first = send(make("b1"))
     assert begun.wait(PATIENCE_S)
-    late = app.submissions.ingest.submit_made(
+    late = app.submissions.queue_made(
         ("XTE", "live", "b2"), "f", None, None, None, Future(), is_long=False, wait_s=0.0
     )
     go_on.set()
@@ -179,9 +179,7 @@ def test_the_answers_of_a_group_reach_an_event_loop_together(app, make):
         loop.call_soon_threadsafe = lambda *given: (calls.append(given), told(*given))[1]
         go_on = threading.Event()
         app.store.writer.change(lambda connection: go_on.wait(PATIENCE_S))
-        futures = [
-            app.submissions.ingest.submit(each, None, None, loop.create_future()) for each in sent
-        ]
+        futures = [app.submissions.queued(each, None, None, loop.create_future()) for each in sent]
         while app.store.writer.state().queued < len(sent):
             await asyncio.sleep(0.01)
         calls.clear()
@@ -198,7 +196,7 @@ def test_a_client_that_has_gone_keeps_no_other_from_its_answer(app, make):
     async def post():
         loop = asyncio.get_running_loop()
         gone, stays = (
-            app.submissions.ingest.submit(make(name), None, None, loop.create_future())
+            app.submissions.queued(make(name), None, None, loop.create_future())
             for name in ("gone", "stays")
         )
         gone.cancel()
@@ -334,7 +332,7 @@ def test_a_batch_waits_for_the_sky_that_it_needs_and_others_pass(app, make, monk
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
 def test_a_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
-    service = app.submissions.ingest
+    service = app.submissions
 
     def is_alive():
         with suppress(Stopping):
@@ -349,7 +347,7 @@ def test_a_thread_that_ended_or_stalls_is_noticed(app, make, monkeypatch):
     monkeypatch.setattr(
         service._queue, "_look_up", lambda group: (go_on.wait(PATIENCE_S), look_up(group))[1]
     )
-    stalled = service.submit(make("b1"), None, None, Future())
+    stalled = service.queued(make("b1"), None, None, Future())
     wait_until(lambda: not is_alive(), why="the stalled thread is not noticed")
     with pytest.raises(Stopping, match="restart"):
         service.require_alive()

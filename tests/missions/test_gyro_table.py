@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from service.app.context import Context
+from service.app.gyro import Gyro
 from service.errors import BadBatch, BadConfiguration
 from service.gyro import GyroBlockIn, block_from_model
-from service.ingest.submit import GyroIntake
 from service.missions.mission import load_missions, parse_mission
 from tests.gyro.blocks import body
 from tests.missions.without_gyro import text_without_gyro
@@ -81,4 +82,4 @@ def test_the_largest_rate_of_the_mission_bounds_what_is_taken():
     block = block_from_model(GyroBlockIn.model_validate(body()), "XTE")
     with pytest.raises(BadBatch, match=r"0.000872665 rad/s \(0.05 deg/s\)"):
         # It is refused before the records are looked at.
-        GyroIntake(missions, None).begin(block)
+        Gyro(Context(None, missions, None, None)).begin(block)

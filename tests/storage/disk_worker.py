@@ -50,7 +50,7 @@ def main(database, file, faults, seed):
 
     def one_by_one(texts):
         sent = [submission_from_json(text) for text in texts]
-        waiting = [app.submissions.ingest.submit(each, None, None, Future()) for each in sent]
+        waiting = [app.submissions.queued(each, None, None, Future()) for each in sent]
         return [each.result() for each in waiting]
 
     waiting = iter(lines)

@@ -154,7 +154,7 @@ def test_a_repeat_of_an_archived_batch_gets_its_answer_and_another_body_is_refus
     with pytest.raises(Conflict):
         filled.submissions.submit(make("b1", kind="good", after_s=20_000.0))
     many = [make("b1", kind="suspect", after_s=20_000.0), make("new", after_s=20_000.0)]
-    first, second = filled.submissions.ingest.submit_many(many)
+    first, second = filled.submissions.submit_many(many)
     assert first.replayed
     assert not second.replayed
 
@@ -180,9 +180,7 @@ def test_without_its_archive_the_service_takes_what_came_with_a_repeat(
     # While the first is looked up the others come, and are then looked up together.
     monkeypatch.setattr(submit, "look_up", look_up)
     sent = [make("n1"), make("b1", kind="suspect", after_s=20_000.0), make("n2")]
-    first, repeat, new = (
-        filled.submissions.ingest.submit(each, None, None, Future()) for each in sent
-    )
+    first, repeat, new = (filled.submissions.queued(each, None, None, Future()) for each in sent)
     may_go_on.set()
     assert not first.result(60).replayed
     assert not new.result(60).replayed
@@ -206,7 +204,7 @@ def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_aga
 ):
     late = make("b1", kind="suspect", after_s=20_000.0)
     archiving.archive(filled.store, place, LATER)
-    unsaved = filled.submissions.ingest.solver.solve(late)
+    unsaved = filled.submissions.solver.solve(late)
     (outcome,) = filled.store.writer.record([unsaved]).result()
     assert isinstance(outcome, Busy)
     with filled.store.reading() as connection:

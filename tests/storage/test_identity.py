@@ -202,7 +202,7 @@ def test_of_fifty_concurrent_batches_under_one_key_one_is_recorded(app, make):
 
 def test_what_was_recorded_between_look_and_transaction_is_found(app, make):
     """An unsaved result is new when looked up; one that was recorded since is still noticed."""
-    solve = app.submissions.ingest.solver.solve
+    solve = app.submissions.solver.solve
     key = "of another body"
     sent = [make(f"b{i}") for i in range(6)]
     changed = make("b2", after_s=3600.0)
@@ -245,7 +245,7 @@ def test_a_repeat_of_what_is_pruned_at_the_same_moment_is_recorded_anew(app, mak
 
 def test_a_run_whose_making_was_taken_back_is_made_with_the_next_of_its_batches(app, make):
     """Which runs there are is remembered with the connection, whatever became of them."""
-    solve = app.submissions.ingest.solver.solve
+    solve = app.submissions.solver.solve
     bad = solve(make("b1", run="another"))
     bad.result["mission_digest"] = "sha256:of nothing that is there"
     (refused,) = app.store.writer.record([bad]).result()

@@ -13,7 +13,7 @@ from tests.storage import samples
 @pytest.fixture
 def unsaved(app, make):
     """The unsaved result of what `make` makes."""
-    return lambda *named, **wanted: app.submissions.ingest.solver.solve(make(*named, **wanted))
+    return lambda *named, **wanted: app.submissions.solver.solve(make(*named, **wanted))
 
 
 @pytest.mark.parametrize("kind", samples.KINDS)

@@ -34,7 +34,7 @@ from service.settings import Settings
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.storage.projections import rollups
 from service.storage.projections.projector import rebuild_trends
-from service.storage.recording.digests import digest_of
+from service.storage.recording.identity import digest_of
 from service.storage.sql.columns import PackedText, metadata
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.tables import (

@@ -96,7 +96,7 @@ def test_results_that_waited_too_long_are_refused_and_what_waits_with_them_is_wr
 ):
     writer = app.store.writer
     monkeypatch.setattr(writer, "_wait_s", 0.05)
-    unsaved = app.submissions.ingest.solver.solve(make("late"))
+    unsaved = app.submissions.solver.solve(make("late"))
     go_on = held_up(writer)
     late, change = writer.record([unsaved]), writer.change(new_run("kept"))
     in_bulk = writer.record([unsaved], low_priority=True)
@@ -143,9 +143,7 @@ def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
 
 def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
     go_on = held_up(app.store.writer)
-    unsaved_results = [
-        app.submissions.ingest.solver.solve(make(name)) for name in ("b1", "b2", "b3")
-    ]
+    unsaved_results = [app.submissions.solver.solve(make(name)) for name in ("b1", "b2", "b3")]
     unsaved_results[1].result["mission_digest"] = "sha256:of nothing that is there"
     waiting = app.store.writer.record(unsaved_results)
     go_on.set()

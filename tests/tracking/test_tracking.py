@@ -92,7 +92,7 @@ def test_a_suspect_attitude_predicts_nothing(app, flown):
 def test_what_waits_together_is_computed_in_order_of_time(app, flown):
     send(app, flown[0].body)
     futures = {
-        k: app.submissions.ingest.submit(
+        k: app.submissions.queued(
             submission_from_json(json.dumps(flown[k].body)), None, None, Future()
         )
         for k in (1, 5, 3, 2, 4)

@@ -12,7 +12,8 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import text
 
-from service.access import sessions, tokens
+from service.access import tokens
+from service.access import tokens as sessions
 from service.app.factory import open_app
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now

@@ -5,8 +5,7 @@ import json
 import httpx
 import pytest
 
-from service.access.sessions import LEAST_BURST, Access
-from service.access.tokens import Caller
+from service.access.tokens import LEAST_BURST, Access, Caller
 from service.errors import RateLimited
 
 URL = "/api/v1/batches"

@@ -12,7 +12,7 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
-from service.app.submissions import READ_HERE_BYTES
+from service.ingest.submit import READ_HERE_BYTES
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.storage import samples

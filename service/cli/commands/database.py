@@ -374,16 +374,10 @@ def _note(parsed: Namespace) -> Any:
 
 def note(connection: "Connection", action: str, about: str, asked: dict[str, Any]) -> None:
     """Add an entry to the audit list: the user of this command did this."""
-    from service.access.audit import add_entry
+    from service.access.audit import Entry
     from service.storage.recording.ids import Ulids
     from service.times import utc_now
 
-    add_entry(
-        connection,
-        id=Ulids().new(),
-        moment=utc_now().text,
-        who=f"command:{getpass.getuser()}"[:80],
-        action=action,
-        about=about,
-        body=json.dumps(asked),
-    )
+    who = f"command:{getpass.getuser()}"[:80]
+    entry = Entry(Ulids().new(), utc_now().text, who, action, about, json.dumps(asked))
+    entry.add_to(connection)

@@ -104,6 +104,8 @@ SHARED_LOOK_S = 0.1
 """The same on PostgreSQL in the process that projects: other services record all the time."""
 POLL_S = 0.02
 """The time between two looks of a reader for where another process projects."""
+GIVE_WAY_S = 0.01
+"""The pause after a commit that woke the projector: the answers to its posts go out first."""
 GAP_S = 0.01
 """The pause before a gap in the record is looked at again."""
 WAIT_S = 1.0
@@ -288,6 +290,7 @@ class Projector:
                     is_alert = self._is_shared and self._is_projecting
                     self._changed.wait_for(self._has_work, SHARED_LOOK_S if is_alert else LOOK_S)
                     self._is_idle = False
+                    self._changed.wait_for(lambda: self._readers or self._is_closing, GIVE_WAY_S)
                 elif step.is_blocked:
                     self._changed.wait(GAP_S)
                 pause_s = begun_s + EVERY_S - time.monotonic()

@@ -22,7 +22,8 @@ from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
-from service.storage.recording.tracker_values import Row, catalog_rows, tracker_rows
+from service.storage.recording.result_metrics import catalog_rows, tracker_rows
+from service.storage.sql.columns import Row
 from service.vectors import Matrix, Vector
 
 MARGIN = 1.25

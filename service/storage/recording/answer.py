@@ -44,8 +44,7 @@ def answer_of(
     `warnings` follow those of the acquisition.  The time of recording stays None: it
     is known when the rows are handed over.
     """
-    batch = acquisition.batch
-    run_catalog = acquisition.run_catalog
+    batch, run_catalog = acquisition.batch, acquisition.run_catalog
     return answers.Answer(
         id=id,
         spacecraft=batch.spacecraft,
@@ -103,20 +102,19 @@ def rows_of_stars(answer: answers.Answer) -> list[dict[str, Any]]:
 
 
 def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> answers.TrackerStars:
-    zone = None
-    if result.region is not None:
-        ra_deg, dec_deg = ra_dec_of(result.region.axis)
+    region, zone = result.region, None
+    if region is not None:
+        ra_deg, dec_deg = ra_dec_of(region.axis)
         zone = answers.SearchedZone(
-            kind=result.region.kind,
+            kind=region.kind,
             ra_deg=ra_deg,
             dec_deg=dec_deg,
             stars=result.stars,
             pairs=result.pairs,
             cached=result.zone_cached,
         )
-    return answers.TrackerStars(
-        tracker=result.corrected.tracker.name, zone=zone, stars=_stars(result, run_catalog)
-    )
+    stars = _stars(result, run_catalog)
+    return answers.TrackerStars(tracker=result.corrected.tracker.name, zone=zone, stars=stars)
 
 
 def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[answers.Star]:
@@ -199,9 +197,11 @@ def _attitude(acquisition: Acquisition) -> answers.Attitude | None:
 
 
 def _tracking(acquisition: Acquisition) -> answers.Tracking | UnsetType:
-    asked, state = acquisition.batch.tracking, acquisition.tracking_state
-    if asked is None or state is None:
+    asked = acquisition.batch.tracking
+    if asked is None:
         return UNSET
+    state = acquisition.tracking_state
+    assert state is not None
     predicted = acquisition.batch.a_priori
     prediction = None
     if isinstance(predicted, PredictedPrior):

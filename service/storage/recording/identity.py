@@ -1,18 +1,27 @@
-"""Recorded batches and Idempotency-Keys, and the fingerprints of their bodies."""
+"""Recorded batches and Idempotency-Keys; and digests of what the record keeps.
 
-from collections.abc import Collection, Sequence
+`verify` computes the digests again, of each result and of each row of settings that it names:
+a digit that changed later, in an answer, an input, a column or a star, does not pass.  A digest
+leaves null columns out, so that a column which a later version adds changes no digest that was
+made before it.
+"""
+
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
+from functools import cache
+from hashlib import blake2b
+from operator import itemgetter
 from typing import Any
 
 import msgspec
 from msgspec import Struct
-from sqlalchemy import Connection, insert
+from sqlalchemy import Connection, Double, Table, insert
 
 from service.errors import Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
-from service.storage.sql.columns import unpack
+from service.storage.sql import tables
+from service.storage.sql.columns import Row, unpack
 from service.storage.sql.statements import execute
-from service.storage.sql.tables import idempotency_keys
 
 Identity = tuple[str, str, str]
 """(spacecraft, run, batch): unique among submissions."""
@@ -95,23 +104,25 @@ class Registry:
     identities: dict[Identity, ExistingResult] = field(default_factory=dict)
     keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
 
-    def first(
+    def holder(
         self, identity: Identity, key: OwnKey | None, fingerprint: str
-    ) -> ExistingResult | None:
-        """The recorded result of this body; None: there is none.
+    ) -> ExistingResult | KeyReused | Conflict | None:
+        """The recorded result of this body, or None; the error where it is of another body.
 
-        Raises `KeyReused` where the key belongs to another body, which is
+        That is `KeyReused` where the key belongs to another body, which is
         looked at first, and `Conflict` where the identity does.
         """
         by_key = None if key is None else self.keys.get(key)
         if key is not None and by_key is not None:
             if by_key.fingerprint != fingerprint:
-                raise KeyReused(f"Idempotency-Key {shown_value(key[1])} was used with another body")
+                return KeyReused(
+                    f"Idempotency-Key {shown_value(key[1])} was used with another body"
+                )
             return by_key
         by_identity = self.identities.get(identity)
         if by_identity is not None and by_identity.fingerprint != fingerprint:
             spacecraft, run, batch = identity
-            raise Conflict(
+            return Conflict(
                 f"{spacecraft}, run {run}: batch {shown_value(batch)} is recorded with another body"
             )
         return by_identity
@@ -160,8 +171,11 @@ def remember_key(
     connection: Connection, identity: Identity, key: OwnKey, taken: ExistingResult
 ) -> None:
     """Give a key to a body that is recorded without it; raises `KeyReused` if another has it."""
-    if look_up(connection, (), [key]).first(identity, key, taken.fingerprint) is None:
-        connection.execute(insert(idempotency_keys), key_row(key, taken))
+    holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
+    if isinstance(holder, KeyReused | Conflict):
+        raise holder
+    if holder is None:
+        connection.execute(insert(tables.idempotency_keys), key_row(key, taken))
 
 
 def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
@@ -179,3 +193,78 @@ def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, by
     """The answers of recorded results, byte for byte as first sent."""
     rows = _rows(connection, _ANSWERS + _AMONG[connection.dialect.name], ids) if ids else ()
     return {id: unpack(answer).encode() for id, answer in rows}
+
+
+# ---- digests ----------------------------------------------------------------------------------
+
+BYTES = 8
+SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
+"""The tables whose rows have a digest each, `row_digest`."""
+_NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
+"""Columns without content: the mark of the current result, places in an order, digests."""
+
+_encode = msgspec.json.Encoder().encode
+_in_order = itemgetter("tracker", "position")
+
+
+def digest_of(
+    result: Row,
+    stars: Sequence[Row],
+    solution: Row | None,
+    batch: Row | None = None,
+    frame: Row | None = None,
+) -> int:
+    """The digest of the rows of a result, 63 bits of BLAKE2b.
+
+    `batch` and `frame` are given for the first result of a batch, and not for a what-if.
+    """
+    content: list[object] = [
+        _content(tables.results)(result),
+        sorted(map(_content(tables.star_results), stars), key=_in_order),
+    ]
+    for table, row in (
+        (tables.solutions, solution),
+        (tables.batches, batch),
+        (tables.frames, frame),
+    ):
+        content.append(None if row is None else _content(table)(row))
+    return _digest(content)
+
+
+def digest_of_row(table: Table, row: Row) -> int:
+    """The digest of a row of `SETTINGS` or `tracker_values`."""
+    return _digest(_content(table)(row))
+
+
+def made_later(digest: int) -> int:
+    """The digest as it is kept where it was made after the result: at an upgrade."""
+    return ~digest
+
+
+def agrees(stored: int | None, digest: int) -> bool:
+    """True if a digest that is kept, if any, is this one, whenever it was made."""
+    return stored in (None, digest, made_later(digest))
+
+
+def _digest(content: object) -> int:
+    return int.from_bytes(blake2b(_encode(content), digest_size=BYTES).digest(), "big") >> 1
+
+
+@cache
+def _content(table: Table) -> Callable[[Row], dict[str, object]]:
+    """A function that gives the content of a row as it comes back from any database."""
+    columns = [
+        (each.name, isinstance(each.type, Double))
+        for each in table.columns
+        if each.name != "row_digest" and f"{table.name}.{each.name}" not in _NO_CONTENT
+    ]
+
+    def content(row: Row) -> dict[str, object]:
+        # SQLite has no minus zero, and a whole number comes back as a float.
+        return {
+            name: float(value) + 0.0 if is_double else value
+            for name, is_double in columns
+            if (value := row[name]) is not None
+        }
+
+    return content

@@ -1,15 +1,40 @@
-"""The metrics of results: measured from an acquisition, and rolled up in memory or by SQL."""
+"""The metrics of results and of their trackers, and rollups of them in memory or by SQL.
 
-from collections.abc import Mapping, Sequence
+Rows of `tracker_values` exist where the spacecraft has several trackers: of one alone the
+result itself has the same values.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Double, Table, case, func
+import numpy as np
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Connection,
+    Double,
+    Table,
+    case,
+    delete,
+    func,
+    insert,
+    select,
+)
 
 from service.acquire import Acquisition
+from service.alarms.drift import alignment_offsets_arcsec, mean_stars, scale_offset_ppm
 from service.alarms.quantities import QUANTITIES, Measured, Quantity, Ratio, StarShare
+from service.identify.identification import Integers
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import CorrectedObservations
+from service.sky.catalog.run_catalog import RunCatalog
+from service.storage.models.answers import Answer, Star
+from service.storage.recording.identity import digest_of_row
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
+from service.vectors import Vector
 
 
 def metrics_of(acquisition: Acquisition) -> Row:
@@ -118,3 +143,147 @@ OF_TRACKERS = tables.results.join(
     tables.tracker_values, tables.tracker_values.c.batch_id == tables.results.c.batch_id
 )
 """The source of a query over `tracker_values`, so that it can choose current results."""
+
+
+# ---- the trackers of a batch: stars by outcome, residuals, magnitudes -------------------------
+
+
+def values_of_trackers(acquisition: Acquisition, answer: Answer, batch_id: str) -> list[Row]:
+    """The rows of an acquisition; none where its mission has one tracker."""
+    if len(acquisition.mission.trackers) == 1:
+        return []
+    return tracker_rows(
+        batch_id,
+        answer,
+        acquisition.batch,
+        [each.corrected for each in acquisition.trackers],
+        acquisition.run_catalog,
+        [each.identification.star for each in acquisition.trackers],
+    )
+
+
+def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
+    """The rows of the run catalog (n,) of the stars of every tracker, -1 for others.
+
+    `place` gives the row of a star's id; empty where the catalog is no longer there.
+    """
+    return [
+        np.array([place.get(star.star.id, -1) if star.star else -1 for star in each.stars], int)
+        for each in answer.observations
+    ]
+
+
+def tracker_rows(
+    batch_id: str,
+    answer: Answer,
+    batch: ObservationBatch,
+    corrected: Sequence[CorrectedObservations],
+    catalog: RunCatalog,
+    star: Sequence[Integers],
+) -> list[Row]:
+    """The rows of an answer, one a tracker, in the order of its observations.
+
+    `corrected` are the observations of `batch` that it was made from, and `star` the rows of
+    the catalog (n,) of their unique stars, -1 for others and where they are not known.
+    """
+    catalog_mag = [np.where(rows >= 0, catalog.magnitude_mag[rows], np.nan) for rows in star]
+    directions = catalog.direction_at(batch.time)
+    means = [] if answer.attitude is None else mean_stars(batch, corrected, star, directions)
+    alignment = alignment_offsets_arcsec(means) or [None] * len(corrected)
+    expected = [_expected_squares(answer, each) for each in corrected]
+    scale = _scale(answer, expected)
+    rows = []
+    for k, (stars, seen, squares, magnitudes) in enumerate(
+        zip(answer.observations, corrected, expected, catalog_mag, strict=True)
+    ):
+        outcomes = [star.outcome for star in stars.stars]
+        used = list(_residuals(stars.stars))
+        predicted = scale * math.fsum(squares[k] for k, _ in used)
+        offsets = (seen.magnitude_mag - magnitudes)[np.isfinite(seen.magnitude_mag - magnitudes)]
+        row = dict.fromkeys(tables.MEASURED) | {
+            "batch_id": batch_id,
+            "tracker": stars.tracker,
+            "observed": len(outcomes),
+            **{name: outcomes.count(name) for name in ("unique", "ambiguous", "unmatched")},
+            "status": _status(answer, stars.tracker),
+            "residual_rms_arcsec": _rms(math.fsum(each**2 for _, each in used), len(used)),
+            "predicted_rms_arcsec": _rms(predicted, len(used)),
+            "magnitude_offset_mag": (
+                math.fsum(offsets.tolist()) / len(offsets) if len(offsets) else None
+            ),
+            "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
+            "alignment_offset_arcsec": alignment[k],
+        }
+        rows.append(row | {"row_digest": digest_of_row(tables.tracker_values, row)})
+    return rows
+
+
+def _residuals(stars: Sequence[Star]) -> Iterator[tuple[int, float]]:
+    """The place and the residual of each star that the attitude uses."""
+    for place, star in enumerate(stars):
+        if star.residual_arcsec is not None:
+            yield place, star.residual_arcsec
+
+
+def _status(answer: Answer, tracker: str) -> str | None:
+    """`suspect` for the tracker that disagrees with the others; None without an attitude."""
+    if answer.attitude is None:
+        return None
+    return "suspect" if answer.attitude.outlier == tracker else "good"
+
+
+def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
+    """The squared residual (n,) in arcsec^2 that is expected of each star.
+
+    Of the best attitude it is the noise along both tangent axes less what the
+    attitude, of covariance P, takes up of it: 2 sigma^2 - (trace P - d' P d).
+    """
+    if answer.attitude is None:
+        return np.zeros(len(seen.sigma_arcsec))
+    covariance = np.array(answer.attitude.covariance_arcsec2)
+    direction = seen.direction_body
+    along = np.einsum("ni,ij,nj->n", direction, covariance, direction)
+    return np.asarray(2.0 * seen.sigma_arcsec**2 - (np.trace(covariance) - along))
+
+
+def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
+    """The factor that brings the expected squares to the sum that the answer predicts; 1 for QUEST.
+
+    TRIAD's attitude takes its own part of the noise, which its answer says of all stars only.
+    """
+    if answer.attitude is None or answer.attitude.predicted_rms_arcsec is None:
+        return 0.0
+    used = [
+        squares[place]
+        for squares, stars in zip(expected, answer.observations, strict=True)
+        for place, _ in _residuals(stars.stars)
+    ]
+    total = math.fsum(used)
+    return len(used) * answer.attitude.predicted_rms_arcsec**2 / total if total > 0.0 else 0.0
+
+
+def _rms(squares: float, count: int) -> float | None:
+    """The rms of so many squares; None where it is not known."""
+    return math.sqrt(squares / count) if count and squares > 0.0 else None
+
+
+def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
+    """True if batches of a spacecraft's run are still to be split."""
+    query = select(tables.tracker_splits.c.run).where(
+        tables.tracker_splits.c.spacecraft == spacecraft, tables.tracker_splits.c.run == run
+    )
+    return connection.execute(query).first() is not None
+
+
+def split_anew(connection: Connection, spacecraft: str) -> None:
+    """Have all batches of a spacecraft looked at: from now on it has several trackers."""
+    connection.execute(
+        delete(tables.tracker_splits).where(tables.tracker_splits.c.spacecraft == spacecraft)
+    )
+    recorded, trends = (
+        select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
+        for table in (tables.results, tables.rollups_daily)
+    )
+    # Archived batches are in the trends alone, and the latest ones in the record alone.
+    runs = recorded.union(trends)
+    connection.execute(insert(tables.tracker_splits).from_select(["spacecraft", "run"], runs))

@@ -7,17 +7,17 @@ from sqlalchemy import Connection, and_, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
 from service.storage.recording import events
-from service.storage.recording.digests import digest_of_row
 from service.storage.recording.identity import (
     ExistingResult,
     PredictionOutdated,
     Registry,
+    digest_of_row,
     key_row,
     look_up,
     require_not_archived,
     stored_answers,
 )
-from service.storage.recording.tracker_values import split_anew
+from service.storage.recording.result_metrics import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql import tables
 from service.storage.sql.access_tables import audit
@@ -127,6 +127,8 @@ def _outdated(
     the same spacecraft and run.  All locks are taken first, and in order.
     """
     asked = [unsaved for unsaved in unsaved_results if unsaved.is_outdated is not None]
+    if not asked:
+        return {}
     for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved in asked}):
         execute(connection, _LOCK_SEQUENCE, {"pair": pair})
     return {
@@ -153,11 +155,11 @@ def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | Acqu
     """The holder of an identity and key: an earlier result, or from now on the unsaved one."""
     if unsaved.batch is None:
         return ExistingResult(unsaved.id, "")
-    try:
-        first = registry.first(unsaved.identity, unsaved.key, unsaved.batch["fingerprint"])
-    except AcquisitionError as error:
-        return error
-    taken = first or ExistingResult(unsaved.id, unsaved.batch["fingerprint"])
+    fingerprint = unsaved.batch["fingerprint"]
+    holder = registry.holder(unsaved.identity, unsaved.key, fingerprint)
+    if isinstance(holder, AcquisitionError):
+        return holder
+    taken = holder or ExistingResult(unsaved.id, fingerprint)
     registry.enter(unsaved.identity, unsaved.key, taken)
     return taken
 
@@ -180,8 +182,9 @@ def _insert(
     if len(known) > _REMEMBERED:
         known.clear()
     missing = [name for name in sorted(names) if not assume_new or name not in known]
-    insert_runs(connection, {name: names[name] for name in missing})
-    known.update(missing)
+    if missing:
+        insert_runs(connection, {name: names[name] for name in missing})
+        known.update(missing)
     insert_all(connection, tables.batches, rows)
     require_not_archived(connection, [unsaved.identity for unsaved in firsts])
     insert_all(connection, tables.frames, [each.frame for each in firsts if each.frame is not None])

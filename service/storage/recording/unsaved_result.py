@@ -19,9 +19,8 @@ from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
-from service.storage.recording.digests import digest_of
-from service.storage.recording.result_metrics import metrics_of
-from service.storage.recording.tracker_values import values_of_trackers
+from service.storage.recording.identity import digest_of
+from service.storage.recording.result_metrics import metrics_of, values_of_trackers
 from service.storage.sql.columns import Row
 from service.times import Utc
 

@@ -7,42 +7,43 @@ themselves, in turn with everything else.
 """
 
 import logging
+import sqlite3
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from sqlalchemy import Connection, Engine, update
-from sqlalchemy.exc import DBAPIError
+from sqlalchemy import Connection, Engine, exc, update
 
 from service.errors import AcquisitionError, Busy, Stopping
 from service.storage.recording import events
-from service.storage.recording.transaction import (
-    QueuedJob,
-    WriteOutcomes,
-    is_of_the_database,
-    transact,
-)
+from service.storage.recording.identity import ArchivedMeanwhile
+from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile, FileLock
 from service.storage.sql.engines import TO_WRITE, patience
 from service.storage.sql.projector_lock import Attempt, NotProjecting, ProjectorLock
+from service.storage.sql.statements import execute
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
+WriteOutcome = RecordOutcome | Exception
+WriteOutcomes = list[WriteOutcome]
+
 MAX_QUEUED = 10_000
 """Results that may wait: a matter of seconds."""
 TOGETHER = 64
 """The most pieces of work of one transaction."""
 MAX_ATTEMPTS = 5
+MAX_LOOKS = 5
 STALLED_S = 20.0
 """Posts that are not solved by then are a failure; a look-up takes at most five seconds."""
 RETRY_AFTER_S = 5
@@ -64,6 +65,36 @@ class WriterState:
     """True if the last write did."""
     failed: int
     """Batches and changes that could not be written since the start."""
+
+
+@dataclass(eq=False)
+class QueuedJob:
+    """Results to record, or another change to make, and the function that takes the outcome.
+
+    The results of a `pending` submission are added when the thread comes to it, see
+    `Writer.solve_posts`.
+    """
+
+    settle: Callable[[Any], object]
+    """Called with the `WriteOutcomes`, with what the change returns, or with an error."""
+    unsaved_results: Sequence[UnsavedResult] = ()
+    change: Callable[[Connection], Any] | None = None
+    low_priority: bool = False
+    """True for a bulk load: it is written by itself, after what else waits."""
+    needs_lock: bool = False
+    """True for a step of the projector: only the session that holds its lock may run it."""
+    pending: Any = None
+    since_s: float = field(default_factory=time.monotonic)
+
+    @property
+    def weight(self) -> int:
+        """How much there is to write."""
+        return len(self.unsaved_results) or 1
+
+    @property
+    def is_projection(self) -> bool:
+        """True for a step of the projector, which is alone in its transaction."""
+        return self.low_priority and self.change is not None
 
 
 class Writer:
@@ -200,8 +231,8 @@ class Writer:
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
-            if job.pending is None:
-                self._require_lock()
+            if job.pending is None and self._file_lock is not None:
+                self._file_lock.take()
             # A job that alone is larger than the queue is still taken by an empty one.
             is_full = self._queued and self._queued + job.weight > self._max_queued
             if is_full and not job.is_projection:
@@ -209,10 +240,6 @@ class Writer:
             (self._low_priority if job.low_priority else self._queue).append(job)
             self._queued += job.weight
             self._changed.notify()
-
-    def _require_lock(self) -> None:
-        if self._file_lock is not None:
-            self._file_lock.take()
 
     # ---- the writer's thread -----------------------------------------------------------------
 
@@ -254,7 +281,7 @@ class Writer:
         try:
             outcomes = self._write(jobs)
         except BaseException as error:
-            cause = error.orig if isinstance(error, DBAPIError) else repr(error)
+            cause = error.orig if isinstance(error, exc.DBAPIError) else repr(error)
             log.error("%d pieces of work could not be written: %s", len(jobs), cause)
             shown = _error_for_client(error)
             is_trouble = isinstance(shown, Busy) and not isinstance(shown, NotProjecting | Stopping)
@@ -292,8 +319,8 @@ class Writer:
         finally:
             self._solving_since_s = None
         try:
-            if solved:
-                self._require_lock()
+            if solved and self._file_lock is not None:
+                self._file_lock.take()
         except AcquisitionError as error:
             for job in solved:
                 job.settle(error)
@@ -317,39 +344,31 @@ class Writer:
         """Write the jobs in one transaction; a second try is made with care, see `transact`."""
         attempt = 1
         while True:
+            # A job of low priority is alone.
+            has_time = jobs[0].low_priority
             try:
-                with self._transaction(jobs) as connection:
-                    outcomes = self._transact(connection, jobs, careful=attempt > 1)
+                with (
+                    self._connection.transaction() as connection,
+                    patience(connection) if has_time else nullcontext(),
+                ):
+                    if self._lock is not None and jobs[0].needs_lock:
+                        self._lock.require_in(connection)
+                    try:
+                        outcomes = transact(connection, jobs, careful=attempt > 1)
+                    except Exception as error:
+                        if attempt > 1 or is_of_the_database(error):
+                            raise
+                        failure = type(error).__name__
+                        log.debug("a transaction is made again, with care: %s", failure)
+                        raise RolledBack from error
                     self._has_events = events.noted(connection) > 0
                 return outcomes
             except RolledBack:
                 pass
-            except DBAPIError as error:
+            except exc.DBAPIError as error:
                 if getattr(error.orig, "sqlstate", None) not in _CROSSED or attempt == MAX_ATTEMPTS:
                     raise
             attempt += 1
-
-    def _transact(
-        self, connection: Connection, jobs: Sequence[QueuedJob], careful: bool
-    ) -> list[Any]:
-        try:
-            return transact(connection, jobs, careful)
-        except Exception as error:
-            if careful or is_of_the_database(error):
-                raise
-            log.debug("a transaction is made again, with care: %s", type(error).__name__)
-            raise RolledBack from error
-
-    @contextmanager
-    def _transaction(self, jobs: Sequence[QueuedJob]) -> Iterator[Connection]:
-        has_time = all(job.low_priority for job in jobs)
-        with (
-            self._connection.transaction() as connection,
-            patience(connection) if has_time else nullcontext(),
-        ):
-            if self._lock is not None and jobs[0].needs_lock:
-                self._lock.require_in(connection)
-            yield connection
 
     def tell_of_events(self) -> None:
         """Call those who wait for events: another process recorded some."""
@@ -365,6 +384,99 @@ class Writer:
             except Exception:
                 # The transaction is committed: an error of a listener does not change that.
                 log.exception("a listener failed after a commit")
+
+
+def transact(connection: Connection, jobs: Sequence[QueuedJob], careful: bool) -> list[Any]:
+    """One outcome for each job: what comes of it, or the error that concerns it alone.
+
+    A first try assumes that every result is new and looks nothing up, and it has no
+    savepoints, for which SQLite keeps each page as it was: whatever fails ends the
+    transaction.  A `careful` try looks up recorded batches first and isolates each failure.
+    """
+    with events.numbered(connection):
+        unsaved_results = [unsaved for job in jobs for unsaved in job.unsaved_results]
+        recorded: Sequence[WriteOutcome]
+        if careful:
+            recorded = _record(connection, unsaved_results)
+        else:
+            recorded = record(connection, unsaved_results, assume_new=True)
+        outcomes = iter(recorded)
+        return [
+            [next(outcomes) for _ in job.unsaved_results]
+            if job.change is None
+            else _change(connection, job.change, careful)
+            for job in jobs
+        ]
+
+
+def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> WriteOutcomes:
+    """Record all together; if that fails, each by itself, so that one fails no other."""
+    if not unsaved_results:
+        return []
+    failure: Exception
+    for _ in range(MAX_LOOKS):
+        try:
+            with _savepoint(connection):
+                return list(record(connection, unsaved_results))
+        except (exc.IntegrityError, ArchivedMeanwhile) as error:
+            failure = error  # perhaps another process was faster: look again
+        except Exception as error:
+            if is_of_the_database(error):
+                raise
+            failure = error
+            break
+    if len(unsaved_results) == 1:
+        return [failure]
+    return [outcome for unsaved in unsaved_results for outcome in _record(connection, [unsaved])]
+
+
+def _change(connection: Connection, change: Callable[[Connection], Any], careful: bool) -> Any:
+    if not careful:
+        return change(connection)
+    try:
+        with _savepoint(connection):
+            return change(connection)
+    except Exception as error:
+        if is_of_the_database(error):
+            raise
+        return error
+
+
+@contextmanager
+def _savepoint(connection: Connection) -> Iterator[None]:
+    """Keep what the block does whole, or none of it.
+
+    Trouble of the database itself ends the whole transaction: SQLite, its disk
+    full, may have rolled it back already, and what came before would be lost.
+    """
+    noted = events.noted(connection)
+    execute(connection, "SAVEPOINT block")
+    try:
+        yield
+    except BaseException as error:
+        events.undone(connection, noted)
+        if not is_of_the_database(error):
+            execute(connection, "ROLLBACK TO SAVEPOINT block")
+            execute(connection, "RELEASE SAVEPOINT block")
+        raise
+    execute(connection, "RELEASE SAVEPOINT block")
+
+
+def is_of_the_database(error: BaseException) -> bool:
+    """True if an error is the database's, its disk's or its connection's, and no single row's."""
+    about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
+    return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
+
+
+def may_pass(error: exc.DBAPIError) -> bool:
+    """True if the trouble is with the database's disk or connection, and not with what was asked.
+
+    SQLite says of a table that is missing, and of a write through a connection
+    for readers, that they are operational errors too.
+    """
+    code = getattr(error.orig, "sqlite_errorcode", None)
+    ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
+    return isinstance(error, exc.OperationalError | exc.InterfaceError) and not ours
 
 
 def _settling(done: "Future[Any]") -> Callable[[Any], None]:
@@ -408,7 +520,7 @@ def _error_for_client(error: BaseException) -> Exception:
 
     Its words name files and hosts, which are for the log alone.
     """
-    if isinstance(error, DBAPIError) and is_of_the_database(error):
+    if isinstance(error, exc.DBAPIError) and is_of_the_database(error):
         shown: Exception = Busy("the database cannot be written now", RETRY_AFTER_S)
     elif isinstance(error, Exception):
         return error

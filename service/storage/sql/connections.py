@@ -122,29 +122,24 @@ class PersistentConnection:
         if not self._lock.acquire(timeout=self._turn_s):
             raise Busy("too many requests wait for the database", 1)
         try:
-            with self._used() as connection:
+            if self._file is not None:
+                self._file.require()
+            connection = self._open or self._engine.connect()
+            self._open = None
+            try:
                 yield connection
+            except RolledBack:
+                self._keep(connection)
+                raise
+            except BaseException:
+                # A connection in an unknown state must not serve the next transaction.
+                if not self._is_idle(connection):
+                    connection.invalidate()
+                connection.close()
+                raise
+            self._keep(connection)
         finally:
             self._lock.release()
-
-    @contextmanager
-    def _used(self) -> Iterator[Connection]:
-        if self._file is not None:
-            self._file.require()
-        connection = self._open or self._engine.connect()
-        self._open = None
-        try:
-            yield connection
-        except RolledBack:
-            self._keep(connection)
-            raise
-        except BaseException:
-            # A connection in an unknown state must not serve the next transaction.
-            if not self._is_idle(connection):
-                connection.invalidate()
-            connection.close()
-            raise
-        self._keep(connection)
 
     def _is_idle(self, connection: Connection) -> bool:
         """True if a server says that its session is outside of any transaction, after an error.

@@ -45,7 +45,7 @@ from service.storage.archive.rows import (
 )
 from service.storage.projections import rollups
 from service.storage.projections.rollups import keep_share
-from service.storage.recording.tracker_values import is_waiting
+from service.storage.recording.result_metrics import is_waiting
 from service.storage.sql import tables
 from service.storage.sql.statements import count, insert_all
 from service.storage.store import Store

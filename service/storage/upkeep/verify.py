@@ -27,8 +27,8 @@ from service.observations.schema import fingerprint_of, submission_from_json
 from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
 from service.storage.queries.time_buckets import Bucket
-from service.storage.recording.digests import SETTINGS, agrees, digest_of, digest_of_row
-from service.storage.recording.tracker_values import is_waiting
+from service.storage.recording.identity import SETTINGS, agrees, digest_of, digest_of_row
+from service.storage.recording.result_metrics import is_waiting
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine

@@ -8,9 +8,9 @@ from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.submissions import MAX_ARRAY, Outcome
 from service.errors import BadBatch, BadInput, Fault
 from service.gyro import GyroBlockIn
+from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
 from service.storage.models.compare import Comparison
@@ -22,7 +22,6 @@ from service.web.requests.access import CallerDep, ChangeDep, require_scope
 from service.web.requests.dependencies import (
     AppDep,
     MetricsDep,
-    answer_response,
     json_response,
     page_response,
 )
@@ -30,14 +29,16 @@ from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who
 from service.web.requests.request_body import (
     BINARY,
+    JSON,
     NO_IDEMPOTENCY_KEY,
     NO_KEY_OF_A_BLOCK,
     NO_KEY_OF_MANY,
     JsonBody,
     idempotency_key,
-    json_body,
+    read_json,
     read_model,
     refused,
+    require_no_query,
 )
 
 router = ApiRouter("batches")
@@ -64,6 +65,15 @@ class WhatIfIn(Wire):
     comment: params.Comment = None
 
 
+def answer_response(answered: Answered, recorded: bool = True) -> Response:
+    """An answer to a batch: new and recorded, recorded before, or not recorded at all."""
+    if not recorded:
+        return Response(answered.body, media_type=JSON)
+    if answered.replayed:
+        return Response(answered.body, 200, {"Replayed": "true"}, JSON)
+    return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
+
+
 @router.serves(
     "POST /batches",
     Returns("The answer, now recorded.", Answer, LOCATION, status=201),
@@ -74,8 +84,8 @@ class WhatIfIn(Wire):
 )
 async def submit_batch(request: Request) -> Response:
     """Identify the stars of a batch, solve for the attitude, and record both."""
-    await params.require_no_query(request)
-    body = await json_body(request)
+    await require_no_query(request)
+    body = await read_json(request, request.app.state.limits.json_bytes)
     key = await idempotency_key(request)
     held = request.app.state
     try:

@@ -7,6 +7,7 @@ from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.access.audit import list_entries
 from service.access.tokens import DEFAULT_DAYS, MAX_DAYS, SESSION_H
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
@@ -122,7 +123,9 @@ def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
 @router.serves("GET /audit", Returns("A page of changes.", AuditPage, LINK))
 def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
-    return page_response(request, app.audit.page(query.limit, query.cursor))
+    with app.context.reading() as connection:
+        page = list_entries(connection, query.limit, query.cursor)
+    return page_response(request, page)
 
 
 def _shown(caller: CallerDep) -> dict[str, object]:

@@ -18,8 +18,7 @@ from starlette.types import Scope as HttpScope
 
 from service import logs
 from service.access.audit import Entry
-from service.access.sessions import OPEN_CALLER, Access
-from service.access.tokens import Caller
+from service.access.tokens import OPEN_CALLER, Access, Caller
 from service.app.factory import App
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
 from service.storage.models.access import Scope
@@ -309,15 +308,11 @@ def author(caller: Caller, named: str | None) -> str:
     return named
 
 
-def bearer(request: Request) -> str | None:
-    """The token in the header, if there is one."""
-    kind, _, token = request.headers.get("authorization", "").partition(" ")
-    return token.strip() if kind.lower() == "bearer" else None
-
-
 def credentials(request: Request) -> tuple[str | None, str | None]:
     """The token and the session that a request shows, each None where there is none."""
-    return bearer(request), request.cookies.get(COOKIE)
+    kind, _, token = request.headers.get("authorization", "").partition(" ")
+    is_bearer = kind.lower() == "bearer"
+    return token.strip() if is_bearer else None, request.cookies.get(COOKIE)
 
 
 def _is_page(request: Request) -> bool:

@@ -13,7 +13,6 @@ from starlette.responses import Response
 
 from service.app.factory import App
 from service.storage.models.base import Page
-from service.storage.recording.unsaved_result import Answered
 from service.web.requests.metrics import Metrics
 from service.web.requests.request_body import JSON
 
@@ -41,15 +40,6 @@ def json_response(
 ) -> Response:
     """An answer of plain values."""
     return Response(_JSON.encode(content), status, headers, media_type=JSON)
-
-
-def answer_response(answered: Answered, recorded: bool = True) -> Response:
-    """An answer to a batch: new and recorded, recorded before, or not recorded at all."""
-    if not recorded:
-        return Response(answered.body, media_type=JSON)
-    if answered.replayed:
-        return Response(answered.body, 200, {"Replayed": "true"}, JSON)
-    return Response(answered.body, 201, {"Location": f"/api/v1/batches/{answered.id}"}, JSON)
 
 
 def page_response(request: Request, page: Page[Any]) -> Response:

@@ -25,8 +25,8 @@ from starlette.types import Scope
 from service import __version__
 from service.alarms.limits import Severity
 from service.app.factory import App
-from service.ingest.outcomes import Recorded
 from service.ingest.queue import Backlog
+from service.ingest.submit import Recorded
 from service.storage.models.alarms import Alarm
 from service.storage.models.overview import ZoneCache
 from service.storage.projections.projector import Lag

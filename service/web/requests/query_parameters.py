@@ -14,11 +14,10 @@ from pydantic import (
     field_validator,
     model_validator,
 )
-from starlette.requests import Request
 
 from service.alarms.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.app.products import TableKind
-from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.errors import BadInput
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
 from service.products.attitudes import ProductGrade, StatusWanted
@@ -29,6 +28,7 @@ from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
+from service.web.requests.request_body import require_no_query
 
 MAX_LIMIT = 500
 
@@ -310,16 +310,6 @@ class LimitQuery(Query):
 
 class LimitStatementQuery(StatementQuery, LimitQuery):
     """Whose limits change, who changes them, and a comment on it."""
-
-
-async def require_no_query(request: Request) -> None:
-    """Raise `BadBatch` for every parameter that a request brings."""
-    faults = [
-        Fault(name[:80], "unknown parameter; this route has none", shown_value(value))
-        for name, value in request.query_params.items()
-    ]
-    if faults:
-        raise BadBatch(faults)
 
 
 NO_QUERY = Depends(require_no_query)

@@ -111,12 +111,6 @@ def trim_memory() -> None:
         trim(0)
 
 
-def _limits(request: Request) -> BodyLimits:
-    limits = request.app.state.limits
-    assert isinstance(limits, BodyLimits)
-    return limits
-
-
 def _require_type(request: Request, allowed: tuple[str, ...]) -> str:
     """The media type of a body, which must be one of these."""
     # Also a protection: pages of other sites can send only form types without a preflight.
@@ -174,18 +168,19 @@ async def _pieces(
 
 async def json_body(request: Request) -> bytes:
     """The bytes of a JSON body."""
-    return await _json_body(request, _limits(request).json_bytes)
+    return await read_json(request, request.app.state.limits.json_bytes)
 
 
 async def session_body(request: Request) -> bytes:
     """The bytes of a JSON body that begins a session; it needs no token."""
-    return await _json_body(request, _limits(request).session_bytes)
+    return await read_json(request, request.app.state.limits.session_bytes)
 
 
-async def _json_body(request: Request, max_bytes: int) -> bytes:
+async def read_json(request: Request, max_bytes: int) -> bytes:
+    """The bytes of a JSON body, at most so many."""
     _require_type(request, (JSON,))
     _coding(request, ("identity",))
-    limits = _limits(request)
+    limits: BodyLimits = request.app.state.limits
     budget: BodyBudget = request.app.state.body_budget
     pieces: list[bytes] = []
     received = 0
@@ -216,7 +211,7 @@ async def telemetry_body(
     """
     is_packets = _require_type(request, (*NDJSON, PACKETS)) == PACKETS
     coding = _coding(request, ("identity",) if is_packets else ("identity", "gzip", "zstd"))
-    limits = _limits(request)
+    limits: BodyLimits = request.app.state.limits
     file = new_file()
     lines, last = 0, b"\n"
     try:
@@ -243,7 +238,7 @@ async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
     """A frame in a rewound temporary file that closing deletes."""
     _require_type(request, FRAMES)
     _coding(request, ("identity",))
-    limits = _limits(request)
+    limits: BodyLimits = request.app.state.limits
     file = tempfile.TemporaryFile()  # noqa: SIM115 - its reader closes it
     try:
         async for piece in _pieces(request, max_bytes, limits.pause_s, limits.frame_s):
@@ -286,6 +281,16 @@ async def optional_json_body(request: Request) -> bytes:
 JsonBody = Annotated[bytes, Depends(json_body)]
 OptionalJsonBody = Annotated[bytes, Depends(optional_json_body)]
 SessionBody = Annotated[bytes, Depends(session_body)]
+
+
+async def require_no_query(request: Request) -> None:
+    """Raise `BadBatch` for every parameter that a request brings."""
+    faults = [
+        Fault(name[:80], "unknown parameter; this route has none", shown_value(value))
+        for name, value in request.query_params.items()
+    ]
+    if faults:
+        raise BadBatch(faults)
 
 
 async def idempotency_key(request: Request) -> str | None:

@@ -5,6 +5,7 @@ from typing import Annotated
 from pydantic import Field
 from starlette.responses import Response
 
+from service.access.audit import list_entries
 from service.access.tokens import MAX_DAYS, SCOPES
 from service.storage.recording.events import EVENT_KINDS
 from service.web.console.page import (
@@ -30,7 +31,8 @@ class AuditPageQuery(PageQuery):
 @console_page("/audit", "Audit list", OPERATE, section="/about")
 def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
-    page = context.app.audit.page(ROWS, query.cursor)
+    with context.app.context.reading() as connection:
+        page = list_entries(connection, ROWS, query.cursor)
     return context.rendered("audit.html.jinja", query.run, page=page)
 
 
