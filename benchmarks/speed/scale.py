@@ -106,10 +106,10 @@ def _opened(url: str, folder: Path | None = None) -> App:
     return app
 
 
-def filled(url: str, count: int, seed: int) -> dict[str, Any]:
+def filled(url: str, count: int, seed: int, period_s: float = PERIODS_S[OFTEN]) -> dict[str, Any]:
     """Record so many batches in bulk: how fast, and how large the database is then."""
     name = DATABASES[url.split(":")[0].split("+")[0]]
-    made = drawn(count + CHUNK, seed, PERIODS_S[OFTEN])
+    made = drawn(count + CHUNK, seed, period_s)
     app = _opened(url)
     spent_s = 0.0
     try:
@@ -202,7 +202,7 @@ def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[
     bounds = [
         equal("faults that verifying finds", len(faults), 0),
         equal("batches restored", restored.restored, moved.batches),
-        _same("inputs and answers, restored", _digest(url), recorded),
+        same("inputs and answers, restored", _digest(url), recorded),
         at_most(*_of(figures, OFTEN), MOST_BYTES, "bytes a batch"),
         at_most(
             "archive, numeric columns",
@@ -241,7 +241,7 @@ def _read_ms(url: str, folder: Path | None, count: int) -> dict[str, float]:
         app.close()
 
 
-def _same(figure: str, measured: str, recorded: str) -> Bound:
+def same(figure: str, measured: str, recorded: str) -> Bound:
     return Bound(f"{figure}: SHA-256", measured, recorded, measured == recorded)
 
 

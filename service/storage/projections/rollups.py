@@ -50,6 +50,8 @@ Rollups = dict[Any, Row]
 """Rows by `BucketKey`, or by `TrackerKey`."""
 _KEY = ("spacecraft", "run", "bucket")
 _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
+ROWS_AT_ONCE = 500
+"""Rows of results, with their answers, that a recount holds."""
 MAX_RATES = 20_000
 """The most buckets of one answer: two years of hours, or half a century of days."""
 
@@ -320,7 +322,11 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         query = select(tracker_values, *place).select_from(source)
     width_s = _TRENDS[bucket].width_s
     found: Rollups = {}
-    for row in connection.execute(query.where(results.c.current)).mappings():
+    # PostgreSQL's client would hold all rows at once.
+    read = connection.execute(
+        query.where(results.c.current), execution_options={"yield_per": ROWS_AT_ONCE}
+    )
+    for row in read.mappings():
         tracker = (row["tracker"],) if of_trackers else ()
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number
