@@ -2,8 +2,10 @@
 
 import asyncio
 import json
+import subprocess
+import sys
 import uuid
-from contextlib import asynccontextmanager, suppress
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from itertools import islice
 
 import nats
@@ -11,6 +13,8 @@ from nats.errors import Error as NatsError
 
 from service.follow.follower import DELIVERED, SEQUENCE
 from service.follow.source import Source, refusals_of
+
+FOLLOW = [sys.executable, "-m", "service.cli", "follow"]
 
 
 class Bus:
@@ -39,6 +43,15 @@ class Bus:
         texts = iter(texts)
         while chunk := list(islice(texts, 500)):
             await self.publish(*chunk)
+
+    async def publish_until_kept(self, texts):
+        """Publish messages that may come twice, also where NATS is only just back."""
+        async with asyncio.timeout(120.0):
+            while True:
+                # An answer that was lost with the connection never comes.
+                with suppress(NatsError, TimeoutError):
+                    return await asyncio.wait_for(self.publish_many(texts), 10.0)
+                await asyncio.sleep(0.5)
 
     async def kept_of(self, subject):
         """The messages of a subject: their JSON, and the place and delivery they are about."""
@@ -80,3 +93,36 @@ async def bus(servers, **options):
             for name in (made.name, made.kept):
                 await made.stream.delete_stream(name)
         await connection.close()
+
+
+class Process:
+    """`acquire follow`."""
+
+    def __init__(self, command):
+        self._command = command
+        self.start()
+
+    def start(self):
+        self._process = subprocess.Popen(
+            self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+
+    def kill(self):
+        self._process.kill()
+        self._process.wait()
+
+    def kill_and_start(self):
+        self.kill()
+        self.start()
+
+
+@contextmanager
+def followers(made, url, count):
+    """So many processes that share the messages of a stream."""
+    command = [*FOLLOW, f"{made.servers}/{made.name}", "--consumer", "acquire"]
+    command += ["--url", url, "--refusals", made.refusals]
+    with ExitStack() as stack:
+        running = [Process(command) for _ in range(count)]
+        for process in running:
+            stack.callback(process.kill)
+        yield running

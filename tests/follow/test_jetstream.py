@@ -5,9 +5,7 @@ import json
 import os
 import ssl
 import subprocess
-import sys
 import time
-from contextlib import ExitStack, contextmanager
 
 import nats.js.api
 import pytest
@@ -19,7 +17,7 @@ from service.follow.follower import ACK_WAIT_S, Follower, Metrics
 from service.follow.over_http import OverHttp
 from service.follow.source import Source
 from service.storage.sql.tables import batches
-from tests.follow.bus import bus
+from tests.follow.bus import FOLLOW, bus, followers
 from tests.follow.nats_server import Account, certificate, nats_server, tls
 from tests.fresh_databases import sqlite_at
 from tests.gyro.blocks import body as gyro_block
@@ -32,7 +30,6 @@ MESSAGES, FOLLOWERS = 100_000, 4
 KILL_EVERY_S = 3.0
 KILLS_A_NATS = 20
 """The kills of followers for each kill of NATS."""
-FOLLOW = [sys.executable, "-m", "service.cli", "follow"]
 
 
 @pytest.fixture(scope="module")
@@ -273,7 +270,7 @@ def test_messages_are_recorded_once_whichever_followers_are_killed(
                 named = (f"timed-{count}-{k}" for k in range(timed))
                 async with bus(server.url) as made:
                     await made.publish_many(template.replace("NAME", name) for name in named)
-                    with followers(made, service, count):
+                    with followers(made, service.url, count):
                         # Their start is not counted.
                         await made.wait_until_empty(below=timed)
                         begun_s, left = time.monotonic(), sum(await made.pending())
@@ -287,7 +284,7 @@ def test_messages_are_recorded_once_whichever_followers_are_killed(
                 await made.stream.add_consumer(made.name, config)
                 kills = {"followers": 0, "nats": 0}
                 begun_s = time.monotonic()
-                with followers(made, service, FOLLOWERS) as running:
+                with followers(made, service.url, FOLLOWERS) as running:
                     while await made.pending() != (0, 0):
                         await asyncio.sleep(KILL_EVERY_S)
                         if kills["followers"] % KILLS_A_NATS == KILLS_A_NATS // 2:
@@ -323,36 +320,3 @@ def test_messages_are_recorded_once_whichever_followers_are_killed(
     assert counted == expected + 2 * timed
     wait_until(lambda: service.app.projector.lag().results == 0)
     assert sum(each.batches for each in service.app.spacecraft.rates("XTE")) == counted
-
-
-class Process:
-    """`acquire follow`."""
-
-    def __init__(self, command):
-        self._command = command
-        self.start()
-
-    def start(self):
-        self._process = subprocess.Popen(
-            self._command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-
-    def kill(self):
-        self._process.kill()
-        self._process.wait()
-
-    def kill_and_start(self):
-        self.kill()
-        self.start()
-
-
-@contextmanager
-def followers(made, service, count):
-    """So many processes that share the messages of a stream."""
-    command = [*FOLLOW, f"{made.servers}/{made.name}", "--consumer", "acquire"]
-    command += ["--url", service.url, "--refusals", made.refusals]
-    with ExitStack() as stack:
-        running = [Process(command) for _ in range(count)]
-        for process in running:
-            stack.callback(process.kill)
-        yield running
