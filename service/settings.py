@@ -44,6 +44,9 @@ class Settings:
     below which a proxy serves the service, such as /acquire.  Webhooks reach
     public addresses, and the networks in `webhook_networks`, these by http too.
     `archive_folder` is the folder of `acquire archive`, where archived batches are read.
+    `follow` is a stream of NATS that the service follows, as `acquire follow` does: with the
+    durable consumer `follow_consumer`, answers to the subject `follow_answers`, the file of
+    credentials and the certificate of the authority that NATS is trusted by.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -67,6 +70,11 @@ class Settings:
     root_path: str = ""
     webhook_networks: str = ""
     archive_folder: Path | None = None
+    follow: str | None = None
+    follow_consumer: str = "acquire"
+    follow_answers: str | None = None
+    follow_credentials: Path | None = None
+    follow_authority: Path | None = None
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -149,6 +157,8 @@ _READERS: dict[str, Callable[[str], Any]] = {
     "catalog": Path,
     "spool": Path,
     "archive_folder": Path,
+    "follow_credentials": Path,
+    "follow_authority": Path,
     "shelf_mb": int,
     "frame_mb": int,
     "frame_megapixels": int,

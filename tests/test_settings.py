@@ -34,6 +34,11 @@ def test_every_setting_has_its_variable():
             "ACQUIRE_TRUSTED_PROXIES": "10.1.2.3, 2001:db8::/32",
             "ACQUIRE_WEBHOOK_NETWORKS": "10.20.0.0/16",
             "ACQUIRE_ARCHIVE_FOLDER": "/archive",
+            "ACQUIRE_FOLLOW": "tls://bus/TELEMETRY",
+            "ACQUIRE_FOLLOW_CONSUMER": "ops",
+            "ACQUIRE_FOLLOW_ANSWERS": "attitudes",
+            "ACQUIRE_FOLLOW_CREDENTIALS": "/site/acquire.creds",
+            "ACQUIRE_FOLLOW_AUTHORITY": "/site/bus.pem",
             "HOME": "/root",
         }
     ) == Settings(
@@ -50,6 +55,11 @@ def test_every_setting_has_its_variable():
         trusted_proxies="10.1.2.3, 2001:db8::/32",
         webhook_networks="10.20.0.0/16",
         archive_folder=Path("/archive"),
+        follow="tls://bus/TELEMETRY",
+        follow_consumer="ops",
+        follow_answers="attitudes",
+        follow_credentials=Path("/site/acquire.creds"),
+        follow_authority=Path("/site/bus.pem"),
     )
 
 

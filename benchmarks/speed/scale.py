@@ -1,4 +1,4 @@
-"""What a batch takes in SQLite, PostgreSQL and the archive, and what years of a fleet then take.
+"""What a batch takes in SQLite, PostgreSQL and the archive.
 
     python -m benchmarks scale --quick      twenty thousand batches
     python -m benchmarks.speed.scale --batches 1000000 --write      into docs/scale.md
@@ -57,8 +57,6 @@ FIRST_READ = "the first list of 100"
 """A file is opened, and its part of the batches is decompressed."""
 MOST_BYTES, MOST_NUMERIC_BYTES = 800.0, 280.0
 LEAST_OF_BULK, MOST_OF_LIVE = 1.0, 3.0
-YEARS, HOT_DAYS = 10, 90
-FLEETS = (1, 10, 100)
 SELDOM, OFTEN = "one in 5 minutes", "one a second"
 PERIODS_S = {SELDOM: 300.0, OFTEN: 1.0}
 SELDOM_DAYS = 30
@@ -106,10 +104,10 @@ def _opened(url: str, folder: Path | None = None) -> App:
     return app
 
 
-def filled(url: str, count: int, seed: int) -> dict[str, Any]:
+def filled(url: str, count: int, seed: int, period_s: float = PERIODS_S[OFTEN]) -> dict[str, Any]:
     """Record so many batches in bulk: how fast, and how large the database is then."""
     name = DATABASES[url.split(":")[0].split("+")[0]]
-    made = drawn(count + CHUNK, seed, PERIODS_S[OFTEN])
+    made = drawn(count + CHUNK, seed, period_s)
     app = _opened(url)
     spent_s = 0.0
     try:
@@ -156,10 +154,10 @@ def _seldom(folder: Path, seed: int) -> dict[str, float]:
         moved = archive(store, place, time_at(SELDOM_DAYS * 86_400.0))
     finally:
         store.close()
-    return {ARCHIVED.format(SELDOM): _bytes_in(place) / moved.batches}
+    return {ARCHIVED.format(SELDOM): bytes_in(place) / moved.batches}
 
 
-def _bytes_in(folder: Path) -> int:
+def bytes_in(folder: Path) -> int:
     return sum(each.stat().st_size for each in folder.rglob("*") if each.is_file())
 
 
@@ -196,13 +194,13 @@ def _archived(url: str, folder: Path, count: int) -> tuple[dict[str, Any], list[
         store.close()
     figures: dict[str, Any] = {
         "archive: batches a second, verified": moved.batches / spent_s,
-        ARCHIVED.format(OFTEN): _bytes_in(place) / moved.batches,
+        ARCHIVED.format(OFTEN): bytes_in(place) / moved.batches,
         "archive: bytes a batch, numeric columns": _numeric_bytes(place) / moved.batches,
     }
     bounds = [
         equal("faults that verifying finds", len(faults), 0),
         equal("batches restored", restored.restored, moved.batches),
-        _same("inputs and answers, restored", _digest(url), recorded),
+        same("inputs and answers, restored", _digest(url), recorded),
         at_most(*_of(figures, OFTEN), MOST_BYTES, "bytes a batch"),
         at_most(
             "archive, numeric columns",
@@ -241,7 +239,7 @@ def _read_ms(url: str, folder: Path | None, count: int) -> dict[str, float]:
         app.close()
 
 
-def _same(figure: str, measured: str, recorded: str) -> Bound:
+def same(figure: str, measured: str, recorded: str) -> Bound:
     return Bound(f"{figure}: SHA-256", measured, recorded, measured == recorded)
 
 
@@ -313,25 +311,7 @@ def emptied(url: str) -> None:
     engine.dispose()
 
 
-def sizing(figures: dict[str, Any]) -> str:
-    """What fleets take, of the figures of a run: a table in Markdown."""
-    head = ["spacecraft", "batches of each", "a second", "of SQLite's bulk rate"]
-    names = [each for each in DATABASES.values() if f"{each}: bytes a batch" in figures]
-    rows = []
-    for count in FLEETS:
-        for label, period_s in PERIODS_S.items():
-            rate = count / period_s
-            share = rate / figures["SQLite: batches a second in bulk"]
-            hot, years = rate * 86_400.0 * HOT_DAYS, rate * 86_400.0 * 365.25 * YEARS
-            row = [str(count), label, f"{rate:.3g}", f"{100 * share:.2g} %"]
-            row += [_size_text(hot * figures[f"{each}: bytes a batch"]) for each in names]
-            row.append(_size_text(years * figures[ARCHIVED.format(label)]))
-            rows.append(tuple(row))
-    head += [f"{HOT_DAYS} days in {each}" for each in names]
-    return table([*head, f"{YEARS} years in the archive"], rows)
-
-
-def _size_text(size: float) -> str:
+def size_text(size: float) -> str:
     return f"{size / 1e9:.3g} GB" if size < 1e12 else f"{size / 1e12:.3g} TB"
 
 
@@ -341,7 +321,7 @@ def write(report: Report, count: int, seed: int) -> None:
     before, _, rest = TARGET.read_text(encoding="utf-8").partition(start)
     figures = table(("", "figure"), report.figures.items())
     again = f"python -m benchmarks.speed.scale --batches {count} --seed {seed}"
-    part = [start, figures, bounds_table(report.bounds), sizing(dict(report.figures))]
+    part = [start, figures, bounds_table(report.bounds)]
     part.append(f"{record_of(SERVICE).sentence} Again: `{again}`.\n{end}")
     TARGET.write_text(before + "\n\n".join(part) + rest.partition(end)[2], encoding="utf-8")
 

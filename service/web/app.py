@@ -41,6 +41,7 @@ from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
 from service.web.openapi import add_reference
+from service.web.own_follower import following
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
@@ -99,7 +100,8 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             app.webhooks.sender.start()
             app.live_filter.start()
             app.definitive.start_schedule()
-            yield
+            async with following(app, web_app.state.metrics):
+                yield
         finally:
             reporting.cancel()
             notify_supervisor("STOPPING=1")

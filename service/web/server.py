@@ -21,6 +21,7 @@ from service.storage.sql.database_file import warn_of_readers
 from service.web.app import create_app
 from service.web.connection_limits import Admission
 from service.web.middleware import ProbesOnly
+from service.web.own_follower import source_of
 from service.web.slow_clients import Connection, SharedState
 
 MAX_FILES = 4096
@@ -40,6 +41,8 @@ def serve(settings: Settings) -> None:
     Raises `BadConfiguration` for settings that cannot be used, and for a host other than
     a loopback address while there are no tokens: every client could submit there.
     """
+    # A mistake is named before the database is opened.
+    source_of(settings)
     app, probes = _opened(settings)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     _run(settings, create_app(app), probes)

@@ -1,5 +1,6 @@
 """Two services on one PostgreSQL database record; one projects, and the other takes over."""
 
+import asyncio
 import json
 import signal
 import socket
@@ -7,7 +8,8 @@ import subprocess
 import sys
 import time
 import uuid
-from contextlib import ExitStack, contextmanager
+from collections import Counter
+from contextlib import AsyncExitStack, ExitStack, contextmanager
 from pathlib import Path
 
 import httpx
@@ -17,6 +19,8 @@ from sqlalchemy import create_engine, make_url, select, text
 from service.app.factory import open_app
 from service.storage.sql.engines import database_url
 from service.storage.sql.tables import batches
+from tests.follow.bus import bus, followers
+from tests.follow.nats_server import nats_server
 from tests.scale import size
 from tests.storage import samples
 from tests.storage.recount import assert_equal_to_a_recount
@@ -28,6 +32,8 @@ from tests.web.test_behind_proxy import NGINX
 
 KILLS, TERMINATED = 100, 12
 ACKNOWLEDGED_A_ROUND = 1_000
+MESSAGES_A_ROUND, FOLLOWERS = 200, 2
+BALANCER_FORGETS_S = 2.5
 BALANCER = Path(__file__).parents[2] / "docker" / "balanced" / "nginx.conf"
 BUSY_S = 2.0
 """By so much a look at a service takes longer while other tests run."""
@@ -146,24 +152,37 @@ def test_both_services_record_and_answer_and_the_second_takes_over(database, sky
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    "through",
+    [
+        "ports",
+        pytest.param("nginx", marks=pytest.mark.skipif(NGINX is None, reason="there is no nginx")),
+    ],
+)
 def test_the_services_are_restarted_one_after_the_other_and_no_post_fails(
-    database, sky, missions, figures
+    database, sky, missions, figures, tmp_path, through
 ):
-    with two_services(database) as services:
-        load = Load(tuple(each.port for each in services), samples.batch(sky, missions, "NAME"))
+    with two_services(database) as services, ExitStack() as stack:
+        ports = tuple(each.port for each in services)
+        if through == "nginx":
+            ports = (stack.enter_context(balancer(services, tmp_path)),)
+        load = Load(ports, samples.batch(sky, missions, "NAME"))
         try:
-            for service in services:
+            for service in (*services, *services):
                 _wait_for(load, 50, seconds=120.0)
                 assert service.stop() in (0, -signal.SIGTERM)
                 _wait_for(load, 50, seconds=120.0)
                 service.start()
                 service.wait_until_ready()
+                # For so long nginx sends nothing to a service that it has found gone.
+                time.sleep(BALANCER_FORGETS_S if through == "nginx" else 0.0)
             load.stop()
         finally:
             load.give_up()
     figures(acknowledged=len(load.acknowledged), answers=dict(load.met))
-    # What a balancer sends to the other service counts as broken off; nothing else is met.
-    assert set(load.met) <= {200, 201, 503, "broken off"}
+    # A client that knows both services goes to the other one; nginx does so for its clients.
+    allowed = {200, 201, 503, "broken off"} if through == "ports" else {200, 201}
+    assert set(load.met) <= allowed
     _assert_recorded_once(database, load)
 
 
@@ -207,32 +226,70 @@ def test_a_projector_that_loses_its_session_projects_nothing_until_it_has_the_lo
 def test_behind_a_balancer_kills_and_ended_sessions_lose_and_double_nothing(
     database, sky, missions, rng, figures, tmp_path
 ):
-    """One post after the other goes through the configuration of nginx that is shipped."""
+    """Posts go through the configuration of nginx that is shipped, and so do two followers.
 
-    def disturb(services, at_database):
-        if rng.random() < 0.5:
-            killed = services[rng.integers(len(services))]
-            killed.kill()
-            return [killed]
-        # All that a database server closes when it is restarted, or one of them.
-        ended = "" if rng.random() < 0.5 else "ORDER BY random() LIMIT 1"
-        at_database.execute(text(f"SELECT pg_terminate_backend(pid) FROM ({SESSIONS} {ended}) s"))
-        return []
-
-    def recover(killed):
-        for service in killed:
-            service.start()
-            service.wait_until_ready()
-
+    Services, the one that projects, sessions of PostgreSQL, NATS and followers are killed.
+    """
+    template = samples.batch(sky, missions, "NAME")
+    published, kills = [], Counter()
     # Other tests have sessions on the same server.
     own = make_url(database).update_query_dict({"application_name": uuid.uuid4().hex})
     database = own.render_as_string(hide_password=False)
     with ExitStack() as stack:
+        server = stack.enter_context(nats_server(tmp_path / "nats"))
+        runner = stack.enter_context(asyncio.Runner())
+        opened = AsyncExitStack()
+        made = runner.run(opened.enter_async_context(bus(server.url)))
+        stack.callback(lambda: runner.run(opened.aclose()))
+        running = []
 
         def balanced(services):
-            return (stack.enter_context(balancer(services, tmp_path)),)
+            port = stack.enter_context(balancer(services, tmp_path))
+            url = f"http://127.0.0.1:{port}"
+            running.extend(stack.enter_context(followers(made, url, FOLLOWERS)))
+            return (port,)
 
-        _under_load(database, sky, missions, rng, figures, size(KILLS), disturb, recover, balanced)
+        def disturb(services, at_database):
+            names = [f"bus-{len(published) + k}" for k in range(size(MESSAGES_A_ROUND, 10))]
+            texts = [template.replace("NAME", name) for name in names]
+            runner.run(made.publish_until_kept(texts))
+            published.extend(names)
+            kind = rng.choice(["service", "projector", "session", "sessions", "NATS", "follower"])
+            kills[str(kind)] += 1
+            if kind == "NATS":
+                server.kill()
+                return [server]
+            if kind == "follower":
+                killed = running[rng.integers(FOLLOWERS)]
+            elif kind == "service":
+                killed = services[rng.integers(len(services))]
+            elif kind == "projector":
+                killed = next((each for each in services if each.is_projecting()), services[0])
+            else:
+                # All that a database server closes when it is restarted, or one of them.
+                ended = "" if kind == "sessions" else "ORDER BY random() LIMIT 1"
+                chosen = f"({SESSIONS} {ended}) s"
+                at_database.execute(text(f"SELECT pg_terminate_backend(pid) FROM {chosen}"))
+                return []
+            killed.kill()
+            return [killed]
+
+        def recover(killed):
+            for each in killed:
+                each.start()
+                if isinstance(each, Service):
+                    each.wait_until_ready()
+
+        def finish():
+            runner.run(made.wait_until_empty(seconds=600.0))
+            assert runner.run(made.kept_of(made.refusals)) == []
+            return published
+
+        _under_load(
+            *(database, sky, missions, rng, figures, size(KILLS), disturb, recover),
+            *(balanced, finish),
+            kills=kills,
+        )
 
 
 @contextmanager
@@ -267,10 +324,23 @@ def balancer(services, folder):
         process.wait()
 
 
-def _under_load(database, sky, missions, rng, figures, times, disturb, recover, balanced=None):
+def _under_load(
+    database,
+    sky,
+    missions,
+    rng,
+    figures,
+    times,
+    disturb,
+    recover,
+    balanced=None,
+    finish=lambda: (),
+    **noted,
+):
     """Disturb two services so many times while clients post to whichever takes their batches.
 
-    `balanced` gives the ports that clients use in the place of the services' own.
+    `balanced` gives the ports that clients use in the place of the services' own, `finish` the
+    names of batches that came another way.
     """
     template = samples.batch(sky, missions, "NAME")
     assert json.loads(template)["batch"] == "NAME"
@@ -291,32 +361,40 @@ def _under_load(database, sky, missions, rng, figures, times, disturb, recover, 
                 pauses_s.append(time.monotonic() - begun_s)
                 recover(disturbed)
             load.stop()
+            others = set(finish())
         finally:
             load.give_up()
-        noted = at_database.exec_driver_sql("SELECT * FROM projectors ORDER BY number").all()
-    sessions = _sessions_in_order(noted)
+        steps = at_database.exec_driver_sql("SELECT * FROM projectors ORDER BY number").all()
+    sessions = _sessions_in_order(steps)
     figures(
         times=times,
         acknowledged=len(load.acknowledged),
         answers=dict(load.met),
         longest_pause_s=round(max(pauses_s), 2),
+        from_the_bus=len(others),
         sessions=len(sessions),
+        **noted,
     )
     assert len(load.acknowledged) >= times * a_round
-    assert all(each.holds_lock for each in noted)
+    assert all(each.holds_lock for each in steps)
     assert len(set(sessions)) == len(sessions)
-    _assert_recorded_once(database, load)
+    _assert_recorded_once(database, load, others)
 
 
-def _assert_recorded_once(database, load):
-    """Each acknowledged batch is there once, with its answer, and projections are a rebuild's."""
+def _assert_recorded_once(database, load, others=frozenset()):
+    """Each acknowledged batch is there once, with its answer, and projections are a rebuild's.
+
+    `others` are the names of batches that did not come from the load.
+    """
     app = open_app(in_process_settings(database))
     try:
         assert_whole(app, dict(load.acknowledged.values()))
         with app.store.reading() as connection:
-            held = dict(connection.execute(select(batches.c.batch, batches.c.id)).all())
+            rows = connection.execute(select(batches.c.batch, batches.c.id)).all()
             assert_equal_to_a_recount(connection)
+        held = {name: id for name, id in rows if name not in others}
         assert held == {name: id for name, (id, _) in load.acknowledged.items()}
+        assert sorted(name for name, _ in rows if name in others) == sorted(others)
     finally:
         app.close()
 

@@ -4,17 +4,15 @@ import sys
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from urllib.parse import urlsplit
 
 from service.cli.arguments import SERVICE, add_command, add_json, count, print_json
 from service.cli.configuration import service_url, settings_of
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.follow import Metrics
+    from service.follow.follower import Metrics
 
 DEFAULT_CONCURRENCY = 16
-SCHEMES = ("nats", "tls")
 
 
 def add(commands: Any) -> None:
@@ -73,15 +71,20 @@ def run(parsed: Namespace) -> int:
     from acquire_client import AsyncClient
     from prometheus_client import start_http_server
 
-    from service.follow import Follower, Metrics, Source
+    from service.follow.follower import Follower, Metrics
+    from service.follow.over_http import OverHttp
+    from service.follow.source import Source, refusals_of, server_and_stream
     from service.replay.over_http import checked_url, translated
 
-    servers, stream = _server_and_stream(parsed.source)
+    try:
+        servers, stream = server_and_stream(parsed.source)
+    except ValueError as error:
+        raise BadInput(Fault("SOURCE", str(error), shown_value(parsed.source))) from None
     source = Source(
         servers,
         stream,
         parsed.consumer,
-        parsed.refusals or f"acquire.refused.{stream}",
+        parsed.refusals or refusals_of(stream),
         parsed.answers,
         _existing_file(parsed.credentials, "--credentials"),
         _existing_file(parsed.authority, "--authority"),
@@ -92,7 +95,9 @@ def run(parsed: Namespace) -> int:
 
     async def follow() -> None:
         async with AsyncClient(url, token=token) as client:
-            follower = Follower(source, client, metrics, _show)
+            submit = OverHttp(client)
+            await submit.require_scope()
+            follower = Follower(source, submit, metrics, _show)
             loop = asyncio.get_running_loop()
             for number in (signal.SIGINT, signal.SIGTERM):
                 loop.add_signal_handler(number, follower.stop)
@@ -120,15 +125,6 @@ def _show(metrics: "Metrics") -> None:
 def _text(metrics: "Metrics") -> str:
     counts = ", ".join(f"{number:,} {name}" for name, number in metrics.counts.items())
     return f"{counts}; {metrics.lag:,} to come"
-
-
-def _server_and_stream(text: str) -> tuple[str, str]:
-    parts = urlsplit(text)
-    stream = parts.path.strip("/")
-    if parts.scheme not in SCHEMES or not parts.hostname or not stream or "/" in stream:
-        message = "must be nats://HOST/STREAM or tls://HOST/STREAM"
-        raise BadInput(Fault("SOURCE", message, shown_value(text)))
-    return f"{parts.scheme}://{parts.netloc}", stream
 
 
 def _existing_file(file: Path | None, name: str) -> Path | None:

@@ -38,6 +38,8 @@ _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
 _NOTHING: Row = dict.fromkeys((*COUNTS, *tables.SUMS), 0) | dict.fromkeys(
     (*tables.MINIMA, *tables.MAXIMA)
 )
+ROWS_AT_ONCE = 500
+"""Rows of results, with their answers, that a recount holds."""
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
@@ -203,7 +205,11 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         query = select(tracker_values, *place).select_from(source)
     width_s = TRENDS[bucket].width_s
     found: Rollups = {}
-    for row in connection.execute(query.where(results.c.current)).mappings():
+    # PostgreSQL's client would hold all rows at once.
+    read = connection.execute(
+        query.where(results.c.current), execution_options={"yield_per": ROWS_AT_ONCE}
+    )
+    for row in read.mappings():
         tracker = (row["tracker"],) if of_trackers else ()
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number

@@ -28,7 +28,7 @@ MEDIA_TYPE = "application/problem+json"
 log = logging.getLogger(__name__)
 
 
-_FAILED = {"detail": "The service has failed; its log contains the cause."}
+FAILED = {"detail": "The service has failed; its log contains the cause."}
 
 
 def problem_response(
@@ -68,7 +68,7 @@ def problem_within(request: Request, error: BaseException) -> Problem:
         or types.problem_type_of(error) is types.INTERNAL_ERROR
     ):
         log.error("%s %s failed in part", request.method, request.url.path, exc_info=error)
-        return convert(_content(request, types.INTERNAL_ERROR, _FAILED), Problem)
+        return convert(_content(request, types.INTERNAL_ERROR, FAILED), Problem)
     return convert(
         _content(request, types.problem_type_of(error), errors.problem_of(error)), Problem
     )
@@ -143,7 +143,7 @@ def _methods_at(request: Request) -> list[str]:
 def internal_error(request: Request, error: Exception) -> Response:
     """Log an unexpected error, and answer without details of it."""
     log.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(request, types.INTERNAL_ERROR, _FAILED)
+    return problem_response(request, types.INTERNAL_ERROR, FAILED)
 
 
 async def _on_disconnect(request: Request, error: Exception) -> Response:

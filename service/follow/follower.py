@@ -1,4 +1,4 @@
-"""Follows a stream of NATS JetStream: a durable consumer whose messages go to a service.
+"""Follows a stream: a durable consumer of NATS JetStream whose messages are submitted.
 
     stream ──► consumer ──► follower ──► service ──► committed ──► acknowledged
                                └──► refused: subject of refusals, and terminated
@@ -6,22 +6,20 @@
 A message is a batch or a gyro block, as JSON.  It is acknowledged after the service has committed
 it; one that is delivered again, because a follower ended in between, gets the stored answer.
 Several followers of one consumer share its messages: the distributed queue is that of NATS.
+
+A `Submit` hands a message over: `over_http` to a service that listens somewhere,
+`service.web.own_follower` to the service that the follower runs in.
 """
 
 import asyncio
 import json
 import logging
 import ssl
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from pathlib import Path
+from typing import Any
 
-import nats
-from acquire_client import AsyncClient
-from acquire_client import errors as answers
-from acquire_client.encoding import path_of
-from acquire_client.retrying import Repeat
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
@@ -30,14 +28,16 @@ from nats.js.api import AckPolicy, ConsumerConfig
 from nats.js.errors import NoStreamResponseError, NotFoundError
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
-from service.errors import BadConfiguration
+from service.errors import AcquisitionError, BadConfiguration
+from service.follow.source import Source
 from service.gyro import is_gyro_line
 
 ACK_WAIT_S = 30.0
 """A message without a sign from its follower for so long is delivered to another one."""
 BEAT_S = 10.0
 FETCH_S = 1.0
-PAUSE_S = 1.0
+PAUSE_S = 1
+BEGIN_AGAIN_S = 5.0
 TRIES = 5
 """Deliveries of a message at which the service fails, before it is refused."""
 STATE_EVERY_S = 5.0
@@ -48,28 +48,40 @@ log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Source:
-    """The stream, consumer and subjects that a follower uses."""
+class Answer:
+    """The answer to a message that is recorded."""
 
-    servers: str
-    stream: str
-    consumer: str
-    refusals: str
-    """The subject that refused messages go to, with the problem."""
-    answers: str | None = None
-    """The subject that answers are published to; None: to none."""
-    credentials: Path | None = None
-    authority: Path | None = None
-    """The certificate of the authority that NATS is trusted by; None: those of the system."""
-    concurrency: int = 16
-    """Messages that are at work together."""
+    body: bytes
+    is_repeated: bool
+    """True if it had been recorded before."""
+
+
+Submit = Callable[[bytes], Awaitable[Answer]]
+"""Hands a message over, and waits until it is recorded.
+
+Raises `NotNow`, `Refused`, or another exception that is about no single message.
+"""
+
+
+class NotNow(Exception):
+    """The service takes no message now; the same one may be recorded later."""
+
+
+class Refused(Exception):
+    """The service refuses a message."""
+
+    def __init__(self, problem: Mapping[str, Any], has_failed: bool) -> None:
+        """`has_failed`: the fault is the service's; another attempt may succeed."""
+        super().__init__(problem["detail"])
+        self.problem, self.has_failed = problem, has_failed
 
 
 class Metrics:
     """Counters of a follower for Prometheus, and for its summary."""
 
-    def __init__(self) -> None:
-        self.registry = CollectorRegistry()
+    def __init__(self, registry: CollectorRegistry | None = None) -> None:
+        """The counters are in a registry of their own unless one is given."""
+        self.registry = CollectorRegistry() if registry is None else registry
         self._messages = Counter(
             "starid_follow_messages",
             "Messages of the stream by what came of them: recorded, repeated or refused.",
@@ -111,12 +123,12 @@ class Follower:
     def __init__(
         self,
         source: Source,
-        client: AsyncClient,
+        submit: Submit,
         metrics: Metrics,
         progress: Callable[[Metrics], object] = lambda metrics: None,
     ) -> None:
         """`progress` is called every few seconds."""
-        self._source, self._client = source, client
+        self._source, self._submit = source, submit
         self._metrics, self._progress = metrics, progress
         self._stopped = asyncio.Event()
 
@@ -127,12 +139,12 @@ class Follower:
     async def run(self, until_empty: bool = False) -> None:
         """Follow the stream; with `until_empty`, until nothing is left to deliver.
 
-        Raises `BadConfiguration` where NATS has no such stream or refuses the connection, or the
-        token may not submit, and what the client raises where the service wants another token.
+        Raises `BadConfiguration` where NATS has no such stream or refuses the connection, and what
+        `submit` raises that is about no single message.
         """
-        if "submit" not in (await self._client.session()).scopes:
-            raise BadConfiguration("ACQUIRE_TOKEN: the token lacks the scope `submit`")
         connection = await self._connected()
+        if connection is None:
+            return
         try:
             stream = connection.jetstream()
             await self._require_consumer(stream)
@@ -165,29 +177,55 @@ class Follower:
                 await connection.flush(timeout=5)
             await connection.close()
 
-    async def _connected(self) -> Client:
+    async def keep_running(self) -> None:
+        """Follow until it is stopped; after a failure begin again a few seconds later."""
+        while not self._stopped.is_set():
+            try:
+                await self.run()
+            except (AcquisitionError, NatsError, OSError) as error:
+                log.warning("the stream is not followed now: %s", error)
+            except Exception:
+                log.exception("the follower failed; it begins again")
+            with suppress(TimeoutError):
+                await asyncio.wait_for(self._stopped.wait(), BEGIN_AGAIN_S)
+
+    async def _connected(self) -> Client | None:
+        """A connection; None if the follower was stopped before NATS answered."""
         source = self._source
-        context = None
-        if source.authority is not None or source.servers.startswith("tls://"):
-            context = ssl.create_default_context(cafile=source.authority)
 
         async def note(error: Exception) -> None:
             log.warning("NATS: %s", error)
 
+        connection = Client()
         try:
-            return await nats.connect(
-                source.servers,
-                name=f"acquire follow {source.consumer}",
-                user_credentials=None if source.credentials is None else str(source.credentials),
-                tls=context,
-                max_reconnect_attempts=-1,
-                reconnect_time_wait=PAUSE_S,
-                error_cb=note,
-                allow_reconnect=True,
-                connect_timeout=5,
+            context = None
+            if source.authority is not None or source.servers.startswith("tls://"):
+                context = ssl.create_default_context(cafile=source.authority)
+            connecting = asyncio.create_task(
+                connection.connect(
+                    source.servers,
+                    name=f"acquire follow {source.consumer}",
+                    user_credentials=source.credentials and str(source.credentials),
+                    tls=context,
+                    max_reconnect_attempts=-1,
+                    reconnect_time_wait=PAUSE_S,
+                    error_cb=note,
+                    connect_timeout=5,
+                )
             )
-        except (NatsError, OSError, ssl.SSLError) as error:
-            raise BadConfiguration(f"{source.servers}: NATS cannot be reached: {error}") from None
+            stopping = asyncio.create_task(self._stopped.wait())
+            await asyncio.wait({connecting, stopping}, return_when=asyncio.FIRST_COMPLETED)
+            stopping.cancel()
+            if connecting.done():
+                connecting.result()
+                return connection
+            connecting.cancel()
+            with suppress(asyncio.CancelledError):
+                await connecting
+            await connection.close()
+            return None
+        except (NatsError, OSError) as error:
+            raise BadConfiguration(f"{source.shown}: NATS cannot be reached: {error}") from None
 
     async def _require_consumer(self, stream: JetStreamContext) -> None:
         """Make the durable consumer where there is none."""
@@ -195,9 +233,7 @@ class Follower:
         try:
             await stream.stream_info(source.stream)
         except NotFoundError:
-            raise BadConfiguration(
-                f"{source.servers}: NATS has no stream {source.stream}"
-            ) from None
+            raise BadConfiguration(f"{source.shown}: NATS has no stream {source.stream}") from None
         try:
             await stream.consumer_info(source.stream, source.consumer)
         except NotFoundError:
@@ -242,40 +278,30 @@ class Follower:
     async def _settle(self, stream: JetStreamContext, message: Msg) -> None:
         while not self._stopped.is_set():
             try:
-                body, is_repeated = await self._submitted(message.data)
-            except answers.Unauthenticated:
-                # Of the token, not of the message: that waits for a follower that may.
-                await message.nak()
-                raise
-            except (answers.Busy, answers.RateLimited, answers.NoAnswer) as error:
+                answer = await self._submit(message.data)
+            except NotNow as error:
                 log.warning("the service does not take messages now: %s", error)
                 await asyncio.sleep(PAUSE_S)
-            except answers.Problem as problem:
-                is_last = message.metadata.num_delivered >= TRIES
-                if isinstance(problem, answers.ServiceFailed) and not is_last:
+            except Refused as refused:
+                if refused.has_failed and message.metadata.num_delivered < TRIES:
                     await message.nak(PAUSE_S)
                     return
-                await self._publish(stream, self._source.refusals, message, _refusal(problem))
+                problem = json.dumps(refused.problem).encode()
+                await self._publish(stream, self._source.refusals, message, problem)
                 await message.term()
                 self._metrics.count("refused")
                 return
+            except Exception:
+                # Of the token, for example, not of the message: that waits for a follower that may.
+                await message.nak()
+                raise
             else:
                 if self._source.answers is not None:
-                    await self._publish(stream, self._source.answers, message, body)
+                    await self._publish(stream, self._source.answers, message, answer.body)
                 await message.ack()
-                self._metrics.count("repeated" if is_repeated else "recorded")
+                self._metrics.count("repeated" if answer.is_repeated else "recorded")
                 return
         await message.nak()
-
-    async def _submitted(self, sent: bytes) -> tuple[bytes, bool]:
-        """The answer of the service once it has committed, and whether it had it before."""
-        path, body = path_of("batches"), sent
-        if is_gyro_line(sent):
-            block = json.loads(sent)
-            path = path_of("spacecraft", str(block.pop("spacecraft", "")), "gyro")
-            body = json.dumps(block).encode()
-        response = await self._client.request("POST", path, body=body, repeat=Repeat.ALWAYS)
-        return response.content, response.headers.get("Replayed") == "true"
 
     async def _publish(
         self, stream: JetStreamContext, subject: str, message: Msg, body: bytes
@@ -293,11 +319,9 @@ class Follower:
             log.debug("no stream keeps %s: who listens now hears of it", subject)
 
 
-def _refusal(problem: answers.Problem) -> bytes:
-    """The problem of a refused message."""
-    errors = [
-        {"field": each.field, "message": each.message, "value": each.value}
-        for each in problem.errors or ()
-    ]
-    body = {"type": problem.type, "status": problem.status, "detail": problem.detail}
-    return json.dumps(body | {"errors": errors}).encode()
+def gyro_block_in(message: bytes) -> tuple[str, bytes] | None:
+    """The spacecraft of a gyro block, and the body of a request for it; None for a batch."""
+    if not is_gyro_line(message):
+        return None
+    block = json.loads(message)
+    return str(block.pop("spacecraft", "")), json.dumps(block).encode()

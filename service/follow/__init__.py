@@ -1,0 +1,1 @@
+"""Telemetry from a message bus: follows a stream of NATS JetStream."""
