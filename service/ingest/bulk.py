@@ -7,7 +7,7 @@ time while no single post waits.  Only this process uses the database.
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Annotated
 
 import msgspec
@@ -210,7 +210,7 @@ class Bulk:
     ) -> "BulkChunk":
         """Let a chunk be computed; raises `Busy` where the time has not come.
 
-        `require` is called before each batch that this process computes itself, and
+        `require` is called before each portion that this process computes itself, and
         ends that where it raises.
         """
         # Without them each worker would compile what it does not find.
@@ -235,16 +235,8 @@ class Bulk:
 
     def compute_here(self, lines: TelemetryLines, require: Require) -> list[LineResult]:
         """The same in this process; single posts go first."""
-
-        def unsaved_results(fresh: Sequence[Submission]) -> list[UnsavedResult | AcquisitionError]:
-            made = []
-            for each in fresh:
-                require()
-                made.append(self.submissions.solve_one_of_many(each))
-            return made
-
-        asks_for_last = self.submissions.solver.asks_for_last
-        return line_results(lines, unsaved_results, asks_for_last)
+        solve = partial(self.submissions.solve_many, require=require)
+        return line_results(lines, solve, self.submissions.solver.asks_for_last)
 
     def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
         """Record a line that asks for the last attitude, when all before it are recorded."""
@@ -368,7 +360,10 @@ class BulkChunk:
             submission = submission_from_json(text, run=self._lines.run)
             if self._bulk.submissions.solver.asks_for_last(submission.batch):
                 return TrackedLine(seen.identity, submission.text)
-            return self._bulk.submissions.solve_one_of_many(submission)
+            (made,) = self._bulk.submissions.solve_many([submission])
+            if isinstance(made, AcquisitionError):
+                raise made
+            return made
         answer = self._stored[first.result_id]
         if isinstance(answer, AcquisitionError):
             # The archive may be out of reach for long: the other lines do not wait for it.

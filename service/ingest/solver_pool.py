@@ -118,19 +118,15 @@ class Solver:
         received = utc_now()
         several = self.acquired([each.batch for each in submissions])
         return [
-            self._one_of_many(submission, partial(self.unsaved, submission, found, received))
+            self._one_of_many(submission, found, received)
             for submission, found in zip(submissions, several, strict=True)
         ]
 
-    def solve_one_of_many(self, submission: Submission) -> UnsavedResult | AcquisitionError:
-        """The result of a submission, or what is wrong with that one alone."""
-        return self._one_of_many(submission, partial(self.solve, submission))
-
     def _one_of_many(
-        self, submission: Submission, solve: Callable[[], UnsavedResult]
+        self, submission: Submission, found: Acquisition | Exception, received: Utc
     ) -> UnsavedResult | AcquisitionError:
         try:
-            return solve()
+            return self.unsaved(submission, found, received)
         except Busy:
             # Nothing is decided about the batch: the whole chunk may come again.
             raise

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -50,6 +51,8 @@ log = logging.getLogger(__name__)
 
 YIELD_S = 0.002
 """The longest wait of each bulk batch for single posts."""
+PORTION = 32
+"""Batches of bulk that are solved at once, while no single one comes before them."""
 MAX_ARRAY = 100
 """The most batches of an array."""
 READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
@@ -285,9 +288,9 @@ class SubmissionService:
             stored = self._store.archive.stored_answers(connection, repeats)
         # The connection is given back: a snapshot of the database that is held for as long as
         # five hundred batches take keeps SQLite from shortening its log.
-        found: list[UnsavedResult | ExistingResult | AcquisitionError] = []
-        for holder, each in zip(holders, submissions, strict=True):
-            found.append(holder or self.solve_one_of_many(each))
+        fresh = [each for holder, each in zip(holders, submissions, strict=True) if not holder]
+        solved = iter(self.solve_many(fresh))
+        found = [holder or next(solved) for holder in holders]
         unsaved_results = [each for each in found if isinstance(each, UnsavedResult)]
         written = iter(self.begin_writing(unsaved_results)())
         answers: Answers = []
@@ -375,12 +378,20 @@ class SubmissionService:
 
     # ---- bulk --------------------------------------------------------------------------------
 
-    def solve_one_of_many(self, submission: Submission) -> UnsavedResult | AcquisitionError:
-        """The result of one of many; single submissions go first."""
-        self.yield_to_interactive()
-        return self.pool.call(
-            lambda: self.solver.solve_one_of_many(submission), "bulk", is_long=True
-        )
+    def solve_many(
+        self, submissions: Sequence[Submission], require: Callable[[], object] = lambda: None
+    ) -> list[UnsavedResult | AcquisitionError]:
+        """The result of each of many, or what is wrong with that one; single submissions go first.
+
+        `require` is called before each portion, and ends this where it raises.
+        """
+        found: list[UnsavedResult | AcquisitionError] = []
+        for first in range(0, len(submissions), PORTION):
+            require()
+            self.yield_to_interactive()
+            portion = submissions[first : first + PORTION]
+            found += self.pool.call(partial(self.solver.solve_many, portion), "bulk", is_long=True)
+        return found
 
     def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
         """Queue many results for a transaction; to call what it gives waits for the answers."""

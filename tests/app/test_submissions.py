@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from service.acquire import kernel_build
+from service.acquire import kernel_build, pipeline
 from service.acquire.kernel_build import KernelBuild
 from service.app.factory import open_app
 from service.errors import AcquisitionError, BadBatch, BadConfiguration, BadInput, Busy, Conflict
@@ -95,18 +95,19 @@ def test_batches_run_to_warm_up_are_not_kept(app, make, caplog):
 
 
 def test_single_posts_go_before_bulk(app, make, monkeypatch):
-    """Between the batches of a bulk load whatever came one by one is computed and recorded."""
+    """Between the portions of a bulk load whatever came one by one is computed and recorded."""
     monkeypatch.setattr(submit, "YIELD_S", 10.0)
-    acquire, order, first_at_work = solver_pool.acquire, [], threading.Event()
+    monkeypatch.setattr(submit, "PORTION", 2)
+    acquired, order, first_at_work = solver_pool.acquired, [], threading.Event()
 
-    def noting(batch, mission, sky):
-        order.append(batch.batch)
-        if batch.batch == "m0":
+    def noting(batches, *rest, **how):
+        order.extend(each.batch for each in batches)
+        if batches[0].batch == "m0":
             first_at_work.set()
             time.sleep(0.5)
-        return acquire(batch, mission, sky)
+        return acquired(batches, *rest, **how)
 
-    monkeypatch.setattr(solver_pool, "acquire", noting)
+    monkeypatch.setattr(solver_pool, "acquired", noting)
     bulk = [make(f"m{k}", run="bulk") for k in range(4)]
     single = make("b1")
     with ThreadPoolExecutor(1) as threads:
@@ -114,7 +115,7 @@ def test_single_posts_go_before_bulk(app, make, monkeypatch):
         assert first_at_work.wait(30)
         app.submissions.submit(single)
         assert len(many.result(30)) == 4
-    assert order == ["m0", "b1", "m1", "m2", "m3"]
+    assert order == ["m0", "m1", "b1", "m2", "m3"]
 
 
 def test_nothing_at_once_is_nothing(app):
@@ -248,12 +249,12 @@ def test_a_catalog_that_cannot_be_read_is_a_mistake_in_the_configuration(tmp_pat
 def test_no_moment_of_the_database_is_held_while_many_are_worked_on(app, make):
     held = []
     solver = app.submissions.solver
-    solver.acquire = lambda *asked, own=solver.acquire, **how: (
+    solver.acquired = lambda *asked, own=solver.acquired, **how: (
         held.append(app.store._readers.pool.checkedout()),
         own(*asked, **how),
     )[1]
     app.submissions.submit_many([make("b1"), make("b2")])
-    assert held == [0, 0]
+    assert held == [0]
 
 
 def test_many_at_once_share_the_time_of_their_recording(app, make):
@@ -270,13 +271,13 @@ def test_many_at_once_share_the_time_of_their_recording(app, make):
 def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
     app, make, monkeypatch, caplog
 ):
-    def acquire(batch, *rest):
+    def search(batch, *rest):
         if batch.batch == "b2":
             raise ZeroDivisionError("inside")
         return real(batch, *rest)
 
-    real = solver_pool.acquire
-    monkeypatch.setattr(solver_pool, "acquire", acquire)
+    real = pipeline._search
+    monkeypatch.setattr(pipeline, "_search", search)
     first, second, third = app.submissions.submit_many([make("b1"), make("b2"), make("b3")])
     assert not first.replayed
     assert not third.replayed
@@ -292,17 +293,17 @@ def test_a_batch_was_received_before_it_was_worked_on_however_long_that_took(
     begun = []
 
     def slowed(acquire):
-        def slow(*asked, **how):
-            begun.append(utc_now().tai_ns)
+        def slow(asked, **how):
+            begun.extend([utc_now().tai_ns] * (len(asked) if isinstance(asked, list) else 1))
             time.sleep(0.02)
-            return acquire(*asked, **how)
+            return acquire(asked, **how)
 
         return slow
 
     monkeypatch.setattr(solver, "acquire", slowed(solver.acquire))
     monkeypatch.setattr(solver, "acquired", slowed(solver.acquired))
     made = [solver.solve(make("alone"))]
-    made += [solver.solve_one_of_many(make(name)) for name in ("one", "other")]
+    made += solver.solve_many([make("one"), make("other")])
     app.submissions.submit(make("in the queue"))
     (told,) = (each for each in app.results.page().items if each.batch == "in the queue")
     received = [parse_utc(each.batch["received"]).tai_ns for each in made] + [
