@@ -22,6 +22,7 @@ from llvmlite.binding import parse_assembly  # type: ignore[import-untyped]
 from numba.core.caching import FunctionCache
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
 
 from service.compiled.checked_file import CheckedFile
@@ -70,12 +71,12 @@ class Kernel(CPUDispatcher):
         self._inner = CPUDispatcher(function, targetoptions=options | without)
 
     def compile(self, sig: Any) -> Any:
-        """Load or compile the kernel for a signature."""
-        try:
-            return super().compile(sig)
-        except BaseException:
-            self._cache.unlock()
-            raise
+        """Load or compile the kernel for a signature, one thread at a time."""
+        with global_compiler_lock:
+            try:
+                return super().compile(sig)
+            finally:
+                self._cache.unlock()
 
     @property
     def _numba_type_(self) -> Any:
@@ -97,7 +98,7 @@ class _LockedCache(FunctionCache):
         self._lock: IO[str] | None = None
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
-        """Load a kernel; if there is none, lock it until it is saved or `unlock` is called."""
+        """Load a kernel; if there is none, lock it for saving, until `unlock` is called."""
         load: Callable[..., Any] = super().load_overload
         kernel = load(sig, target_context)
         if kernel is None and self._lock is None:
@@ -107,14 +108,7 @@ class _LockedCache(FunctionCache):
                 self._lock = place.open("w")
                 fcntl.flock(self._lock, fcntl.LOCK_EX)
                 kernel = load(sig, target_context)
-        if kernel is not None:
-            self.unlock()
         return kernel
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        """Save a kernel that was locked."""
-        super().save_overload(sig, data)  # type: ignore[no-untyped-call]
-        self.unlock()
 
     def unlock(self) -> None:
         """Let other processes load the kernel, or compile it."""

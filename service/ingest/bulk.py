@@ -1,7 +1,7 @@
 """Many batches at once, from lines of telemetry to stored answers.
 
-Worker processes compute where there are any; otherwise this process does, a line at a
-time while no single post waits.  Only this process uses the database.
+Worker processes compute where there are any; otherwise this process does, a portion at
+a time while no single post waits.  Only this process uses the database.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -116,7 +116,16 @@ class Solver:
     ) -> list[UnsavedResult | AcquisitionError]:
         """The result of each submission, or what is wrong with that one alone."""
         received = utc_now()
-        several = self.acquired([each.batch for each in submissions])
+        several: Sequence[Acquisition | Exception]
+        try:
+            several = self.acquired([each.batch for each in submissions])
+        except Busy:
+            raise
+        except Exception as error:
+            if len(submissions) > 1:
+                # Only the batch with the fault is refused.
+                return [one for each in submissions for one in self.solve_many([each])]
+            several = [error]
         return [
             self._one_of_many(submission, found, received)
             for submission, found in zip(submissions, several, strict=True)

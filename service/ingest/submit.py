@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -386,10 +386,9 @@ class SubmissionService:
         `require` is called before each portion, and ends this where it raises.
         """
         found: list[UnsavedResult | AcquisitionError] = []
-        for first in range(0, len(submissions), PORTION):
+        for portion in _portions(submissions):
             require()
             self.yield_to_interactive()
-            portion = submissions[first : first + PORTION]
             found += self.pool.call(partial(self.solver.solve_many, portion), "bulk", is_long=True)
         return found
 
@@ -551,6 +550,22 @@ class SubmissionService:
             except Exception:
                 # The batch is recorded and its answer due, whatever an observer does.
                 log.exception("an observer failed")
+
+
+def _portions(submissions: Sequence[Submission]) -> Iterator[list[Submission]]:
+    """Those that take milliseconds together; what may take long by itself, so that it can stop."""
+    portion: list[Submission] = []
+    for each in submissions:
+        is_long = may_take_long(each.batch)
+        if portion and (is_long or len(portion) == PORTION):
+            yield portion
+            portion = []
+        if is_long:
+            yield [each]
+        else:
+            portion.append(each)
+    if portion:
+        yield portion
 
 
 def decided(outcomes: WriteOutcomes) -> Answers:

@@ -118,6 +118,20 @@ def test_single_posts_go_before_bulk(app, make, monkeypatch):
     assert order == ["m0", "m1", "b1", "m2", "m3"]
 
 
+def test_what_may_take_long_is_solved_by_itself(app, make, monkeypatch):
+    portions, acquired = [], solver_pool.acquired
+
+    def noting(batches, *rest, **how):
+        portions.append([each.batch for each in batches])
+        return acquired(batches, *rest, **how)
+
+    monkeypatch.setattr(solver_pool, "acquired", noting)
+    monkeypatch.setattr(submit, "may_take_long", lambda batch: batch.batch == "b2")
+    monkeypatch.setattr(submit, "PORTION", 2)
+    app.submissions.submit_many([make(f"b{k}") for k in range(7)])
+    assert portions == [["b0", "b1"], ["b2"], ["b3", "b4"], ["b5", "b6"]]
+
+
 def test_nothing_at_once_is_nothing(app):
     assert app.submissions.submit_many([]) == []
 
@@ -268,16 +282,25 @@ def test_many_at_once_share_the_time_of_their_recording(app, make):
     assert sum(recording) < took_us
 
 
+@pytest.mark.parametrize("place", ["of its own", "of all together"])
 def test_a_fault_of_ours_in_one_batch_keeps_no_other_from_being_recorded(
-    app, make, monkeypatch, caplog
+    app, make, monkeypatch, caplog, place
 ):
     def search(batch, *rest):
         if batch.batch == "b2":
             raise ZeroDivisionError("inside")
         return real(batch, *rest)
 
-    real = pipeline._search
-    monkeypatch.setattr(pipeline, "_search", search)
+    def acquired(batches, *rest, **how):
+        if "b2" in [each.batch for each in batches]:
+            raise ZeroDivisionError("inside")
+        return real_of_all(batches, *rest, **how)
+
+    real, real_of_all = pipeline._search, solver_pool.acquired
+    if place == "of its own":
+        monkeypatch.setattr(pipeline, "_search", search)
+    else:
+        monkeypatch.setattr(solver_pool, "acquired", acquired)
     first, second, third = app.submissions.submit_many([make("b1"), make("b2"), make("b3")])
     assert not first.replayed
     assert not third.replayed
