@@ -7,7 +7,7 @@ once, `AsyncClient` when the call is awaited.
 from collections.abc import Callable, Coroutine
 from dataclasses import dataclass
 from functools import partial, update_wrapper, wraps
-from types import MethodType
+from inspect import getattr_static, iscoroutinefunction
 from typing import TYPE_CHECKING, Any, Concatenate, Generic, ParamSpec, TypeVar, cast, overload
 
 import httpx
@@ -65,28 +65,56 @@ def post(kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED
     return Call(partial(decoded, kind=kind), "POST", path, body=body, repeat=repeat)
 
 
-class _Method(Generic[P]):
+class _Method:
     """A method that describes what the client carries out."""
 
-    def __init__(self, describe: Callable[Concatenate[Any, P], Any]) -> None:
-        @wraps(describe)
-        def method(client: Any, *args: P.args, **kwargs: P.kwargs) -> Any:
-            asked = describe(client, *args, **kwargs)
-            return client._carry_out(asked) if isinstance(asked, Call) else client._listed(asked)
-
-        self._method = method
+    def __init__(self, describe: Callable[..., Any]) -> None:
+        self._describe = describe
         # For `doctest`, which looks at this object.
         update_wrapper(cast(Any, self), describe)
 
-    def _bound(self, client: Any) -> Any:
-        return self._method if client is None else MethodType(self._method, client)
+    def function_of(self, owner: type["Caller"]) -> Callable[..., Any]:
+        """The function that a class of clients has in place of this object."""
+        raise NotImplementedError
 
 
-class single_request(_Method[P], Generic[P, T]):  # noqa: N801 - a decorator
+class Caller:
+    """The base of both connections: classes below it get functions in place of descriptions.
+
+    They are coroutine functions where the connection is asynchronous, as `inspect` and
+    `unittest.mock.create_autospec` look for.
+    """
+
+    _carry_out: Callable[..., Any]
+    _listed: Callable[..., Any]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        for name in dir(cls):
+            method = getattr_static(cls, name)
+            if isinstance(method, _Method):
+                setattr(cls, name, method.function_of(cls))
+
+
+class single_request(_Method, Generic[P, T]):  # noqa: N801 - a decorator
     """Decorates a method that describes one request."""
 
     def __init__(self, describe: Callable[Concatenate[Any, P], Call[T]]) -> None:
         super().__init__(describe)
+
+    def function_of(self, owner: type[Caller]) -> Callable[..., Any]:
+        """A function that sends the request, and gives the answer."""
+        describe = self._describe
+
+        @wraps(describe)
+        def at_once(client: Any, *args: Any, **kwargs: Any) -> Any:
+            return client._carry_out(describe(client, *args, **kwargs))
+
+        @wraps(describe)
+        async def awaited(client: Any, *args: Any, **kwargs: Any) -> Any:
+            return await client._carry_out(describe(client, *args, **kwargs))
+
+        return awaited if iscoroutinefunction(owner._carry_out) else at_once
 
     @overload
     def __get__(self, client: None, owner: type) -> Callable[..., Any]: ...
@@ -100,15 +128,25 @@ class single_request(_Method[P], Generic[P, T]):  # noqa: N801 - a decorator
     ) -> Callable[P, Coroutine[Any, Any, T]]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """The method of a client, or the function of a class."""
-        return self._bound(client)
+        """For type checkers: classes of clients have a function in place of this object."""
+        return self
 
 
-class paged_list(_Method[P], Generic[P, Row]):  # noqa: N801 - a decorator
+class paged_list(_Method, Generic[P, Row]):  # noqa: N801 - a decorator
     """Decorates a method that describes a long list."""
 
     def __init__(self, describe: Callable[Concatenate[Any, P], Listing[Row]]) -> None:
         super().__init__(describe)
+
+    def function_of(self, owner: type[Caller]) -> Callable[..., Any]:
+        """A function that gives the items of the list."""
+        describe = self._describe
+
+        @wraps(describe)
+        def listed(client: Any, *args: Any, **kwargs: Any) -> Any:
+            return client._listed(describe(client, *args, **kwargs))
+
+        return listed
 
     @overload
     def __get__(self, client: None, owner: type) -> Callable[..., Any]: ...
@@ -120,5 +158,5 @@ class paged_list(_Method[P], Generic[P, Row]):  # noqa: N801 - a decorator
     def __get__(self, client: "AsyncConnection", owner: type) -> Callable[P, "AsyncItems[Row]"]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """The method of a client, or the function of a class."""
-        return self._bound(client)
+        """For type checkers: classes of clients have a function in place of this object."""
+        return self

@@ -228,6 +228,8 @@ class IngestQueue:
             else:
                 pending.unsaved = found
                 job.unsaved_results = [found]
+                # Only from now on does it wait to be written.
+                job.since_s = time.monotonic()
 
     def _start(self, pending: PendingBatch) -> None:
         """Queue a batch for the pool."""

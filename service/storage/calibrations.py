@@ -20,6 +20,7 @@ from service.storage.models.base import (
     Record,
     Stamp,
     doc,
+    page_record,
 )
 from service.storage.recording.ids import following_ulid
 from service.storage.sql.columns import Row
@@ -37,7 +38,6 @@ Terms = Annotated[
 class FocalPlane(Record, frozen=True, kw_only=True):
     """A tracker's focal-plane calibration, as in mission files."""
 
-    component: ClassVar[str] = "FocalPlane"
     scale: float
     h_terms: Terms
     v_terms: Terms
@@ -46,7 +46,6 @@ class FocalPlane(Record, frozen=True, kw_only=True):
 class TrackerMagnitudes(Record, frozen=True, kw_only=True):
     """A tracker's magnitude calibration, as in mission files."""
 
-    component: ClassVar[str] = "TrackerMagnitudes"
     zero_mag: float
     scale: float
     color_mag: float
@@ -55,7 +54,6 @@ class TrackerMagnitudes(Record, frozen=True, kw_only=True):
 class TrackerGeometry(Record, frozen=True, kw_only=True):
     """Alignment, focal plane and magnitudes of a tracker, as in mission files."""
 
-    component: ClassVar[str] = "TrackerGeometry"
     name: str
     x_axis_body: Components
     y_axis_body: Components
@@ -69,7 +67,6 @@ class TrackerGeometry(Record, frozen=True, kw_only=True):
 class CalibrationBatches(Record, frozen=True, kw_only=True):
     """The batches that a calibration came from."""
 
-    component: ClassVar[str] = "CalibrationBatches"
     total: Annotated[Count, doc("Batches in the period.")]
     sampled: Annotated[Count, doc("Batches that were processed again.")]
     used: Annotated[Count, doc("Batches with identified stars.")]
@@ -81,7 +78,6 @@ class CalibrationBatches(Record, frozen=True, kw_only=True):
 class CalibrationHeldOut(Record, frozen=True, kw_only=True):
     """How well a distortion of a degree predicts blocks of time that it was not fitted to."""
 
-    component: ClassVar[str] = "CalibrationHeldOut"
     degree: Count
     residual_over_sigma: float
     chosen: bool
@@ -90,7 +86,6 @@ class CalibrationHeldOut(Record, frozen=True, kw_only=True):
 class CalibrationResiduals(Record, frozen=True, kw_only=True):
     """Root mean square of a tracker's residuals per axis, before and after."""
 
-    component: ClassVar[str] = "CalibrationResiduals"
     tracker: str
     stars: Count
     before_arcsec: float
@@ -102,7 +97,6 @@ class CalibrationResiduals(Record, frozen=True, kw_only=True):
 class CalibrationUnknown(Record, frozen=True, kw_only=True):
     """An estimated correction to the settings that the calibration started from."""
 
-    component: ClassVar[str] = "CalibrationUnknown"
     name: str
     tracker: str
     kind: UnknownKind
@@ -114,7 +108,6 @@ class CalibrationUnknown(Record, frozen=True, kw_only=True):
 class CalibrationNotObservable(Record, frozen=True, kw_only=True):
     """Something that the stars cannot show, and why."""
 
-    component: ClassVar[str] = "CalibrationNotObservable"
     name: str
     reason: str
 
@@ -122,7 +115,6 @@ class CalibrationNotObservable(Record, frozen=True, kw_only=True):
 class ResidualCell(Record, frozen=True, kw_only=True):
     """Mean residuals of the stars in a cell of the focal plane, observed minus predicted."""
 
-    component: ClassVar[str] = "ResidualCell"
     h_deg: Annotated[float, doc("Of the cell's centre.")]
     v_deg: float
     stars: Count
@@ -133,7 +125,6 @@ class ResidualCell(Record, frozen=True, kw_only=True):
 class ResidualMap(Record, frozen=True, kw_only=True):
     """A tracker's residuals over its focal plane; cells without stars are left out."""
 
-    component: ClassVar[str] = "ResidualMap"
     tracker: str
     radius_deg: float
     step_deg: Annotated[float, doc("The width of a cell.")]
@@ -143,7 +134,6 @@ class ResidualMap(Record, frozen=True, kw_only=True):
 class CalibrationResult(Record, frozen=True, kw_only=True):
     """What the stars say of the trackers."""
 
-    component: ClassVar[str] = "CalibrationResult"
     batches: CalibrationBatches
     stars: Count
     stars_left_out: Annotated[Count, doc("Stars that were left out as wrong.")]
@@ -179,7 +169,6 @@ class CalibrationProgress(Record, frozen=True, kw_only=True):
 class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
     """A calibration without its covariance and maps; `result` fields are null until it is done."""
 
-    component: ClassVar[str] = "CalibrationSummary"
     fault: str | None
     residual_over_sigma: float | None
     degree: Count | None
@@ -192,7 +181,6 @@ class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
 class Calibration(CalibrationProgress, frozen=True, kw_only=True):
     """A calibration: what was asked, how far it is, and what was found."""
 
-    component: ClassVar[str] = "Calibration"
     request: MissionSettings
     fault: str | None
     result: CalibrationResult | None
@@ -201,18 +189,14 @@ class Calibration(CalibrationProgress, frozen=True, kw_only=True):
     ]
 
 
-class CalibrationPage(Record, frozen=True, kw_only=True):
-    """A page of calibrations, newest first."""
-
-    component: ClassVar[str] = "CalibrationPage"
-    items: list[CalibrationSummary]
-    next_cursor: str | None
+CalibrationPage = page_record(
+    "CalibrationPage", CalibrationSummary, "A page of calibrations, newest first."
+)
 
 
 class CalibrationAdoption(Record, frozen=True, kw_only=True):
     """A change of the calibration in force, by whom and when."""
 
-    component: ClassVar[str] = "CalibrationAdoption"
     id: Id
     spacecraft: str
     adopted: Stamp
@@ -228,7 +212,6 @@ class CalibrationAdoption(Record, frozen=True, kw_only=True):
 class CalibrationInForce(Record, frozen=True, kw_only=True):
     """The calibration that new batches of a spacecraft use, and what held before."""
 
-    component: ClassVar[str] = "CalibrationInForce"
     spacecraft: str
     mission: Annotated[Digest, doc("The settings in force.")]
     calibration: Annotated[Id | None, doc("Null: the mission file holds.")]

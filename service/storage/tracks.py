@@ -118,7 +118,6 @@ TrackKindName = Literal["moving", "planet", "fixed_on_sky", "fixed_on_detector",
 class TrackPoint(Record, frozen=True, kw_only=True):
     """A point of a track."""
 
-    component: ClassVar[str] = "TrackPoint"
     id: Annotated[Id, doc("Of the batch's result.")]
     tracker: str
     star: Annotated[Count, doc("Its place among the tracker's stars in the batch, from 0.")]
@@ -177,7 +176,6 @@ class Track(Record, frozen=True, kw_only=True):
 class TrackList(Record, frozen=True, kw_only=True):
     """The tracks of a period, those of most points first."""
 
-    component: ClassVar[str] = "TrackList"
     spacecraft: str
     run: str
     batches: Annotated[Count, doc("Batches of the period.")]

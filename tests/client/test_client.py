@@ -2,6 +2,7 @@
 
 import asyncio
 import doctest
+import inspect
 import json
 import socket
 import threading
@@ -10,6 +11,7 @@ from contextlib import aclosing, contextmanager
 from datetime import UTC, datetime, timedelta, timezone
 from email.utils import format_datetime
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from unittest.mock import create_autospec
 
 import httpx
 import numpy as np
@@ -146,6 +148,40 @@ def test_the_asynchronous_client_gives_the_same(address, client, drawn):
     assert table == client.attitudes("XTE", run=run).to_arrow()
     assert heard == [1, 2, 3, 4, 5]
     assert states[-1] == "done"
+
+
+@pytest.mark.parametrize("name", ["submit", "what_if", "latest"])
+def test_methods_of_the_asynchronous_client_are_coroutine_functions(name):
+    assert inspect.iscoroutinefunction(getattr(AsyncClient, name))
+    assert not inspect.iscoroutinefunction(getattr(Client, name))
+
+
+def test_a_double_of_a_client_is_called_as_the_client_is():
+    double = create_autospec(AsyncClient, instance=True)
+    double.submit.return_value = "answered"
+    assert asyncio.run(double.submit({})) == "answered"
+    assert create_autospec(Client, instance=True).submit({}) is not None
+    assert not asyncio.iscoroutine(double.batches("XTE"))
+    for each in (double, create_autospec(Client, instance=True)):
+        with pytest.raises(TypeError, match="batch"):
+            each.submit()
+
+
+def test_an_argument_that_is_none_is_refused_when_the_call_is_awaited():
+    call = AsyncClient("http://127.0.0.1:9").submit({"magnitude": object()})
+    with pytest.raises(InvalidArgument):
+        asyncio.run(call)
+
+
+def test_a_class_below_a_client_keeps_its_own_methods():
+    class Own(Client):
+        def latest(self, spacecraft):
+            return "own"
+
+    class Below(Own):
+        pass
+
+    assert Below("http://127.0.0.1:9").latest("XTE") == "own"
 
 
 def test_pages_are_read_as_they_are_needed(client, drawn, monkeypatch):

@@ -119,6 +119,13 @@ def test_each_kind_of_event_has_the_model_of_its_data():
         assert (event.id, event.kind, type(event.data)) == (7, kind, data)
 
 
+@pytest.mark.parametrize("package", [client, models])
+def test_all_holds_every_public_name_and_no_module_but_the_models(package):
+    public = [name for name, value in vars(package).items() if not inspect.ismodule(value)]
+    public += ["models"] if package is client else []
+    assert sorted(package.__all__) == sorted(name for name in public if name[0] != "_")
+
+
 def test_an_event_of_a_later_service_is_handed_out_with_its_word():
     event = event_lines.Block(7, "eclipse", '{"begins": 3}').event()
     assert event == client.OtherEvent(7, "other", "eclipse", {"begins": 3})

@@ -103,9 +103,11 @@ def assert_as_claimed(psf, frames):
     spread = float(np.sqrt((errors**2).mean()))
     print(
         f"\n{psf}: {counts['frames']} frames, {counts['right']} attitudes right, "
-        f"{counts['suspect']} suspect, e^T P^-1 e over 3 of the others {chi2:.2f}; "
-        f"{counts['stars']} stars, {counts['no star']} of them none; "
-        f"{counts['named']} named, {counts['misnamed']} wrongly; {len(errors)} errors of places, "
+        f"{counts['suspect']} suspect; "
+        f"mean normalised error squared over 3, good attitudes: {chi2:.2f}; "
+        f"detections sent, of these no star: {counts['stars']}, {counts['no star']}; "
+        f"stars named; wrongly named: {counts['named']}, {counts['misnamed']}; "
+        f"{len(errors)} errors of places, "
         f"over their sigmas: rms {spread:.3f}, central 68.3 % "
         f"{np.quantile(np.abs(errors), 0.6827):.3f}, largest {np.abs(errors).max():.1f}"
     )

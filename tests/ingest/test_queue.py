@@ -168,6 +168,22 @@ def test_what_waited_too_long_may_come_again(app, send, make, monkeypatch):
     assert not app.submissions.submit(make("b2")).replayed
 
 
+@pytest.mark.parametrize("step", ["_look_up", "_solve_together"])
+def test_look_up_and_solving_are_no_wait_to_be_written(app, make, monkeypatch, step):
+    app.submissions.submit(make("builds its zone"))
+    work, taken = getattr(app.submissions._queue, step), []
+
+    def slowly(group):
+        taken.extend(group)
+        time.sleep(0.5)
+        return work(group)
+
+    monkeypatch.setattr(app.submissions._queue, step, slowly)
+    monkeypatch.setattr(app.store.writer, "_wait_s", 0.25)
+    assert not app.submissions.submit(make("b1")).replayed
+    assert len(taken) == 1
+
+
 def test_the_answers_of_a_group_reach_an_event_loop_together(app, make):
     sent = [make(f"b{k}") for k in range(8)]
     app.submissions.submit(make("its zone is at hand then"))

@@ -2,6 +2,7 @@
 
 import json
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import httpx
 import pytest
@@ -69,12 +70,16 @@ def test_a_key_with_another_body_is_refused_before_the_batch_id_is_looked_at(pos
 def test_fifty_repeats_at_once_record_one_batch(address, client, batch, run, key):
     body = batch | {"run": run}
 
-    def send(_):
-        with httpx.Client(base_url=address, timeout=60) as own:
-            return own.post(URL, json=body, headers={k: v + run for k, v in key.items()})
+    def send(own):
+        return own.post(URL, json=body, headers={k: v + run for k, v in key.items()})
 
-    with ThreadPoolExecutor(50) as pool:
-        answers = list(pool.map(send, range(50)))
+    with ExitStack() as open_ones, ThreadPoolExecutor(50) as pool:
+        # Made before the burst, so that the posts come at once.
+        clients = [
+            open_ones.enter_context(httpx.Client(base_url=address, timeout=60)) for _ in range(50)
+        ]
+        answers = list(pool.map(send, clients))
+    assert [each.json()["detail"] for each in answers if each.is_error] == []
     assert sorted(each.status_code for each in answers) == [200] * 49 + [201]
     assert len({each.content for each in answers}) == 1
     assert len(client.get(URL, params={"run": run}).json()["items"]) == 1

@@ -9,7 +9,7 @@ import httpx
 import msgspec
 
 from ..base import Page
-from ..calls import Call, Listing
+from ..calls import Call, Caller, Listing
 from ..encoding import Query, bearer_of, checked_address, decoded, json_of, parameters_of
 from ..errors import NoAnswer, UnexpectedAnswer, problem_of
 from ..retrying import Patience, Repeat, shown
@@ -29,7 +29,7 @@ CONNECT_S = 5.0
 JSON = {"Content-Type": "application/json"}
 
 
-class AsyncConnection:
+class AsyncConnection(Caller):
     """The connections to a service; `AsyncClient` explains the arguments."""
 
     def __init__(

@@ -1,84 +1,172 @@
 """Every model: what the answers of the service hold."""
 
-from .answers import Answer as Answer
-from .answers import Attitude as Attitude
-from .answers import Detection as Detection
-from .answers import FrameSummary as FrameSummary
-from .answers import FrameTimings as FrameTimings
-from .answers import FrameWithStars as FrameWithStars
-from .answers import Picture as Picture
-from .answers import PictureAttitude as PictureAttitude
-from .answers import PictureLens as PictureLens
-from .answers import PictureStar as PictureStar
-from .answers import Provenance as Provenance
-from .answers import Result as Result
-from .answers import Rival as Rival
-from .answers import SearchedZone as SearchedZone
-from .answers import Star as Star
-from .answers import StarCounts as StarCounts
-from .answers import StarRef as StarRef
-from .answers import Summary as Summary
-from .answers import Timings as Timings
-from .answers import Track as Track
-from .answers import TrackerFit as TrackerFit
-from .answers import TrackerStars as TrackerStars
-from .answers import TrackList as TrackList
-from .answers import TrackPoint as TrackPoint
-from .answers import WhatIf as WhatIf
-from .calibrations import Calibration as Calibration
-from .calibrations import CalibrationAdoption as CalibrationAdoption
-from .calibrations import CalibrationBatches as CalibrationBatches
-from .calibrations import CalibrationChange as CalibrationChange
-from .calibrations import CalibrationHeldOut as CalibrationHeldOut
-from .calibrations import CalibrationInForce as CalibrationInForce
-from .calibrations import CalibrationNotObservable as CalibrationNotObservable
-from .calibrations import CalibrationResiduals as CalibrationResiduals
-from .calibrations import CalibrationResult as CalibrationResult
-from .calibrations import CalibrationSummary as CalibrationSummary
-from .calibrations import CalibrationUnknown as CalibrationUnknown
-from .calibrations import FocalPlane as FocalPlane
-from .calibrations import ResidualCell as ResidualCell
-from .calibrations import ResidualMap as ResidualMap
-from .calibrations import TrackerGeometry as TrackerGeometry
-from .events import Adopted as Adopted
-from .events import AnnotationChange as AnnotationChange
-from .events import LatestBatch as LatestBatch
-from .events import Limit as Limit
-from .events import Recorded as Recorded
-from .events import TrackingChange as TrackingChange
-from .replays import ApidPackets as ApidPackets
-from .replays import LineProblem as LineProblem
-from .replays import NewToken as NewToken
-from .replays import RefusedLine as RefusedLine
-from .replays import Replay as Replay
-from .replays import ReplayCounts as ReplayCounts
-from .replays import ReplayLines as ReplayLines
-from .replays import ReplayPackets as ReplayPackets
-from .replays import ReplayProgress as ReplayProgress
-from .replays import Run as Run
-from .replays import RunState as RunState
-from .replays import Session as Session
-from .replays import Token as Token
-from .replays import TokenList as TokenList
-from .spacecraft import Acted as Acted
-from .spacecraft import Alarm as Alarm
-from .spacecraft import AlarmAction as AlarmAction
-from .spacecraft import AlarmRaised as AlarmRaised
-from .spacecraft import AlarmValue as AlarmValue
-from .spacecraft import AlarmWithActions as AlarmWithActions
-from .spacecraft import AttitudeRow as AttitudeRow
-from .spacecraft import DefinitiveJob as DefinitiveJob
-from .spacecraft import GyroBlock as GyroBlock
-from .spacecraft import GyroSamples as GyroSamples
-from .spacecraft import History as History
-from .spacecraft import Innovation as Innovation
-from .spacecraft import LiveAttitude as LiveAttitude
-from .spacecraft import MissionNow as MissionNow
-from .spacecraft import MissionThen as MissionThen
-from .spacecraft import RankedBatch as RankedBatch
-from .spacecraft import Ranking as Ranking
-from .spacecraft import Rates as Rates
-from .spacecraft import Series as Series
-from .spacecraft import Shelved as Shelved
-from .spacecraft import SpacecraftRow as SpacecraftRow
-from .spacecraft import SpacecraftState as SpacecraftState
+from .answers import (
+    Answer,
+    Attitude,
+    Detection,
+    FrameSummary,
+    FrameTimings,
+    FrameWithStars,
+    Picture,
+    PictureAttitude,
+    PictureLens,
+    PictureStar,
+    Provenance,
+    Result,
+    Rival,
+    SearchedZone,
+    Star,
+    StarCounts,
+    StarRef,
+    Summary,
+    Timings,
+    Track,
+    TrackerFit,
+    TrackerStars,
+    TrackList,
+    TrackPoint,
+    WhatIf,
+)
+from .calibrations import (
+    Calibration,
+    CalibrationAdoption,
+    CalibrationBatches,
+    CalibrationChange,
+    CalibrationHeldOut,
+    CalibrationInForce,
+    CalibrationNotObservable,
+    CalibrationResiduals,
+    CalibrationResult,
+    CalibrationSummary,
+    CalibrationUnknown,
+    FocalPlane,
+    ResidualCell,
+    ResidualMap,
+    TrackerGeometry,
+)
+from .events import Adopted, AnnotationChange, LatestBatch, Limit, Recorded, TrackingChange
+from .replays import (
+    ApidPackets,
+    LineProblem,
+    NewToken,
+    RefusedLine,
+    Replay,
+    ReplayCounts,
+    ReplayLines,
+    ReplayPackets,
+    ReplayProgress,
+    Run,
+    RunState,
+    Session,
+    Token,
+    TokenList,
+)
+from .spacecraft import (
+    Acted,
+    Alarm,
+    AlarmAction,
+    AlarmRaised,
+    AlarmValue,
+    AlarmWithActions,
+    AttitudeRow,
+    DefinitiveJob,
+    GyroBlock,
+    GyroSamples,
+    History,
+    Innovation,
+    LiveAttitude,
+    MissionNow,
+    MissionThen,
+    RankedBatch,
+    Ranking,
+    Rates,
+    Series,
+    Shelved,
+    SpacecraftRow,
+    SpacecraftState,
+)
+
+__all__ = [
+    "Acted",
+    "Adopted",
+    "Alarm",
+    "AlarmAction",
+    "AlarmRaised",
+    "AlarmValue",
+    "AlarmWithActions",
+    "AnnotationChange",
+    "Answer",
+    "ApidPackets",
+    "Attitude",
+    "AttitudeRow",
+    "Calibration",
+    "CalibrationAdoption",
+    "CalibrationBatches",
+    "CalibrationChange",
+    "CalibrationHeldOut",
+    "CalibrationInForce",
+    "CalibrationNotObservable",
+    "CalibrationResiduals",
+    "CalibrationResult",
+    "CalibrationSummary",
+    "CalibrationUnknown",
+    "DefinitiveJob",
+    "Detection",
+    "FocalPlane",
+    "FrameSummary",
+    "FrameTimings",
+    "FrameWithStars",
+    "GyroBlock",
+    "GyroSamples",
+    "History",
+    "Innovation",
+    "LatestBatch",
+    "Limit",
+    "LineProblem",
+    "LiveAttitude",
+    "MissionNow",
+    "MissionThen",
+    "NewToken",
+    "Picture",
+    "PictureAttitude",
+    "PictureLens",
+    "PictureStar",
+    "Provenance",
+    "RankedBatch",
+    "Ranking",
+    "Rates",
+    "Recorded",
+    "RefusedLine",
+    "Replay",
+    "ReplayCounts",
+    "ReplayLines",
+    "ReplayPackets",
+    "ReplayProgress",
+    "ResidualCell",
+    "ResidualMap",
+    "Result",
+    "Rival",
+    "Run",
+    "RunState",
+    "SearchedZone",
+    "Series",
+    "Session",
+    "Shelved",
+    "SpacecraftRow",
+    "SpacecraftState",
+    "Star",
+    "StarCounts",
+    "StarRef",
+    "Summary",
+    "Timings",
+    "Token",
+    "TokenList",
+    "Track",
+    "TrackList",
+    "TrackPoint",
+    "TrackerFit",
+    "TrackerGeometry",
+    "TrackerStars",
+    "TrackingChange",
+    "WhatIf",
+]
