@@ -46,7 +46,7 @@ class Settings:
     `archive_folder` is the folder of `acquire archive`, where archived batches are read.
     `follow` is a stream of NATS that the service follows, as `acquire follow` does: with the
     durable consumer `follow_consumer`, answers to the subject `follow_answers`, the file of
-    credentials and the certificate of the authority that NATS is trusted by.
+    credentials, and the CA certificate (PEM) that the NATS server's certificate is checked with.
     """
 
     database: str = "sqlite:///acquire.db"

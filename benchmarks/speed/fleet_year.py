@@ -4,7 +4,8 @@
     python -m benchmarks.speed.fleet_year --write    into docs/scale.md
 
 Batches of five stars, one a minute and no two alike, are recorded in bulk and archived; their
-bytes do not depend on the machine.  PostgreSQL is measured where TEST_POSTGRESQL_URL names a
+bytes do not depend on the machine.  The bytes at other rates are computed with the same bytes a
+batch.  PostgreSQL is measured where TEST_POSTGRESQL_URL names a
 scratch database.  The rate of posts is that of docs/performance.md.
 """
 
@@ -64,10 +65,16 @@ def year(sizes: Mapping[str, float], posts_a_second: float) -> str:
             share = f"{100 * rate / posts_a_second:.2g} %"
             if rate > posts_a_second:
                 share = f"{rate / posts_a_second:.2g} services' posts"
-            row = [f"{spacecraft:,}", label, f"{batches:.3g}", f"{rate:.3g}", share]
+            row = [f"{spacecraft:,}", label, number_text(batches), number_text(rate), share]
             rows.append((*row, *(size_text(size * batches) for size in sizes.values())))
     head = ("spacecraft", "batches of each", "batches a year", "a second", "of one service's posts")
     return table([*head, *(f"a year in {name}" for name in sizes)], rows)
+
+
+def number_text(number: float) -> str:
+    """A number rounded to three digits, without an exponent: 105,000."""
+    rounded = float(f"{number:.3g}")
+    return f"{rounded:,.0f}" if rounded >= 1_000 else f"{rounded:g}"
 
 
 def main() -> None:
@@ -88,7 +95,9 @@ def main() -> None:
     if parsed.write:
         start, end = "<!-- measured by benchmarks.speed.fleet_year -->", "<!-- end of year -->"
         before, _, rest = TARGET.read_text(encoding="utf-8").partition(start)
-        again = f"python -m benchmarks.speed.fleet_year --batches {parsed.batches}"
+        again = (
+            f"python -m benchmarks.speed.fleet_year --batches {parsed.batches} --seed {parsed.seed}"
+        )
         said = (
             f"One service takes {posts:,.0f} posts a second over 16 connections ([performance.md]"
         )

@@ -312,7 +312,11 @@ def emptied(url: str) -> None:
 
 
 def size_text(size: float) -> str:
-    return f"{size / 1e9:.3g} GB" if size < 1e12 else f"{size / 1e12:.3g} TB"
+    for unit, name in ((1e9, "GB"), (1e12, "TB")):
+        # From 999.5 on three digits would be shown as 1e+03.
+        if size < 999.5 * unit:
+            return f"{size / unit:.3g} {name}"
+    return f"{size / 1e15:.3g} PB"
 
 
 def write(report: Report, count: int, seed: int) -> None:

@@ -1,6 +1,7 @@
 """The benchmarks run, on small samples, and find everything within its bounds."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,8 @@ from benchmarks.bounds import equal, share_as_expected
 from benchmarks.record import ROOT, digest_of, read_record
 from benchmarks.sections import Section, Written, bounds_shown, kept, stale, state_of
 from benchmarks.speed import live_filter, performance, tracker_calibration
+from benchmarks.speed.fleet_year import number_text, year
+from benchmarks.speed.scale import size_text
 from benchmarks.validation import aberration, centroids, consistency, covariance, tracker_sigmas
 from benchmarks.validation.imaging_claims import HELD_AGAINST
 from benchmarks.validation.lost_in_space.__main__ import main as lost_in_space
@@ -194,3 +197,12 @@ def test_every_benchmark_of_speed_has_its_record_and_its_bounds():
     for name in performance.TITLES:
         assert read_record(results[name].get("code", "")) is not None, name
         assert results[name]["bounds"], name
+
+
+def test_the_table_of_fleets_has_no_exponents():
+    text = year({"SQLite": 2_380.0, "PostgreSQL": 4_969.0, "the archive": 739.0}, 1_585.0)
+    assert not re.search(r"\de[+-]\d", text)
+    assert "| 1 | one in 5 minutes | 105,000 | 0.00333 |" in text
+    assert "| 315,000,000,000 | 10,000 | 6.3 services' posts | 751 TB | 1.57 PB | 233 TB |" in text
+    assert [number_text(number) for number in (999.4, 999.6, 1e3)] == ["999", "1,000", "1,000"]
+    assert [size_text(size) for size in (9.994e11, 9.996e11)] == ["999 GB", "1 TB"]

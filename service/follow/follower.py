@@ -15,7 +15,9 @@ import asyncio
 import json
 import logging
 import ssl
-from collections.abc import Awaitable, Callable, Mapping
+import time
+from collections import Counter as Counts
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -23,9 +25,11 @@ from typing import Any
 from nats.aio.client import Client
 from nats.aio.msg import Msg
 from nats.errors import Error as NatsError
+from nats.errors import MaxPayloadError
+from nats.errors import TimeoutError as NatsTimeout
 from nats.js import JetStreamContext
-from nats.js.api import AckPolicy, ConsumerConfig
-from nats.js.errors import NoStreamResponseError, NotFoundError
+from nats.js.api import AckPolicy, ConsumerConfig, ConsumerInfo
+from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
 from service.errors import AcquisitionError, BadConfiguration
@@ -39,7 +43,11 @@ FETCH_S = 1.0
 PAUSE_S = 1
 BEGIN_AGAIN_S = 5.0
 TRIES = 5
-"""Deliveries of a message at which the service fails, before it is refused."""
+"""Attempts of this follower at which the service fails, before it refuses the message."""
+UNKEPT_S = 60.0
+"""For so long the follower does not ask again whether a stream keeps a subject."""
+MESSAGE_TOO_LARGE = 10_054
+"""The code of NATS for a message above the largest one that a stream takes."""
 STATE_EVERY_S = 5.0
 SEQUENCE, DELIVERED = "Acquire-Sequence", "Acquire-Delivered"
 """Headers of refusals and answers: the message's place in its stream, and its deliveries."""
@@ -131,6 +139,11 @@ class Follower:
         self._source, self._submit = source, submit
         self._metrics, self._progress = metrics, progress
         self._stopped = asyncio.Event()
+        self._is_service_busy = False
+        self._failures: Counts[int] = Counts()
+        """How often the service failed at a message, by its place in the stream."""
+        self._unkept_until_s: dict[str, float] = {}
+        """Subjects that no stream keeps, and when to ask again."""
 
     def stop(self) -> None:
         """Take no more messages, and end after those at work."""
@@ -145,6 +158,8 @@ class Follower:
         connection = await self._connected()
         if connection is None:
             return
+        self._connection = connection
+        self._failures.clear()
         try:
             stream = connection.jetstream()
             await self._require_consumer(stream)
@@ -159,7 +174,7 @@ class Follower:
                             self._source.concurrency, timeout=FETCH_S
                         )
                     except TimeoutError:
-                        if until_empty and await self._is_empty(stream):
+                        if await self._is_empty(stream) and until_empty:
                             return
                         continue
                     except NatsError as error:
@@ -196,10 +211,10 @@ class Follower:
         async def note(error: Exception) -> None:
             log.warning("NATS: %s", error)
 
-        connection = Client()
+        connection, context = Client(), None
         try:
-            context = None
             if source.authority is not None or source.servers.startswith("tls://"):
+                connection = _TlsClient()
                 context = ssl.create_default_context(cafile=source.authority)
             connecting = asyncio.create_task(
                 connection.connect(
@@ -228,22 +243,50 @@ class Follower:
             raise BadConfiguration(f"{source.shown}: NATS cannot be reached: {error}") from None
 
     async def _require_consumer(self, stream: JetStreamContext) -> None:
-        """Make the durable consumer where there is none."""
+        """Make the durable consumer where there is none.
+
+        Raises `BadConfiguration` where JetStream does not answer, where there is no such stream,
+        and where the consumer would deliver the follower's own answers or refusals to it.
+        """
         source = self._source
         try:
-            await stream.stream_info(source.stream)
-        except NotFoundError:
-            raise BadConfiguration(f"{source.shown}: NATS has no stream {source.stream}") from None
-        try:
-            await stream.consumer_info(source.stream, source.consumer)
-        except NotFoundError:
+            kept = (await stream.stream_info(source.stream)).config.subjects or ()
+            with suppress(NotFoundError):
+                found = await stream.consumer_info(source.stream, source.consumer)
+                self._refuse_own_output(kept, found.config)
+                return
             config = ConsumerConfig(
                 durable_name=source.consumer, ack_policy=AckPolicy.EXPLICIT, ack_wait=ACK_WAIT_S
             )
+            self._refuse_own_output(kept, config)
             await stream.add_consumer(source.stream, config)
+        except NotFoundError:
+            raise BadConfiguration(f"{source.shown}: NATS has no stream {source.stream}") from None
+        except NatsError as error:
+            raise BadConfiguration(f"{source.shown}: JetStream cannot be used: {error}") from None
+
+    def _refuse_own_output(self, kept: Iterable[str], consumer: ConsumerConfig) -> None:
+        """Raise `BadConfiguration` where the consumer would deliver answers or refusals."""
+        source, one = self._source, consumer.filter_subject
+        delivered = [one] if one else consumer.filter_subjects or [">"]
+        for subject in (source.refusals, source.answers):
+            if subject and _covers(kept, subject) and _covers(delivered, subject):
+                raise BadConfiguration(
+                    f"{source.shown}: the stream {source.stream} keeps {subject}, "
+                    "which the follower publishes to: it would follow its own messages"
+                )
 
     async def _is_empty(self, stream: JetStreamContext) -> bool:
-        info = await stream.consumer_info(self._source.stream, self._source.consumer)
+        """True if every message is settled; makes a consumer that was deleted again."""
+        try:
+            info = await stream.consumer_info(self._source.stream, self._source.consumer)
+        except NotFoundError:
+            log.warning("NATS has lost the consumer %s: it is made again", self._source.consumer)
+            await self._require_consumer(stream)
+            return False
+        except NatsError as error:
+            log.warning("NATS does not say what is left: %s", error)
+            return False
         return not info.num_pending and not info.num_ack_pending
 
     async def _report(self, stream: JetStreamContext) -> None:
@@ -251,8 +294,15 @@ class Follower:
             with suppress(NatsError, TimeoutError):
                 info = await stream.consumer_info(self._source.stream, self._source.consumer)
                 self._metrics.set_lag(info.num_pending or 0)
+                self._forget_failures(info)
             self._progress(self._metrics)
             await asyncio.sleep(STATE_EVERY_S)
+
+    def _forget_failures(self, info: ConsumerInfo) -> None:
+        """Forget the failures at messages that another follower has settled."""
+        floor = info.ack_floor.stream_seq if info.ack_floor else 0
+        for place in [place for place in self._failures if place <= floor]:
+            del self._failures[place]
 
     # ---- one message -------------------------------------------------------------------------
 
@@ -276,19 +326,26 @@ class Follower:
                 await message.in_progress()
 
     async def _settle(self, stream: JetStreamContext, message: Msg) -> None:
+        place = message.metadata.sequence.stream
         while not self._stopped.is_set():
             try:
                 answer = await self._submit(message.data)
             except NotNow as error:
-                log.warning("the service does not take messages now: %s", error)
+                if not self._is_service_busy:
+                    log.warning("the service does not take messages now: %s", error)
+                self._is_service_busy = True
                 await asyncio.sleep(PAUSE_S)
             except Refused as refused:
-                if refused.has_failed and message.metadata.num_delivered < TRIES:
-                    await message.nak(PAUSE_S)
-                    return
+                self._is_service_busy = False
+                if refused.has_failed:
+                    self._failures[place] += 1
+                    if self._failures[place] < TRIES:
+                        await message.nak(PAUSE_S)
+                        return
                 problem = json.dumps(refused.problem).encode()
                 await self._publish(stream, self._source.refusals, message, problem)
                 await message.term()
+                self._failures.pop(place, None)
                 self._metrics.count("refused")
                 return
             except Exception:
@@ -296,9 +353,11 @@ class Follower:
                 await message.nak()
                 raise
             else:
+                self._is_service_busy = False
                 if self._source.answers is not None:
                     await self._publish(stream, self._source.answers, message, answer.body)
                 await message.ack()
+                self._failures.pop(place, None)
                 self._metrics.count("repeated" if answer.is_repeated else "recorded")
                 return
         await message.nak()
@@ -306,7 +365,10 @@ class Follower:
     async def _publish(
         self, stream: JetStreamContext, subject: str, message: Msg, body: bytes
     ) -> None:
-        """Publish about a message; a stream that keeps the subject takes it once."""
+        """Publish about a message; a stream that keeps the subject takes it once.
+
+        What is too large for NATS is not published.
+        """
         place = message.metadata
         headers = {
             "Nats-Msg-Id": f"{place.stream}-{place.sequence.stream}-{subject}",
@@ -314,9 +376,58 @@ class Follower:
             DELIVERED: str(place.num_delivered),
         }
         try:
-            await stream.publish(subject, body, headers=headers)
+            if _size_of(headers) + len(body) > self._connection.max_payload:
+                # NATS would end the connection.
+                raise MaxPayloadError
+            if time.monotonic() < self._unkept_until_s.get(subject, 0.0):
+                await self._connection.publish(subject, body, headers=headers)
+            else:
+                await stream.publish(subject, body, headers=headers)
         except NoStreamResponseError:
-            log.debug("no stream keeps %s: who listens now hears of it", subject)
+            log.debug("no stream keeps %s, and nobody subscribes to it", subject)
+        except NatsTimeout:
+            # A subscriber has it, but only a stream acknowledges it.
+            with suppress(NotFoundError):
+                await stream.find_stream_name_by_subject(subject)
+                raise
+            self._unkept_until_s[subject] = time.monotonic() + UNKEPT_S
+        except (MaxPayloadError, APIError) as error:
+            if isinstance(error, APIError) and error.err_code != MESSAGE_TOO_LARGE:
+                raise
+            log.error(
+                "what the service said of message %d is too large for %s: %d bytes",
+                place.sequence.stream,
+                subject,
+                len(body),
+            )
+
+
+class _TlsClient(Client):
+    """A connection that sends no credentials to a server without TLS, also when it is lost."""
+
+    def _connect_command(self) -> bytes:
+        if not self._server_info.get("tls_required"):
+            raise NatsError("the server does not require TLS")
+        return super()._connect_command()
+
+
+def _size_of(headers: Mapping[str, str]) -> int:
+    """The bytes of headers as NATS counts them."""
+    lines = (f"{name}: {value}\r\n".encode() for name, value in headers.items())
+    return len(b"NATS/1.0\r\n\r\n") + sum(len(line) for line in lines)
+
+
+def _covers(patterns: Iterable[str], subject: str) -> bool:
+    """True if one of the patterns, with `*` for a token and `>` for the rest, has the subject."""
+    return any(_matches(pattern.split("."), subject.split(".")) for pattern in patterns)
+
+
+def _matches(pattern: list[str], tokens: list[str]) -> bool:
+    if pattern[-1] == ">" and len(tokens) >= len(pattern):
+        pattern = pattern[:-1] + tokens[len(pattern) - 1 :]
+    return len(pattern) == len(tokens) and all(
+        wanted in ("*", token) for wanted, token in zip(pattern, tokens, strict=True)
+    )
 
 
 def gyro_block_in(message: bytes) -> tuple[str, bytes] | None:

@@ -8,9 +8,20 @@ from acquire_client.retrying import Repeat
 from service.errors import BadConfiguration
 from service.follow.follower import Answer, NotNow, Refused, gyro_block_in
 
+RECORDED = (200, 201)
+"""The statuses of a message that was recorded before, and of one that is recorded now."""
+MISDIRECTED = 421
+"""The status where the service does not know itself by the name in its address."""
+PATH_TOO_LONG = (414, 431)
+"""The statuses where the name of a spacecraft makes the request line too long."""
+FAILED = 500
+
 
 class OverHttp:
-    """Submits through a client; raises what the client does where the service wants a token."""
+    """Submits through a client.
+
+    Raises what the client does where the service wants a token, or another name of its host.
+    """
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
@@ -33,10 +44,29 @@ class OverHttp:
         except (answers.Busy, answers.NoAnswer) as error:
             raise NotNow(str(error)) from None
         except answers.Problem as problem:
+            if problem.status == MISDIRECTED:
+                raise
+            if not _is_about_message(problem):
+                raise NotNow(problem.detail) from None
             raise Refused(
                 _problem_of(problem), isinstance(problem, answers.ServiceFailed)
             ) from None
+        kind = response.headers.get("Content-Type", "").partition(";")[0].strip().lower()
+        if response.status_code not in RECORDED or kind != "application/json":
+            raise NotNow(
+                f"HTTP {response.status_code} with {kind or 'no Content-Type'} "
+                "is no answer of the service"
+            )
         return Answer(response.content, response.headers.get("Replayed") == "true")
+
+
+def _is_about_message(problem: answers.Problem) -> bool:
+    """False if a proxy answered, for example: the same message may be recorded later.
+
+    The client gives an answer that is no problem document the detail `HTTP 404: ...`.
+    """
+    is_of_service = not problem.detail.startswith(f"HTTP {problem.status}")
+    return is_of_service or problem.status in (*PATH_TOO_LONG, FAILED)
 
 
 def _problem_of(error: answers.Problem) -> dict[str, object]:

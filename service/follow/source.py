@@ -21,7 +21,10 @@ class Source:
     """The subject that answers are published to; None: to none."""
     credentials: Path | None = None
     authority: Path | None = None
-    """The certificate of the authority that NATS is trusted by; None: those of the system."""
+    """CA certificate (PEM) that the NATS server's certificate is checked with.
+
+    None: those of the system.
+    """
     concurrency: int = 16
     """Messages that are at work together."""
 
@@ -34,7 +37,12 @@ class Source:
 
 def server_and_stream(text: str) -> tuple[str, str]:
     """The two parts of nats://HOST/STREAM; raises ValueError."""
-    parts = urlsplit(text)
+    try:
+        parts = urlsplit(text)
+        _ = parts.port
+    except ValueError:
+        # The message of Python would show a part of the address, which may be a password.
+        raise ValueError(EXPECTED) from None
     stream = parts.path.strip("/")
     if parts.scheme not in SCHEMES or not parts.hostname or not stream or "/" in stream:
         raise ValueError(EXPECTED)

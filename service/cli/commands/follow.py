@@ -36,7 +36,10 @@ def add(commands: Any) -> None:
         "--credentials", type=Path, metavar="FILE", help="credentials of NATS (.creds)"
     )
     parser.add_argument(
-        "--authority", type=Path, metavar="FILE", help="certificate that NATS is trusted by (PEM)"
+        "--authority",
+        type=Path,
+        metavar="FILE",
+        help="CA certificate (PEM) that the NATS server's certificate is checked with",
     )
     parser.add_argument(
         "--concurrency",
@@ -67,7 +70,7 @@ def run(parsed: Namespace) -> int:
 
     from service.extras import require_extra
 
-    require_extra("nats", "nats", "SOURCE", parsed.source)
+    require_extra("nats", "nats", "SOURCE", "nats")
     from acquire_client import AsyncClient
     from prometheus_client import start_http_server
 
@@ -79,7 +82,8 @@ def run(parsed: Namespace) -> int:
     try:
         servers, stream = server_and_stream(parsed.source)
     except ValueError as error:
-        raise BadInput(Fault("SOURCE", str(error), shown_value(parsed.source))) from None
+        # The address may hold a password: it is not shown.
+        raise BadInput(Fault("SOURCE", str(error))) from None
     source = Source(
         servers,
         stream,
