@@ -56,6 +56,7 @@ def get(kind: type[T], path: str, query: Query | None = None) -> Call[T]:
 
 def get_items(kind: type[Row], path: str, query: Query | None = None) -> Call[list[Row]]:
     """A GET whose answer is a short list of models."""
+    # The type is known only now, which the checker of types does not allow.
     page: Any = Page[kind]  # type: ignore[valid-type]
     return Call(lambda response: decoded(response, page).items, "GET", path, query)
 

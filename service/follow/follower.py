@@ -367,7 +367,7 @@ class Follower:
     ) -> None:
         """Publish about a message; a stream that keeps the subject takes it once.
 
-        What is too large for NATS is not published.
+        A message that is too large for NATS is logged and not published.
         """
         place = message.metadata
         headers = {

@@ -156,13 +156,14 @@ class AsyncConnection(Caller):
 class AsyncItems(Generic[Row]):
     """The items of a list: iterate over it, more than once if you like.
 
-    What is recorded meanwhile neither repeats nor hides items.
+    Batches that the service records meanwhile neither repeat nor hide items.
     """
 
     def __init__(self, connection: AsyncConnection, listing: Listing[Row]) -> None:
         self._connection, self._listing = connection, listing
 
     async def __aiter__(self) -> AsyncIterator[Row]:
+        # The type is known only now, which the checker of types does not allow.
         page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
         query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:

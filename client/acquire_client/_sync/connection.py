@@ -154,13 +154,14 @@ class Connection(Caller):
 class Items(Generic[Row]):
     """The items of a list: iterate over it, more than once if you like.
 
-    What is recorded meanwhile neither repeats nor hides items.
+    Batches that the service records meanwhile neither repeat nor hide items.
     """
 
     def __init__(self, connection: Connection, listing: Listing[Row]) -> None:
         self._connection, self._listing = connection, listing
 
     def __iter__(self) -> Iterator[Row]:
+        # The type is known only now, which the checker of types does not allow.
         page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
         query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:

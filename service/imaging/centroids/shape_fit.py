@@ -130,7 +130,7 @@ def fit_in_its_colour(
 ) -> tuple[Fit | None, Psf]:
     """The best place with the image of the colour that the star itself shows, and that image.
 
-    What is known of stars' colours counts as a measurement.  Images of all colours are even and
+    The spread of colours among stars counts as a measurement.  Images of all colours are even and
     their slopes odd, so that the colour's own error hardly moves a star.
     """
     found = fit(window, psf, start, half_width_px)

@@ -91,7 +91,7 @@ class TrackerStarsOfPeriod:
 
 @dataclass(frozen=True, eq=False)
 class PeriodStars:
-    """What was read of the `total` batches of a period: all, or some where there are many.
+    """The stars of the batches read, of `total` in a period: all, or some where there are many.
 
     `other_catalog` is how many of those read were identified with a star catalog that
     the service no longer has; they are without stars here.  `sun` (b, 3) are inertial

@@ -178,7 +178,7 @@ def _unsaved_result(
         "run": batch.run,
         "time_ns": batch.time.tai_ns,
         "identifier": answer.identifier,
-        # What was not named is left out.
+        # Only the options that the batch named are stored.
         "options": json.dumps({k: value for k, value in named.items() if value not in (None, {})}),
         "mission_digest": answer.provenance.mission,
         "catalog_digest": answer.provenance.catalog,

@@ -78,6 +78,6 @@ gyro_blocks = sa.Table(
     sa.UniqueConstraint("spacecraft", "run", "block"),
     # Periods, and blocks that may share a time with another: no block spans more than a day.
     sa.Index("ix_gyro_blocks_by_start", "spacecraft", "run", "start_ns", "end_ns"),
-    # What is pruned is found by its end, in all runs or in one.
+    # Pruning finds blocks by their end, in all runs or in one.
     sa.Index("ix_gyro_blocks_by_end", "end_ns"),
 )
