@@ -17,7 +17,7 @@ from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch
 from service.observations.columns import BatchColumns, Integers, joined, offsets_of
-from service.observations.focal_plane import tracker_vectors
+from service.observations.focal_plane import true_tangents
 from service.observations.scans.reduce import reduced
 from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 
@@ -127,7 +127,20 @@ def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -
     different = {each.name: each for each in trackers if each is not None}
     place_of = {name: place for place, name in enumerate(different)}
     places = np.array([-1 if each is None else place_of[each.name] for each in trackers])
-    direction = batches.vector
+    observed = (
+        batches.vector,
+        batches.rates_deg_per_s,
+        batches.time_offset_s,
+        batches.sigma_arcsec,
+        batches.magnitude_mag,
+    )
+    written = (
+        found.direction_body,
+        found.magnitude_mag,
+        found.sigma_arcsec,
+        found.sigma_rad,
+        found.outside_field_of_view,
+    )
     for place, tracker in enumerate(different.values()):
         rows = place, places, batches.tracker_offsets, batches.star_offsets
         settings = (
@@ -137,42 +150,23 @@ def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -
             tracker.magnitudes.zero_mag,
             tracker.magnitudes.scale,
         )
-        observed = (
-            batches.rates_deg_per_s,
-            batches.time_offset_s,
-            batches.sigma_arcsec,
-            batches.magnitude_mag,
-        )
-        written = (
-            found.direction_body,
-            found.magnitude_mag,
-            found.sigma_arcsec,
-            found.sigma_rad,
-            found.outside_field_of_view,
-        )
-        given = rows, settings, observed, written
-        if not _to_body(direction, *given):
-            unknown = np.isnan(direction)
-            if len(different) > 1:
-                unknown &= (places == place).repeat(np.diff(batches.star_offsets))[:, None]
-            from_angles = tracker_vectors(batches.angles_deg, tracker.calibration)
-            direction = np.where(unknown, from_angles, direction)
-            _to_body(direction, *given)
+        tangents = true_tangents(batches.angles_deg, tracker.calibration)
+        _to_body(tangents, rows, settings, observed, written)
     return found
 
 
 @njit
-def _to_body(direction, rows, settings, observed, written):  # type: ignore[no-untyped-def]
-    """Whether every direction of a tracker's stars is known; if so they are carried to the body.
+def _to_body(tangents, rows, settings, observed, written):  # type: ignore[no-untyped-def]
+    """Carry the stars of a tracker to the body's axes at the epoch.
 
-    v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.  `direction` (m, 3) is
-    in tracker axes.
+    v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.  A star without a
+    vector has the direction (tan h, tan v, 1) in tracker axes; `tangents` (m, 2) are tan h, tan v.
     """
     # `place` is that of the tracker among `places` (t,).
     place, places, tracker_offsets, star_offsets = rows
     # `least_cosine` is of the angle to the boresight within the field of view.
     body_from_tracker, least_cosine, default_sigma, zero_mag, magnitude_scale = settings
-    rates_deg_per_s, time_offset_s, sigma, magnitude = observed
+    vector, rates_deg_per_s, time_offset_s, sigma, magnitude = observed
     # The true magnitude is as it would be if the tracker were as the run catalog assumes.
     body, true_magnitude, sigma_arcsec, sigma_rad, outside = written
     for i in range(len(tracker_offsets) - 1):
@@ -189,20 +183,22 @@ def _to_body(direction, rows, settings, observed, written):  # type: ignore[no-u
             if places[s] != place:
                 continue
             for k in range(star_offsets[s], star_offsets[s + 1]):
-                if math.isnan(direction[k, 0]):
-                    return False
-                outside[k] = direction[k, 2] < least_cosine
+                u, v, w = vector[k, 0], vector[k, 1], vector[k, 2]
+                if math.isnan(u):
+                    u, v = tangents[k, 0], tangents[k, 1]
+                    norm = math.sqrt(u * u + v * v + 1.0)
+                    u, v, w = u / norm, v / norm, 1.0 / norm
+                outside[k] = w < least_cosine
                 true_magnitude[k] = zero_mag + magnitude_scale * magnitude[k]
                 sigma_arcsec[k] = default_sigma if math.isnan(sigma[k]) else sigma[k]
                 sigma_rad[k] = sigma_arcsec[k] / ARCSEC_PER_RADIAN
                 for j in range(3):
                     body[k, j] = (
-                        direction[k, 0] * body_from_tracker[j, 0]
-                        + direction[k, 1] * body_from_tracker[j, 1]
-                        + direction[k, 2] * body_from_tracker[j, 2]
+                        u * body_from_tracker[j, 0]
+                        + v * body_from_tracker[j, 1]
+                        + w * body_from_tracker[j, 2]
                     )
                 _turn(body[k], x, y, z, rate * time_offset_s[k])
-    return True
 
 
 @njit_no_refcount

@@ -11,13 +11,19 @@ def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
 
     The direction is that of (tan h, tan v, 1), h and v being the true angles.
     """
-    h, v = angles_deg[:, 0], angles_deg[:, 1]
-    plane = np.ones((len(h), 3))
-    for axis, terms in enumerate((calibration.h_terms, calibration.v_terms)):
-        bent = sum(c * h**i * v**j for i, j, c in terms)
-        true = calibration.scale * (angles_deg[:, axis] + bent)
-        plane[:, axis] = np.tan(np.radians(true))
+    plane = np.ones((len(angles_deg), 3))
+    plane[:, :2] = true_tangents(angles_deg, calibration)
     return unit(plane)
+
+
+def true_tangents(angles_deg: Vector, calibration: Calibration) -> Vector:
+    """Tangents (n, 2) of the true angles, of measured angles (n, 2)."""
+    h, v = angles_deg.T
+    true = angles_deg.copy()
+    for axis, terms in enumerate((calibration.h_terms, calibration.v_terms)):
+        if terms:
+            true[:, axis] += sum(c * h**i * v**j for i, j, c in terms)
+    return np.asarray(np.tan(np.radians(calibration.scale * true)))
 
 
 def measured_angles_deg(direction: Vector, calibration: Calibration) -> Vector:
