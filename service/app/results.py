@@ -1,21 +1,23 @@
 """Recorded results: one, a page of them, and a batch again with other options."""
 
+import json
 import math
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+
+from msgspec import structs
 
 from service.access.audit import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
-from service.advice.advice import RunAgain
 from service.app.context import ALL_RUNS, Context, known_id
 from service.errors import Busy, NotFound
-from service.ingest.compare_options import ComparedSample, Pair, compare
+from service.ingest.compare_options import ComparedSample, Pair, RunManyAgain, compare
 from service.ingest.solver_pool import mission_in_input
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
-from service.observations.schema import OptionsIn
+from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
 from service.storage.models.compare import Comparison
@@ -24,6 +26,7 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period
 from service.storage.queries.recorded_batch import (
     batch_with_options,
+    merged_options,
     recorded_batch,
     recorded_mission,
     sample_batches,
@@ -219,15 +222,17 @@ class Comparisons:
         `Busy` while the service is computing another comparison.
         """
         mission = mission_named(self._context.missions, name)
-        again = self._submissions.run_again
+        again = self._submissions.run_again_many
+        # Most batches have the same options.
+        merged = cache(lambda own, side: merged_options(json.loads(own), (a, b)[side]).to_options())
 
         def pair_of(row: Row) -> Pair:
-            own = batch_with_options(row["input"], row["options"])
-            if own.measurement is not None:
+            sent = submission_from_json(row["input"]).batch
+            if sent.measurement is not None:
                 # Such a batch has no stars to identify: options do not change its answer.
-                return Pair(row["id"], own, own)
-            options = (batch_with_options(row["input"], row["options"], each) for each in (a, b))
-            return Pair(row["id"], *options)
+                return Pair(row["id"], sent, sent)
+            options = (merged(row["options"], side) for side in (0, 1))
+            return Pair(row["id"], *(structs.replace(sent, options=each) for each in options))
 
         def check(pairs: Sequence[Pair]) -> None:
             of_stars = [each for each in pairs if each.a.measurement is None]
@@ -249,7 +254,7 @@ class Comparisons:
             batch = batch_with_options(row["input"], row["options"])
             return Pair(row["id"], batch, batch)
 
-        again = self._submissions.run_again
+        again = self._submissions.run_again_many
         sides = partial(again, mission=a), partial(again, mission=b)
         return self._compared(stretch, pair_of, sides, ({}, {}), limit_s)
 
@@ -257,7 +262,7 @@ class Comparisons:
         self,
         stretch: Stretch,
         pair_of: Callable[[Row], Pair],
-        sides: tuple[RunAgain, RunAgain],
+        sides: tuple[RunManyAgain, RunManyAgain],
         options: tuple[Row, Row],
         limit_s: float,
         check: Callable[[Sequence[Pair]], None] = lambda pairs: None,

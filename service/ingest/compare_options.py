@@ -8,23 +8,33 @@ star's on the other side.
 import math
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from statistics import fmean, median
 from typing import Any
 
+import numpy as np
+
 from service.acquire import Acquisition
-from service.advice.advice import RunAgain
 from service.alarms.quantities import QUANTITIES
 from service.observations.batch import ObservationBatch
 from service.storage.models import compare as records
 from service.storage.models.answers import StarCounts
+from service.storage.queries.compare_runs import cell_width_s
 from service.storage.recording.answer import StarRow, star_rows
 from service.storage.recording.result_metrics import metrics_of
+from service.times import HOUR_S, unix_seconds, utc_of_unix
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 MAX_SHOWN = 100
 """Batches that are shown star by star; the others are counted."""
+MOST_AT_ONCE, PORTION_S = 512, 0.1
+"""As many batches are solved at once as take this long, both sides together."""
+
+RunManyAgain = Callable[[Sequence[ObservationBatch]], Sequence[Acquisition]]
+
+
+_OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
 
 
 @dataclass(frozen=True)
@@ -55,7 +65,7 @@ class _Side:
         self.work_us.append(sum(acquisition.timings_us.values()))
 
     def record(self, options: dict[str, Any]) -> records.ComparedSide:
-        names = ("observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
+        names = (*_OUTCOMES, "solved", "suspect")
         return records.ComparedSide(
             options=options,
             **{name: int(self.counts[name]) for name in names},
@@ -89,12 +99,15 @@ class ComparisonTally:
     angles_arcsec: list[float] = field(default_factory=list)
     changed: list[records.BatchChange] = field(default_factory=list)
     changed_batches: int = 0
+    counted: list[tuple[int, dict[str, int], dict[str, int]]] = field(default_factory=list)
+    """Of each batch its time in nanoseconds of TAI, and the stars by outcome on both sides."""
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
         """Take one batch's two results."""
         self.compared += 1
         self.a.add(a)
         self.b.add(b)
+        self.counted.append((pair.a.time.tai_ns, a.counts, b.counts))
         angle_arcsec = _angle_arcsec(a, b)
         has = a.solution is not None, b.solution is not None
         self.attitudes[_WHICH[has]] += 1
@@ -118,6 +131,7 @@ class ComparisonTally:
     ) -> records.Comparison:
         """The whole comparison; `options` are those of both sides."""
         angles = self.angles_arcsec
+        cell_s, trend = self._trend()
         return records.Comparison(
             spacecraft=sample.spacecraft,
             run=sample.run,
@@ -127,6 +141,8 @@ class ComparisonTally:
             sampled=sample.drawn,
             cut_short=cut_short,
             compared=self.compared,
+            cell_s=cell_s,
+            trend=trend,
             a=self.a.record(options[0]),
             b=self.b.record(options[1]),
             transitions=[
@@ -143,6 +159,26 @@ class ComparisonTally:
             changed=sorted(self.changed, key=lambda each: each.time),
         )
 
+    def _trend(self) -> tuple[int, list[records.ComparedCell]]:
+        """The width of the cells in seconds, and the stars by outcome in each with a batch."""
+        moments_s = unix_seconds([tai_ns for tai_ns, _, _ in self.counted])
+        cell_s = cell_width_s(float(np.ptp(moments_s))) if self.counted else HOUR_S
+        cells: dict[int, tuple[Counter[str], Counter[str]]] = {}
+        for number, (_, a, b) in zip((moments_s // cell_s).tolist(), self.counted, strict=True):
+            sides = cells.setdefault(int(number), (Counter(), Counter()))
+            for side, counts in zip(sides, (a, b), strict=True):
+                side.update(counts)
+        return cell_s, [
+            records.ComparedCell(
+                start=utc_of_unix(number * cell_s).text,
+                **{
+                    name: StarCounts(**{each: side[each] for each in _OUTCOMES})
+                    for name, side in zip("ab", cells[number], strict=True)
+                },
+            )
+            for number in sorted(cells)
+        ]
+
 
 _WHICH = {
     (True, True): "both",
@@ -153,14 +189,25 @@ _WHICH = {
 
 
 def compare(
-    pairs: Sequence[Pair], run_again: tuple[RunAgain, RunAgain], limit_s: float
+    pairs: Sequence[Pair], run_again: tuple[RunManyAgain, RunManyAgain], limit_s: float
 ) -> tuple[ComparisonTally, bool]:
-    """Run each side of each batch with its function; whether `limit_s` seconds cut it short."""
+    """Run each side of each batch with its function; whether `limit_s` seconds cut it short.
+
+    Many are solved at once, but one alone while each may take seconds.
+    """
     found, end_s = ComparisonTally(), time.monotonic() + limit_s
-    for pair in pairs:
-        if time.monotonic() > end_s:
+    first, count = 0, 1
+    while first < len(pairs):
+        started_s = time.monotonic()
+        if started_s > end_s:
             return found, True
-        found.add(pair, run_again[0](pair.a), run_again[1](pair.b))
+        portion = pairs[first : first + count]
+        sides = run_again[0]([each.a for each in portion]), run_again[1]([e.b for e in portion])
+        for each in zip(portion, *sides, strict=True):
+            found.add(*each)
+        first += count
+        pace = PORTION_S / max(time.monotonic() - started_s, 1e-6)
+        count = max(1, min(MOST_AT_ONCE, int(count * pace)))
     return found, False
 
 

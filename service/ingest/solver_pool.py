@@ -56,24 +56,31 @@ class Solver:
         return acquire(batch, mission, self.sky)
 
     def acquired(
-        self, batches: Sequence[ObservationBatch], *, at_once: bool = False
+        self,
+        batches: Sequence[ObservationBatch],
+        mission: Mission | None = None,
+        *,
+        at_once: bool = False,
     ) -> list[Acquisition | Exception]:
         """The acquisition of each of some batches, or what keeps that one from having one.
 
+        With `mission` they are all of that one, with these settings instead of its own.
         `at_once`: what takes long has `NotAtHand`.
         """
+        if mission is not None:
+            return acquired(batches, mission, self.sky, at_once=at_once)
         found: dict[int, Acquisition | Exception] = {}
         together: dict[str, list[int]] = {}
         for place, batch in enumerate(batches):
             together.setdefault(batch.spacecraft, []).append(place)
         for spacecraft, places in together.items():
             try:
-                mission = mission_in_input(self.missions, spacecraft)
+                own = mission_in_input(self.missions, spacecraft)
             except BadBatch as error:
                 found |= dict.fromkeys(places, error)
                 continue
-            own = [batches[place] for place in places]
-            several = acquired(own, mission, self.sky, at_once=at_once)
+            its_batches = [batches[place] for place in places]
+            several = acquired(its_batches, own, self.sky, at_once=at_once)
             found |= dict(zip(places, several, strict=True))
         return [found[place] for place in range(len(batches))]
 

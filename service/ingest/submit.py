@@ -352,6 +352,22 @@ class SubmissionService:
             is_long=may_take_long(batch),
         )
 
+    def run_again_many(
+        self, batches: Sequence[ObservationBatch], mission: Mission | None = None
+    ) -> list[Acquisition]:
+        """As `run_again` of each of some batches of one spacecraft; raises the first error."""
+        several = self.pool.call(
+            lambda: self.solver.acquired(batches, mission),
+            ("again", batches[0].spacecraft),
+            is_long=True,
+        )
+        found = []
+        for each in several:
+            if isinstance(each, Exception):
+                raise each
+            found.append(each)
+        return found
+
     def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 

@@ -38,7 +38,7 @@ BATCHES = 150
 
 
 def record_of(findings, batches_in_range=200):
-    return advice_record("XTE", "r", BatchSample(batches_in_range, (), "a", "b"), findings, ())
+    return advice_record("XTE", "r", BatchSample(batches_in_range, "a", "b", ()), findings, ())
 
 
 def finding(mission, evidence, name):

@@ -56,6 +56,35 @@ def test_what_changes_is_what_a_what_if_of_each_batch_says(filled):
         assert (answer.batch, answer.time) == (each.batch, each.time)
 
 
+def test_the_trends_count_every_star_in_the_hour_of_its_batch(filled, make):
+    filled.submissions.submit_many(
+        [
+            make(f"late{k}", kind="spurious", after_s=hour * 3600.0)
+            for k, hour in enumerate((2, 2, 5))
+        ]
+    )
+    found = filled.comparisons.of_options("XTE", VOTES, TIGHT)
+    assert found.cell_s == 3600
+    first = make(after_s=0.0).batch.time.text[:14] + "00:00.000Z"
+    hours = [int(each.start[11:13]) - int(first[11:13]) for each in found.trend]
+    assert (found.trend[0].start, hours) == (first, [0, 2, 5])
+    for side in ("a", "b"):
+        cells, whole = [getattr(each, side) for each in found.trend], getattr(found, side)
+        for name in ("observed", "unique", "ambiguous", "unmatched"):
+            assert sum(getattr(each, name) for each in cells) == getattr(whole, name)
+    a_batch = found.trend[2].a.observed
+    assert (found.trend[1].a.observed, found.trend[1].b.observed) == (2 * a_batch, 2 * a_batch)
+
+
+def test_the_answers_do_not_depend_on_how_many_are_solved_at_once(filled, monkeypatch):
+    monkeypatch.setattr("service.ingest.compare_options.PORTION_S", 0.0)
+    alone = filled.comparisons.of_options("XTE", VOTES, TIGHT)
+    monkeypatch.setattr("service.ingest.compare_options.PORTION_S", 60.0)
+    together = filled.comparisons.of_options("XTE", VOTES, TIGHT)
+    assert (together.changed, together.trend) == (alone.changed, alone.trend)
+    assert (together.transitions, together.attitudes) == (alone.transitions, alone.attitudes)
+
+
 def test_nothing_is_kept(filled):
     before = filled.results.page().items
     filled.comparisons.of_options("XTE", NONE, TIGHT)
@@ -72,5 +101,6 @@ def test_a_stretch_a_sample_and_a_bound_on_the_work(filled, make):
     assert (cut.cut_short, cut.compared, cut.sampled) == (True, 0, 6)
     empty = filled.comparisons.of_options("XTE", NONE, NONE, run="nothing")
     assert (empty.compared, empty.start, empty.a.residual_ratio_mean) == (0, None, None)
+    assert empty.trend == []
     with pytest.raises(NotFound):
         filled.comparisons.of_options("NOPE", NONE, NONE)

@@ -72,6 +72,14 @@ class BatchChange(Record, frozen=True, kw_only=True):
     stars: list[StarChange]
 
 
+class ComparedCell(Record, frozen=True, kw_only=True):
+    """Stars of the batches of one cell of time, by outcome on both sides."""
+
+    start: Moment
+    a: StarCounts
+    b: StarCounts
+
+
 class Comparison(Record, frozen=True, kw_only=True):
     """The results of both sides, and their differences."""
 
@@ -83,6 +91,8 @@ class Comparison(Record, frozen=True, kw_only=True):
     sampled: Count
     compared: Count
     cut_short: Annotated[bool, doc("Whether the time limit ended the comparison early.")]
+    cell_s: Annotated[Count, doc("Width of the cells of the trend, in seconds.")]
+    trend: Annotated[list[ComparedCell], doc("The cells of time that have batches, oldest first.")]
     a: ComparedSide
     b: ComparedSide
     transitions: list[Transition]

@@ -319,6 +319,13 @@ _MOST_CELLS_OF_DAYS = 732
 _SHARES = ("ambiguous", "unmatched")
 
 
+def cell_width_s(period_s: float) -> int:
+    """The width of the cells that a period's trends have: an hour, a day or several days."""
+    if period_s <= _SHOWN_BY_HOUR_S:
+        return HOUR_S
+    return DAY_S * math.ceil(period_s / (DAY_S * _MOST_CELLS_OF_DAYS))
+
+
 def run_rates(
     connection: Connection, spacecraft: str, runs: Sequence[str], start: Utc | None, end: Utc | None
 ) -> compare.RatesOfRuns | None:
@@ -335,9 +342,8 @@ def run_rates(
     if start.tai_ns >= end.tai_ns:
         return None
     first_s, end_s = unix_seconds([start.tai_ns, end.tai_ns]).tolist()
-    level: Bucket = "hour" if end_s - first_s <= _SHOWN_BY_HOUR_S else "day"
-    days = math.ceil((end_s - first_s) / (DAY_S * _MOST_CELLS_OF_DAYS))
-    width_s = HOUR_S if level == "hour" else DAY_S * days
+    width_s = cell_width_s(end_s - first_s)
+    level: Bucket = "hour" if width_s == HOUR_S else "day"
     cells = int(-(-end_s // width_s) - first_s // width_s)
     rates = []
     for run in runs:

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import dataclass
+from functools import cached_property
 
 import msgspec
 import numpy as np
@@ -33,11 +34,15 @@ class BatchSample:
     """
 
     total: int
-    batches: tuple[ObservationBatch, ...]
     first: str | None
     last: str | None
-    rows: tuple[Row, ...] = ()
-    """Rows of the batches, in the same order: result id, input and options as they are stored."""
+    rows: tuple[Row, ...]
+    """Rows of the batches: result id, input and options as they are stored."""
+
+    @cached_property
+    def batches(self) -> tuple[ObservationBatch, ...]:
+        """The batches with the options of their results, in the order of the rows."""
+        return tuple(batch_with_options(row["input"], row["options"]) for row in self.rows)
 
 
 def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, Answer]:
@@ -120,7 +125,6 @@ def sample_batches(
     drawn = tuple(rows[k] for k in rng.permutation(len(rows)))
     return BatchSample(
         total,
-        tuple(batch_with_options(row["input"], row["options"]) for row in drawn),
         min(times)[1] if times else None,
         max(times)[1] if times else None,
         drawn,

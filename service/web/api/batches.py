@@ -182,6 +182,10 @@ COMPARISON_S = 10.0
 """The duration of one comparison; the rest is left out, and the answer says so."""
 
 SideOptions = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
+SampleSize = Annotated[
+    int,
+    Field(ge=1, le=5_000, description="Maximum number of batches, taken evenly from the period."),
+]
 
 
 class CompareIn(Wire):
@@ -191,10 +195,7 @@ class CompareIn(Wire):
     run: RunName = "live"
     start: params.Start = None
     end: params.End = None
-    sample: Annotated[
-        int,
-        Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
-    ] = 100
+    sample: SampleSize = 100
     a: SideOptions = OptionsIn()
     b: SideOptions = OptionsIn()
 

@@ -15,7 +15,7 @@ from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
 from service.storage import calibrations as models
 from service.storage.models.compare import Comparison
-from service.web.api.batches import COMPARISON_S
+from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import CallerDep, ChangeDep
@@ -84,10 +84,7 @@ class CalibrationTrialIn(_Period):
     """The batches that a calibration is tried over; without a run those of the calibration's."""
 
     run: RunName | None = None
-    sample: Annotated[
-        int,
-        Field(ge=1, le=500, description="Maximum number of batches, taken evenly from the period."),
-    ] = COMPARE_SAMPLE
+    sample: SampleSize = COMPARE_SAMPLE
 
 
 class _Signed(Wire):

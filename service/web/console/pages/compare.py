@@ -1,5 +1,6 @@
 """The pages of runs and replays, and the one that compares runs or sets of options."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -12,9 +13,10 @@ from starlette.responses import Response
 from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.compare import Comparison, RatesOfRuns
-from service.times import DAY_S, parse_utc, utc_now
-from service.web.api.batches import COMPARISON_S
+from service.storage.models.compare import Comparison
+from service.times import DAY_S, parse_utc, recorded_utc, unix_seconds, utc_now
+from service.vectors import Vector
+from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
 from service.web.console.options import (
     asked_options,
@@ -25,8 +27,10 @@ from service.web.console.options import (
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
-SAMPLE = 100
+SAMPLE = 2_000
+"""Batches that two sets of options are compared over: about a second."""
 SIDES = ("a", "b")
+SHARES = ("ambiguous", "unmatched")
 SPARK_SIZE = 360, 36
 """Pixels: a year has a point a day."""
 
@@ -41,14 +45,14 @@ class CompareQuery(PageQuery):
     spacecraft: Key | None = None
     start: Annotated[str, Field(max_length=40)] = ""
     end: Annotated[str, Field(max_length=40)] = ""
-    sample: Annotated[int, Field(ge=1, le=500)] = SAMPLE
+    sample: SampleSize = SAMPLE
 
 
 @dataclass(frozen=True)
-class DrawnRates:
-    """The rates of two runs, and a sparkline of each."""
+class DrawnTrends:
+    """A sparkline of each of two sides, to one scale."""
 
-    rates: RatesOfRuns
+    cell_s: int
     top: float
     """The share that the top of a sparkline stands for."""
     sparks: list[SparklineDrawing]
@@ -56,7 +60,7 @@ class DrawnRates:
     @property
     def cells(self) -> str:
         """The unit that a point of a sparkline counts, in words."""
-        days = self.rates.cell_s // DAY_S
+        days = self.cell_s // DAY_S
         return {0: "hours", 1: "days"}.get(days, f"periods of {days} days")
 
 
@@ -81,7 +85,7 @@ def compare_page(
     runs = rates = None
     if pair is not None and (query.other is not None or query.spacecraft is None):
         runs = context.app.runs.compare_latest(*pair, start, end)
-        rates = _drawn(context.app.runs.rates(*pair, start, end))
+        rates = context.app.runs.rates(*pair, start, end)
     asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
     if query.spacecraft is not None and query.other is None:
@@ -108,11 +112,13 @@ def compare_page(
         other=pair[1] if pair else None,
         runs=runs,
         rates=rates,
+        rate_trends=rates and _drawn(rates.cell_s, [each.shares for each in rates.runs]),
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
         forms={side: fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
         now={} if mission is None else settings_of_mission(mission),
         result=result,
+        trends=result and _drawn(result.cell_s, _shares(result)),
         sides=SIDES,
         matrix=_matrix(result),
     )
@@ -131,13 +137,26 @@ def _pair(
     return query.run, query.other, name
 
 
-def _drawn(rates: RatesOfRuns | None) -> DrawnRates | None:
-    """The rates with a sparkline for each run, all to one scale; None without any."""
-    if rates is None:
-        return None
-    every = np.concatenate([values for each in rates.runs for values in each.shares.values()])
+def _drawn(cell_s: int, sides: Sequence[Mapping[str, Vector]]) -> DrawnTrends:
+    """A sparkline for each side, from shares of the stars in cells of time."""
+    every = np.concatenate([values for shares in sides for values in shares.values()])
     top = common_top(float(np.nanmax(every, initial=0.0)))
-    return DrawnRates(rates, top, [sparkline(each.shares, top, *SPARK_SIZE) for each in rates.runs])
+    return DrawnTrends(cell_s, top, [sparkline(shares, top, *SPARK_SIZE) for shares in sides])
+
+
+def _shares(result: Comparison) -> list[dict[str, Vector]]:
+    """The shares of the stars on each side, in every cell of the period; NaN without a star."""
+    moments_s = unix_seconds([recorded_utc(cell.start).tai_ns for cell in result.trend])
+    place = ((moments_s - moments_s[:1]) // result.cell_s).astype(int)
+    sides = []
+    for side in SIDES:
+        counts = [getattr(cell, side) for cell in result.trend]
+        observed = np.array([each.observed or np.nan for each in counts])
+        shares = {name: np.full(place.max(initial=-1) + 1, np.nan) for name in SHARES}
+        for name, values in shares.items():
+            values[place] = np.array([getattr(each, name) for each in counts]) / observed
+        sides.append(shares)
+    return sides
 
 
 def _matrix(result: Comparison | None) -> dict[tuple[str, str], int]:
