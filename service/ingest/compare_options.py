@@ -16,13 +16,16 @@ from typing import Any
 import numpy as np
 
 from service.acquire import Acquisition
-from service.alarms.quantities import QUANTITIES
+from service.alarms.quantities import (
+    QUANTITIES,
+    predicted_rms_arcsec,
+    residual_rms_arcsec,
+)
 from service.observations.batch import ObservationBatch
 from service.storage.models import compare as records
 from service.storage.models.answers import StarCounts
 from service.storage.queries.compare_runs import cell_width_s
 from service.storage.recording.answer import StarRow, star_rows
-from service.storage.recording.result_metrics import metrics_of
 from service.times import HOUR_S, unix_seconds, utc_of_unix
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
@@ -34,6 +37,7 @@ MOST_AT_ONCE, PORTION_S = 512, 0.1
 RunManyAgain = Callable[[Sequence[ObservationBatch]], Sequence[Acquisition]]
 
 
+_OF_THE_RATIO = residual_rms_arcsec, predicted_rms_arcsec
 _OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
 
 
@@ -59,7 +63,8 @@ class _Side:
         self.counts.update(acquisition.counts)
         self.counts["solved"] += solution is not None
         self.counts["suspect"] += solution is not None and solution.suspect
-        ratio = QUANTITIES["residual_ratio"].value_of(metrics_of(acquisition))
+        rms_arcsec = {each.__name__: each(acquisition) for each in _OF_THE_RATIO}
+        ratio = QUANTITIES["residual_ratio"].value_of(rms_arcsec)
         if ratio is not None:
             self.ratios.append(ratio)
         self.work_us.append(sum(acquisition.timings_us.values()))
@@ -201,7 +206,8 @@ def compare(
         started_s = time.monotonic()
         if started_s > end_s:
             return found, True
-        portion = pairs[first : first + count]
+        # In the order of time, the sky of a day is made once.
+        portion = sorted(pairs[first : first + count], key=lambda each: each.a.time.tai_ns)
         sides = run_again[0]([each.a for each in portion]), run_again[1]([e.b for e in portion])
         for each in zip(portion, *sides, strict=True):
             found.add(*each)

@@ -117,7 +117,7 @@ class RunCatalog:
         return _on_day(self, round(time.julian_year * DAYS_PER_YEAR))
 
 
-@lru_cache(maxsize=8)
+@lru_cache(maxsize=32)
 def _on_day(run_catalog: RunCatalog, day: int) -> Vector:
     """The directions of a run catalog on a day, counted from Julian year 0."""
     year = day / DAYS_PER_YEAR
