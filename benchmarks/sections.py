@@ -28,7 +28,7 @@ _KEPT = re.compile(
 )
 _WITHIN, _OUT = "within bounds", "out of bounds"
 BOUNDS_HEAD = ("figure", "measured", "bound", "")
-MOST_ROWS = 12
+MOST_ROWS = 6
 """More bounds are shown by kind."""
 
 

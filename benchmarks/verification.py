@@ -16,7 +16,6 @@ its bounds.
 """
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -83,7 +82,6 @@ Measured before records and bounds were kept, and to be made anew: {", ".join(un
         else ""
     )
     here = [name for name in SECTIONS if name in sections]
-    contents = "\n".join(f"- {_link(SECTIONS[name].title)}" for name in here)
     body = "\n".join(sections[name] for name in here)
     return f"""# Verification
 
@@ -98,15 +96,7 @@ with the commit, the library versions and the seed that it was measured with.
 source files have changed since their commit. Where a figure is a count of random events, its bound
 is one that chance alone passes once in 10,000 times.
 {older}
-{contents}
-
 {body}"""
-
-
-def _link(title: str) -> str:
-    """A link to the heading of a section of the same page."""
-    anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-    return f"[{title}](#{anchor})"
 
 
 def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:
