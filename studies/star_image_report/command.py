@@ -28,9 +28,7 @@ ROWS: Mapping[str, Callable[[Study], Row]] = {
 
 _INTRODUCTION = """\
 For optical engineers who know the star image detection report: each of its claims, checked.
-The star image detection report makes star images with wire filters, finds their place by
-correlation, by a sequential estimator and by scans, and recognises fields by one number. All of it
-is rebuilt, each system a row: apertures, spectra, images and centroids in `service/imaging`, scans
+Apertures, spectra, images and centroids are in `service/imaging`, scans
 in `service/observations/scans`, the other systems in `studies/star_image_report`. A claim
 is *confirmed* where ours agrees, *corrected* where the report has a slip that ours mends,
 *qualified* where it is right within limits that are measured here, *added* where ours goes beyond
@@ -47,13 +45,11 @@ _LEFT_OUT = """\
   detection: no study compares or joins them; `acquire simulate frames`, `acquire frame` and
   `acquire simulate mission` give the error of a camera's places and the rates of identification at
   a given error one after the other.
-- 2.5 to 2.7, plates and wedges: claims of IM-1; a camera has wires, and no other mask or plate.
 - 2.5, 7.1, colours: in these claims every star and its background have one spectrum. The cameras'
   images `airy` and `cross` are of one colour, or of the camera's `band_nm` with a colour for each
   star ([missions.md](missions.md#light-of-many-colours)).
 - 3.3, the synthesis of a filter from a wanted correlation: the report names three steps and gives
-  none; nothing is made of it. Aperture times image width: it follows from 2.9 and is no claim of
-  its own.
+  none; nothing is made of it.
 - 4.2, a filter behind the lens: tails shrink with the distance to the sensor and nothing else is
   claimed; the signal to noise of shorter tails is not measured. Pinhole, film and shutter are not
   modelled, and the advice on lenses and shutters is of hardware.
@@ -71,8 +67,6 @@ _LEFT_OUT = """\
 - 7.5, a detector's threshold against the size of the image is not measured.
 - 7.7, M scans: a star of a batch has one scan an axis; several are averaged before they are sent.
 - 7.8, recognition by K is the study's and no identifier: K alone is right too seldom (IM-11).
-- 7.9, accuracy against range: IM-8 and IM-10 give the two laws; the service avoids the trade by
-  moving its window with the star.
 """
 
 
@@ -149,9 +143,12 @@ def document(rows: Sequence[Row], seed: int, folder: Path, file: Path) -> str:
         parts.append(_LEFT_OUT.strip())
     for row in rows:
         parts.append(table(row))
-        for name, picture in row.pictures.items():
-            if link := links(row.title, folder / f"{name}.svg", file):
-                parts += [*link, picture.caption]
+        shown = [
+            f"- {link.removeprefix('!')}: {picture.caption}"
+            for name, picture in row.pictures.items()
+            for link in links(name, folder / f"{name}.svg", file)
+        ]
+        parts += ["\n".join(shown)] if shown else []
     return "\n\n".join(parts) + "\n"
 
 
