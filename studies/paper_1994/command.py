@@ -197,8 +197,8 @@ How the paper was read, where it leaves a choice:
   four runs;
 - one vote is enough; the paper's "ambiguous" counts stars without any vote;
 - the prototype read "all stars down to" a magnitude: of a double only components that bright are
-  merged. The service lets fainter ones add their light, as a tracker sees it
-  ([decision 5](decisions/0005-the-papers-run-catalogs.md)).
+  merged. The service lets fainter ones add their light, as a tracker sees it (of a double star of
+  V 8.2 and 8.4 the light of V 7.5), and applies the magnitude limit after that.
 
 Misprints taken as such: the angles of Table 2 that are not varied are 40, 40 and 60 arcsec, not
 degrees; in Table 9 the desert at 12 arcsec has 1820 stars right, not 1803; runs 3 and 4 of Table 7
