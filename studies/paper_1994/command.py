@@ -134,12 +134,8 @@ def report(
     identifier: Identifier,
     wanted: Sequence[int],
     time_rows: Sequence[Row] = (),
-    times_shown: bool = True,
 ) -> str:
-    """The tables of one identifier as Markdown; `time_rows` are those of `measured`.
-
-    Without `times_shown`, Tables 11 and 12 are the slowest zone beside the limit of 1994.
-    """
+    """The tables of one identifier as Markdown; `time_rows` are those of `measured`."""
     mine = [tally for tally in tallies if tally.identifier == identifier]
     parts = [f"## Tables of Fink & Shoup 1994 by the identifier `{identifier}`"]
     is_paper = identifier == PAPER_IDENTIFIER
@@ -158,11 +154,8 @@ def report(
     for number in wanted:
         rows = [row for row in time_rows if row["table"] == number]
         if rows and number in TIMES:
-            limit = time_tables.limit(rows)
-            command = f"`acquire simulate paper --table {number}`"
-            brief = f"{limit} {command} prints the times of each step."
-            times = [time_tables.times(rows), f"{limit} {time_tables.ABOUT_TIMES}"]
-            parts += [tables.heading(number), *(times if times_shown else [brief])]
+            limit = f"{time_tables.limit(rows)} {time_tables.ABOUT_TIMES}"
+            parts += [tables.heading(number), time_tables.times(rows), limit]
         elif rows:
             note = "`!`: the zone holds more pairs than the approximation bounds."
             parts += [tables.heading(number), time_tables.proportions(rows), note]
@@ -176,7 +169,8 @@ The simulator of the paper, made anew, sends its views through the same code as 
 is a batch whose a priori attitude has its boresight (cap) or its pole (band) on the zone's axis.
 Every run of a table sees the same zones, stars and draws, as in the paper; only the errors differ.
 `acquire simulate paper --identifier starid --plots docs/plots --report docs/paper.md` makes this
-page again, with `--seed` and `--stars` of your choice.
+page again, with `--seed` and `--stars` of your choice; with `--table N` it prints the rows of a
+table. [verification.md](verification.md#the-runs-of-the-paper) has the worst rates of each table.
 
 How the paper was read, where it leaves a choice:
 
@@ -228,7 +222,7 @@ def document(
     plots: Path,
     file: Path,
 ) -> str:
-    """Markdown: how the paper was read, pictures, Tables 2 to 14, and what differs.
+    """Markdown: how the paper was read, pictures of Tables 2 to 10, and what differs.
 
     The pictures are those that `plots.draw` made in the folder `plots`, linked
     as seen from the document's own `file`.  `time_rows` are those of
@@ -238,7 +232,7 @@ def document(
     if not mine:
         return _beyond(tallies, seeds)
     # The report's own heading would stand where the section's does.
-    whole = report(mine, PAPER_IDENTIFIER, list(tables.TITLES), time_rows, times_shown=False)
+    whole = report(mine, PAPER_IDENTIFIER, PROPORTIONS, time_rows)
     without_heading = whole.split("\n", 2)[2]
     shown = [
         link
@@ -250,6 +244,9 @@ def document(
         f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
     )
     parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *shown, without_heading]
+    for number in TIMES:
+        if rows := [row for row in time_rows if row["table"] == number]:
+            parts += [tables.heading(number), time_tables.limit(rows)]
     if mine:
         parts.append(_OUTSIDE)
     parts += [report(tallies, name, _RATE_TABLES) for name in _others(tallies)]
