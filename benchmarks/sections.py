@@ -14,6 +14,7 @@ import re
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, takewhile
 from pathlib import Path
 
 from benchmarks.bounds import Bound, shown
@@ -186,3 +187,47 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int = 
     rule = ["---"] * (len(head) - numbers) + ["---:"] * numbers
     lines = [head, rule, *([shown(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def tables_of(figures: Mapping[str, object]) -> str:
+    """Figures `label: kind` of which several labels have the same kinds as tables, then the others.
+
+    Others that follow each other with the same value share a row.
+    """
+    kinds: dict[str, dict[str, object]] = {}
+    for name, value in figures.items():
+        label, _, kind = name.rpartition(": ")
+        kinds.setdefault(label, {})[kind] = value
+    alike: dict[tuple[str, ...], dict[str, dict[str, object]]] = {}
+    for label, of in kinds.items():
+        if label and len(of) > 1:
+            alike.setdefault(tuple(of), {})[label] = of
+    parts, shown_labels = [], set()
+    for names, labels in alike.items():
+        if len(labels) > 1:
+            shown_labels |= set(labels)
+            parts.append(_crossed(names, labels))
+    others = [item for item in figures.items() if item[0].rpartition(": ")[0] not in shown_labels]
+    rows = [
+        (_joined([name for name, _ in same]), value)
+        for value, same in groupby(others, key=lambda item: item[1])
+    ]
+    return "\n\n".join([*parts, table(("", "figure"), rows)])
+
+
+def _crossed(names: Sequence[str], labels: Mapping[str, Mapping[str, object]]) -> str:
+    if len(names) > len(labels):
+        lines = [(name, *(of[name] for of in labels.values())) for name in names]
+        return table(("", *labels), lines)
+    return table(("", *names), [(label, *of.values()) for label, of in labels.items()])
+
+
+def _joined(names: list[str]) -> str:
+    """One name for several: what they begin with, each one's own words, what they end with."""
+    split = [name.rpartition(": ") for name in names]
+    labels = [label.split() or kind.split() for label, _, kind in split]
+    same = takewhile(lambda words: len(set(words)) == 1, zip(*labels, strict=False))
+    first = len(list(same))
+    own = ", ".join(" ".join(words[first:]) for words in labels)
+    end = f": {split[0][2]}" if split[0][0] else ""
+    return " ".join([*labels[0][:first], own]).strip() + end if len(names) > 1 else names[0]

@@ -123,7 +123,10 @@ ABOUT = {
 
 
 LEFT_OUT = {
-    "kernels": ("cap, 8", "band, 8", "band forest, 8"),
+    "kernels": tuple(
+        f"{zone}, {stars}" for zone in ("cap", "band", "band forest") for stars in (3, 8, 12)
+    ),
+    "verified_cost": ("random cap, exhaustive", "random band, exhaustive", "band forest, exh"),
     "posts": (
         *(
             "start: first",
@@ -137,7 +140,10 @@ LEFT_OUT = {
     ),
     "live_filter": ("the same", "cpu with, us", "cpu without", "answers compared", "p50 with over"),
     "stored": ("filled over", "a month by hour, buckets", "a year by day, buckets"),
-    "soak": ("log: largest in the first", "overviews", "minutes", "posts in all"),
+    "soak": (
+        *("log: largest in the first", "overviews", "minutes", "posts in all", "memory: drift"),
+        *("p50 of the first", "p99 of the first"),
+    ),
 }
 """The beginnings of figures that the command prints and the page leaves out."""
 
