@@ -35,7 +35,6 @@ def test_no_document_is_left_with_a_gap(document):
 
 
 PARTS = {
-    "CONTRIBUTING.md": ("op", "sa", "CURRENT"),
     "calibration.md": ("stars",),
     "definitive-attitude.md": (
         *("tai_ns", "rate_rad_s", "measured_ns", "quaternion", "covariance_rad2"),
