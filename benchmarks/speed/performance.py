@@ -64,22 +64,7 @@ TITLES = {
     "soak": "An hour at 70 % load",
 }
 ABOUT = {
-    "kernels": (
-        "`many` runs the compiled kernels over batches of one zone in one compiled loop, all that "
-        "they write to given; `one` calls them from Python batch by batch as the service does, "
-        "which makes it for each. The bare kernels "
-        "(`benchmarks/speed/bare.py`) do the same work with every array ready and nothing that can "
-        "be switched off; they name the same stars and find the same quaternions. The bare k-d "
-        "tree query, whose pairs must be the same, neither works out separations nor sorts."
-    ),
     "pipeline": "Single calls of the core without records; see `benchmarks/speed/pipeline.py`.",
-    "verified_cost": (
-        "Compiled loops over views of the paper's runs with five stars, in one thread, zones warm. "
-        "*Exhaustive* goes on until nothing that was not examined could matter; the *early stop*, "
-        "which the service uses, ends after the first observed pair whose best hypothesis chance "
-        "does not explain. Bounds in microseconds are for a quiet machine; on a slower one the "
-        "multiples of the time of the votes count."
-    ),
     "posts": (
         "The service as it is served, over SQLite with synchronous=FULL, beside a no-op of the "
         "same server and framework whose route declares the same body, so that the framework "
@@ -122,11 +107,9 @@ ABOUT = {
 }
 
 
+OF_CODE = ("kernels", "verified_cost")
+"""Benchmarks for those who change the kernels; they are printed and not on the page."""
 LEFT_OUT = {
-    "kernels": tuple(
-        f"{zone}, {stars}" for zone in ("cap", "band", "band forest") for stars in (3, 8, 12)
-    ),
-    "verified_cost": ("random cap, exhaustive", "random band, exhaustive", "band forest, exh"),
     "posts": (
         *(
             "start: first",
@@ -201,7 +184,7 @@ def write() -> None:
     ]
     with pictures_in(PLOTS, "performance") as folder:
         for name, title in TITLES.items():
-            if name not in kept["benchmarks"]:
+            if name not in kept["benchmarks"] or name in OF_CODE:
                 continue
             found = kept["benchmarks"][name]
             figures = {
@@ -212,9 +195,7 @@ def write() -> None:
             parts += ["", f"## {title}", "", ABOUT[name], ""]
             apart = [f"{each} {value}" for each, value in found["record"].items() - machine.items()]
             parts += [f"Measured apart: {', '.join(sorted(apart))}.", ""] if apart else []
-            if name == "kernels":
-                parts += [*_kernels(found["figures"], figures, folder), ""]
-            elif name == "pipeline":
+            if name == "pipeline":
                 parts += [_by_place(found["figures"]), ""]
             else:
                 parts += [table(["", "figure"], figures.items(), 1), ""]
@@ -260,59 +241,6 @@ def _by_place(figures: Mapping[str, Any]) -> str:
         [[name, *(row.get(place, "") for place in places)] for name, row in rows.items()],
         len(places),
     )
-
-
-def _kernels(
-    figures: Mapping[str, Any], on_the_page: Mapping[str, Any], folder: Folder
-) -> list[str]:
-    """Tables of the figures on the page, and a picture of all of them."""
-    rows: dict[str, dict[str, Any]] = {}
-    for key, value in figures.items():
-        place, _, name = key.partition(": ")
-        rows.setdefault(place, {})[name] = value
-    kernels = {place: row for place, row in rows.items() if "many, ratio" in row}
-    head = ["pairs", "many, us", "many, bare us", "many, ratio"]
-    head += ["one, us", "one, bare us", "one, ratio"]
-    lines = table(
-        ["zone", *head],
-        [
-            [p, int(r["pairs"]), *(r[h] for h in head[1:])]
-            for p, r in kernels.items()
-            if any(name.startswith(f"{p}: ") for name in on_the_page)
-        ],
-        7,
-    )
-    pairs = {place: row for place, row in rows.items() if place.startswith("SIDS")}
-    sids = table(
-        ["3,000 stars to 8°", "pairs", "ms", "k-d tree, ms", "ratio"],
-        [
-            [
-                place.removeprefix("SIDS, "),
-                row["pairs"],
-                row["ms"],
-                row["bare k-d tree, ms"],
-                row["ratio"],
-            ]
-            for place, row in pairs.items()
-        ],
-        4,
-    )
-    figure = folder.figure(7.0, 3.0)
-    times, ratios = figure.subplots(1, 2)
-    for place in dict.fromkeys(p.partition(",")[0] for p in kernels):
-        own = [row for p, row in kernels.items() if p.partition(",")[0] == place]
-        stars = [row["stars"] for row in own]
-        label = f"{place}, {int(own[0]['pairs']):,} pairs"
-        (line,) = times.plot(stars, [row["many, us"] for row in own], "o-", label=label)
-        times.plot(stars, [row["many, bare us"] for row in own], "x--", color=line.get_color())
-        ratios.plot(stars, [row["many, ratio"] for row in own], "o-", color=line.get_color())
-    times.set(xlabel="observed stars", ylabel="µs a batch", yscale="log")
-    times.set_title("many; dashed: bare")
-    times.legend(fontsize=7)
-    ratios.axhline(1.5, color="0.4", linestyle=":")
-    ratios.set(xlabel="observed stars", ylabel="times the bare kernel", ylim=(0, None))
-    folder.save(figure, "performance-kernels")
-    return [lines, "", "![Kernels](plots/performance-kernels.svg)", "", sids]
 
 
 def _posts_picture(figures: Mapping[str, Any], folder: Folder) -> None:

@@ -217,6 +217,7 @@ def document(found: Measurements, plots: Path, file: Path) -> str:
         ),
         "## Tables and figures",
         tables.RATES,
+        tables.ROWS,
     ]
     for name in tables.TITLES:
         if name in found.tallies:

@@ -52,6 +52,9 @@ RATES = (
     "misnamed. The paper does not say when it counts a field as identified. Its times are "
     "averages; ours are the median and, in brackets, the average of this machine."
 )
+ROWS = (
+    "`acquire simulate paper --table ptp-1` or `figure-12`, for example, prints the rows left out."
+)
 
 
 @dataclass(frozen=True)
@@ -112,9 +115,7 @@ def on_the_page(found: Measurements, name: str) -> str:
     if name not in NOT_ON_THE_PAGE:
         return whole
     heading, *rest = whole.split("\n\n")
-    notes = [part for part in rest if not part.startswith("|")]
-    rows = f"`acquire simulate paper --table {name}` prints the rows."
-    return "\n\n".join([heading, rows, *notes])
+    return "\n\n".join([heading, *(part for part in rest if not part.startswith("|"))])
 
 
 def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
