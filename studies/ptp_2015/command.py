@@ -159,10 +159,7 @@ What differs from the paper:
   empty, so that the triangles of Table 1 are compared by their sides. The axis below is of single
   stars, as the SAO catalog lists them; databases and fields are of stars merged within 60
   arcseconds, as the service keeps them;
-- Table 4: fields are lists of stars with Gaussian errors of position; no image is drawn, so that
-  the point spread of two pixels has no part in the rates (`acquire simulate frames` draws images);
-- slaves, the range of three sigma and the tolerance of sides are constants of the identifier, no
-  settings of a mission;
+- Table 4: fields are lists of stars with Gaussian errors of position; no image is drawn;
 - real pictures (section 4, to come): told the focal length, with the sixteen brightest points and
   stars to V 7, `ptp` finds the attitude of two of the three pictures in `tests/pictures`, and none
   of the one where a tree covers the sky (`tests/identify/test_ptp_pipeline.py`); the solver for

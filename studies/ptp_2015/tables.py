@@ -38,7 +38,10 @@ OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
 }
 """Tables of all triangles of the sky: no field is drawn for these."""
 
-NOT_ON_THE_PAGE = ("ptp-1", "ptp-2", "ptp-3", "figure-7", "figure-11", "figure-12", "figure-13")
+NOT_ON_THE_PAGE = (
+    *("ptp-1", "ptp-2", "ptp-3", "figure-6", "figure-7"),
+    *("figure-10", "figure-11", "figure-12", "figure-13"),
+)
 """The page leaves out their rows, which the command prints; it has their notes and pictures."""
 
 MB = 1e6

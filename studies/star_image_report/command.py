@@ -42,9 +42,7 @@ _LEFT_OUT = """\
 ## Parts of the report that this project leaves out or does differently
 
 - 1.1, kinds of trackers, a field of view that adapts, and the trade of field of view, optics and
-  detection: no study compares or joins them; `acquire simulate frames`, `acquire frame` and
-  `acquire simulate mission` give the error of a camera's places and the rates of identification at
-  a given error one after the other.
+  detection: no study compares or joins them.
 - 2.5, 7.1, colours: in these claims every star and its background have one spectrum. The cameras'
   images `airy` and `cross` are of one colour, or of the camera's `band_nm` with a colour for each
   star ([missions.md](missions.md#light-of-many-colours)).
@@ -57,15 +55,13 @@ _LEFT_OUT = """\
   wide as the image of the whole aperture.
 - Figure 4-2: ten wires each way, as the printed pitch gives for this aperture, not the drawing's
   eight, which have fainter orders.
-- 4.4, eight and two wires: the light of all tails together is compared, not each tail. An optimum
-  number of wires needs a figure of merit that the report does not give; the table is the trade.
+- 4.4, eight and two wires: the light of all tails together is compared, not each tail.
 - 4.5, Vega: the report's photograph through 18 meshes does show dots, against its own rule and
   IM-4, by which only a band of colours blurs them; its exposure and band are not told.
 - 5.4, the negative is cut at 1 % of the peak, without a film's curve or a scan's lines.
 - 6.3, 6.12, 6.4: the learned quantity is one variance of the noise, Q is diagonal, and the rule to
   stop is the study's; the centroid `recursive` of the service stops by a step of 0.01 sigma.
 - 7.5, a detector's threshold against the size of the image is not measured.
-- 7.7, M scans: a star of a batch has one scan an axis; several are averaged before they are sent.
 - 7.8, recognition by K is the study's and no identifier: K alone is right too seldom (IM-11).
 """
 
