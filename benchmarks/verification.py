@@ -90,11 +90,10 @@ answers: each method, compared with independent results. Its figures are not edi
 Version {__version__}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples. Each ends
-with its bounds, many bounds of one kind in one row from the smallest figure to the largest, and
-with the commit, the library versions and the seed that it was measured with.
-`python -m benchmarks --all` prints every bound by itself, and `make stale` names the sections whose
-source files have changed since their commit. Where a figure is a count of random events, its bound
-is one that chance alone passes once in 10,000 times.
+with its bounds, beside a table with their number alone, and with the commit, the library versions
+and the seed that it was measured with. `python -m benchmarks --all` prints every bound, and `make
+stale` names the sections whose source files have changed since their commit. Where a figure is a
+count of random events, its bound is one that chance alone passes once in 10,000 times.
 {older}
 {body}"""
 

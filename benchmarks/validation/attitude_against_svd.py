@@ -87,15 +87,13 @@ def summary(parts: list[tuple[str, int, Agreement]]) -> Report:
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     report = run(quick, seed)
-    bounded = {each.figure for each in report.bounds}
-    figures = {name: value for name, value in report.figures.items() if name not in bounded}
     text = f"""
 QUEST beside the attitude of a singular value decomposition, which needs no iteration: exact half
 turns about any axis, fields from a twentieth of a degree to the whole sky, 2 to 12 stars, sigmas up
 to four decades apart. The bound of each case is thirty roundings times the condition of its
 geometry, which is what the decomposition itself can hold.
 
-{table(("", "figure"), figures.items())}
+{table(("", "figure"), report.figures.items())}
 """
     return Written(text, report.bounds)
 

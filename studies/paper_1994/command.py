@@ -231,9 +231,9 @@ def document(
     mine = [tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER]
     if not mine:
         return _beyond(tallies, seeds)
-    # The report's own heading would stand where the section's does.
-    whole = report(mine, PAPER_IDENTIFIER, PROPORTIONS, time_rows)
-    without_heading = whole.split("\n", 2)[2]
+    # The page has neither the report's own heading nor the note on its tables.
+    whole = report(mine, PAPER_IDENTIFIER, [])
+    without_heading = whole.split("\n\n", 2)[2]
     shown = [
         link
         for name in (*PICTURES, PLACES)
