@@ -178,15 +178,11 @@ fields with at least six detected stars of the database.
   magnitudes** and **without zero point** (-2.5 log10 of counts) likewise. Where the search with
   magnitudes is refused, ours searches again without them; its times include both.
 
-All solvers look for the same stars, those of our run catalog to V 6.5. Ours also knows those to
-V 7.5 when it holds an attitude against the sky, for noise shows such stars, though it makes no
-pairs of them; the peers take one limit for both. Each is driven as its documents say
-(`benchmarks/validation/lost_in_space/peers.py`). tetra3rs and cedar-solve take edge ratios off
-by 0.005, which a pixel of noise needs. cedar-solve and ruststartracker, which take milliseconds,
-get the first scenes only. Solvers take turns in blocks of {turn} scenes, another going first in
-every block, each as it would be run on a stream of pictures: what it is told is made ready before
-the block, one scene that is not timed comes first, answers are judged after the block. Times are of
-the process's own clock around one call from Python.
+All solvers look for the same stars, those of our run catalog to V 6.5; ours also knows those to
+V 7.5 when it holds an attitude against the sky. Each is driven as its documents say
+(`benchmarks/validation/lost_in_space/peers.py`). cedar-solve and ruststartracker, which take
+milliseconds, get the first scenes only. Solvers take turns in blocks of {turn} scenes. Times are of the
+process's own clock around one call from Python.
 
 ## What came of it
 
