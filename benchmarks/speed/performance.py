@@ -109,7 +109,13 @@ ABOUT = {
 
 OF_CODE = ("kernels", "verified_cost")
 """Benchmarks for those who change the kernels; they are printed and not on the page."""
+PLACES = ("random cap", "cap forest", "random band", "band forest")
 LEFT_OUT = {
+    "pipeline": tuple(
+        f"{place}: {name}"
+        for place in PLACES
+        for name in ("zones built", "identify and solve in", "stars held")
+    ),
     "posts": (
         *(
             "start: first",
@@ -196,7 +202,7 @@ def write() -> None:
             apart = [f"{each} {value}" for each, value in found["record"].items() - machine.items()]
             parts += [f"Measured apart: {', '.join(sorted(apart))}.", ""] if apart else []
             if name == "pipeline":
-                parts += [_by_place(found["figures"]), ""]
+                parts += [_by_place(figures), ""]
             else:
                 parts += [table(["", "figure"], figures.items(), 1), ""]
             if name == "posts":

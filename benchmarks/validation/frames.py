@@ -400,8 +400,6 @@ hundred sigmas, and far less than any false star would move it by.
 {bounds_table(report.bounds)}
 
 ![A frame with its stars, their names and residual arrows](images/overlay.png)
-
-The picture is that of the first frame, as `GET /api/v1/batches/{{id}}/overlay` gives it.
 """
 
 

@@ -245,8 +245,8 @@ def document(
     )
     parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *shown, without_heading]
     for number in TIMES:
-        if rows := [row for row in time_rows if row["table"] == number]:
-            parts += [tables.heading(number), time_tables.limit(rows)]
+        rows = [row for row in time_rows if row["table"] == number]
+        parts += [f"Table {number}. {time_tables.limit(rows)}"] if rows else []
     if mine:
         parts.append(_OUTSIDE)
     parts += [report(tallies, name, _RATE_TABLES) for name in _others(tallies)]

@@ -208,7 +208,7 @@ def document(found: Measurements, plots: Path, file: Path) -> str:
         "## The axis",
         _axis(),
         *(
-            ["## Databases", _RIVALS, tables.database_table(found.databases)]
+            ["## Databases", _RIVALS, tables.database_table(_not_of_table_5(found.databases))]
             if found.databases
             else []
         ),
@@ -221,6 +221,10 @@ def document(found: Measurements, plots: Path, file: Path) -> str:
             parts.append(tables.on_the_page(found, name))
             parts += links(tables.TITLES[name], plots / f"ptp-{name}.svg", file)
     return "\n\n".join(part.strip() for part in parts) + "\n"
+
+
+def _not_of_table_5(databases: Sequence[comparison.Database]) -> list[comparison.Database]:
+    return [each for each in databases if not each.algorithm.startswith("PTP, ")]
 
 
 def _in_short(found: Measurements) -> list[str]:

@@ -51,16 +51,13 @@ _LEFT_OUT = """\
 - 4.2, a filter behind the lens: tails shrink with the distance to the sensor and nothing else is
   claimed; the signal to noise of shorter tails is not measured. Pinhole, film and shutter are not
   modelled, and the advice on lenses and shutters is of hardware.
-- 4.2, the width of the intersection, 2 lambda/d: we take it for a slip, the intersection being as
-  wide as the image of the whole aperture.
 - Figure 4-2: ten wires each way, as the printed pitch gives for this aperture, not the drawing's
   eight, which have fainter orders.
 - 4.4, eight and two wires: the light of all tails together is compared, not each tail.
 - 4.5, Vega: the report's photograph through 18 meshes does show dots, against its own rule and
   IM-4, by which only a band of colours blurs them; its exposure and band are not told.
 - 5.4, the negative is cut at 1 % of the peak, without a film's curve or a scan's lines.
-- 6.3, 6.12, 6.4: the learned quantity is one variance of the noise, Q is diagonal, and the rule to
-  stop is the study's; the centroid `recursive` of the service stops by a step of 0.01 sigma.
+- 6.3, 6.12, 6.4: the learned quantity is one variance of the noise, and Q is diagonal.
 - 7.5, a detector's threshold against the size of the image is not measured.
 - 7.8, recognition by K is the study's and no identifier: K alone is right too seldom (IM-11).
 """

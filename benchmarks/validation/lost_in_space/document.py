@@ -181,8 +181,8 @@ fields with at least six detected stars of the database.
 All solvers look for the same stars, those of our run catalog to V 6.5; ours also knows those to
 V 7.5 when it holds an attitude against the sky. Each is driven as its documents say
 (`benchmarks/validation/lost_in_space/peers.py`). cedar-solve and ruststartracker, which take
-milliseconds, get the first scenes only. Solvers take turns in blocks of {turn} scenes. Times are of the
-process's own clock around one call from Python.
+milliseconds, get the first scenes only. Solvers take turns in blocks of {turn} scenes. Times are of
+the process's own clock around one call from Python.
 
 ## What came of it
 
