@@ -159,8 +159,8 @@ The simulator of Fink & Shoup's paper, made anew, sends its views through the sa
 batch, with the votes as the identifier and with `verified`, the service's default. Every run of
 Tables 2 to 10 has at least {min(t.stars for t in votes):,} stars by votes, seeds
 {", ".join(map(str, seeds))} pooled, and {min(t.stars for t in verified):,} verified, seed
-{seeds[0]}. [paper.md](paper.md) has every run by votes;
-`acquire simulate paper --identifier verified` prints every run verified.
+{seeds[0]}. [paper.md](paper.md) says how the paper was read; `acquire simulate paper` prints every
+run, by votes and verified.
 
 {table(head, rows, numbers=6)}
 

@@ -240,7 +240,7 @@ def document(
         for link in links("Rates against errors", plots / f"{name}.svg", file)
     ]
     written = (
-        "For astronomers who know the paper: its tables beside those that this service gives.\n"
+        "For astronomers who know the paper: how it was read, and its rates beside ours.\n"
         f"Seeds {', '.join(map(str, seeds))}, {len(mine)} runs, from {_least(mine):,} stars each."
     )
     parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *shown, without_heading]
