@@ -190,6 +190,9 @@ Z, Y and X, first that of the caps; serious errors have 12 arcsec and 0.3 mag be
 {table(head, rows, numbers=3)}
 
 ![Wrong as often as claimed](plots/calibration.svg)
+
+Below the line the probabilities are too modest, above it they claim too much. An arrow is the upper
+end of the interval where no claim was wrong.
 """
     return Written(
         text,
