@@ -2,8 +2,7 @@
 
 A service of its own is filled with a day of every mission that is watched for alarms; a
 browser then looks at every page, wide and narrow, light and dark.  The
-pictures go to docs/images, where docs/operators.md shows them; the table of
-all of them at its end is written anew.
+pictures go to docs/images, where docs/operators.md shows some of them.
 """
 
 import argparse
@@ -32,8 +31,6 @@ from tests.web.serving import Server
 
 FOLDER = Path(__file__).parents[1] / "docs" / "images"
 PICTURE = Path(__file__).parents[1] / "tests" / "pictures" / "cedarsolve-pleiades.jpg"
-DOCUMENT = FOLDER.parent / "operators.md"
-HEADING = "## All pages: wide and narrow, light and dark"
 RUN = "sample-pass"
 BATCHES = 288
 START = "1999-03-01T00:00:00.000Z"
@@ -54,8 +51,6 @@ NOTES = (
 SIZES = {"wide": 1440, "narrow": 400}
 TALLEST = {"wide": 1350, "narrow": 1100}
 """Pixels of a picture's height: what follows on a long page is more of the same."""
-WIDTHS = {"wide": 320, "narrow": 120}
-"""Of a picture in the table of all."""
 QUALITY = 50
 PATIENCE_S = 600.0
 
@@ -81,9 +76,6 @@ def main() -> int:
             asked.folder.mkdir(parents=True, exist_ok=True)
             with chromium(Path(folder) / "profile") as devtools, Browser(devtools) as browser:
                 total = look(browser, address, pages, asked.folder)
-    if asked.folder == FOLDER and not asked.only:
-        before, _, _ = DOCUMENT.read_text(encoding="utf-8").partition(HEADING)
-        DOCUMENT.write_text(before + gallery(pages), encoding="utf-8")
     print(f"{total / 1e6:.2f} MB in {asked.folder}")
     return 0
 
@@ -221,24 +213,6 @@ def solve(browser: Browser) -> None:
     browser.call("DOM.setFileInputFiles", nodeId=node, files=[str(PICTURE)])
     browser.run("document.querySelector('#picture button.main').click()")
     browser.wait(lambda: browser.run("document.getElementById('drawn').naturalWidth"), PATIENCE_S)
-
-
-def gallery(pages: Mapping[str, str]) -> str:
-    """The last section of the guide: a table of every picture."""
-    views = [(size, light) for light in ("light", "dark") for size in SIZES]
-    head = " | ".join(f"{size}, {light}" for size, light in views)
-    rows = [
-        f"| {page} | "
-        + " | ".join(
-            f'<a href="images/{page}-{size}-{light}.webp">'
-            f'<img src="images/{page}-{size}-{light}.webp" width="{WIDTHS[size]}" '
-            f'alt="{page}, {size}, {light}"></a>'
-            for size, light in views
-        )
-        + " |"
-        for page in pages
-    ]
-    return "\n".join([HEADING, "", f"| page | {head} |", "|---|---|---|---|---|", *rows, ""])
 
 
 TOP = """location.hash ? Math.round(

@@ -14,9 +14,10 @@ import re
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, takewhile
 from pathlib import Path
 
-from benchmarks.bounds import Bound, shown
+from benchmarks.bounds import Bound, every, shown
 from benchmarks.record import CORE, ROOT, SIMULATOR, Record, digest_of, read_record
 from studies.documents import Folder, pictures_in
 
@@ -28,7 +29,7 @@ _KEPT = re.compile(
 )
 _WITHIN, _OUT = "within bounds", "out of bounds"
 BOUNDS_HEAD = ("figure", "measured", "bound", "")
-MOST_ROWS = 12
+MOST_ROWS = 6
 """More bounds are shown by kind."""
 
 
@@ -87,12 +88,20 @@ def framed(name: str, title: str, written: Written, quick: bool, seed: int, reco
         f"<!-- section {name}; seed {seed}; {size}; {state}; {record} -->\n"
         f"## {title}\n\n"
         f"{written.text.strip()}\n\n"
-        f"{bounds_table(written.bounds)}\n\n"
+        f"{_bounds(written)}\n\n"
         f"{doubt}"
         f"{record.sentence} Seed {seed}, {size}; "
         f"again: `python -m benchmarks.verification --only {name}`.\n"
         f"<!-- end of {name} -->\n"
     )
+
+
+def _bounds(written: Written) -> str:
+    """All bounds; beside a table of figures their number, and those that do not hold."""
+    if "\n| " not in written.text:
+        return bounds_table(written.bounds)
+    broken = [each for each in written.bounds if not each.holds]
+    return bounds_table([*every("bounds", written.bounds)][:1] + broken)
 
 
 def bounds_table(bounds: Iterable[Bound]) -> str:
@@ -186,3 +195,47 @@ def table(head: Sequence[str], rows: Iterable[Sequence[object]], numbers: int = 
     rule = ["---"] * (len(head) - numbers) + ["---:"] * numbers
     lines = [head, rule, *([shown(cell) for cell in row] for row in rows)]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def tables_of(figures: Mapping[str, object]) -> str:
+    """Figures `label: kind` of which several labels have the same kinds as tables, then the others.
+
+    Others that follow each other with the same value share a row.
+    """
+    kinds: dict[str, dict[str, object]] = {}
+    for name, value in figures.items():
+        label, _, kind = name.rpartition(": ")
+        kinds.setdefault(label, {})[kind] = value
+    alike: dict[tuple[str, ...], dict[str, dict[str, object]]] = {}
+    for label, of in kinds.items():
+        if label and len(of) > 1:
+            alike.setdefault(tuple(of), {})[label] = of
+    parts, shown_labels = [], set()
+    for names, labels in alike.items():
+        if len(labels) > 1:
+            shown_labels |= set(labels)
+            parts.append(_crossed(names, labels))
+    others = [item for item in figures.items() if item[0].rpartition(": ")[0] not in shown_labels]
+    rows = [
+        (_joined([name for name, _ in same]), value)
+        for value, same in groupby(others, key=lambda item: item[1])
+    ]
+    return "\n\n".join([*parts, table(("", "figure"), rows)])
+
+
+def _crossed(names: Sequence[str], labels: Mapping[str, Mapping[str, object]]) -> str:
+    if len(names) > len(labels):
+        lines = [(name, *(of[name] for of in labels.values())) for name in names]
+        return table(("", *labels), lines)
+    return table(("", *names), [(label, *of.values()) for label, of in labels.items()])
+
+
+def _joined(names: list[str]) -> str:
+    """One name for several: what they begin with, each one's own words, what they end with."""
+    split = [name.rpartition(": ") for name in names]
+    labels = [label.split() or kind.split() for label, _, kind in split]
+    same = takewhile(lambda words: len(set(words)) == 1, zip(*labels, strict=False))
+    first = len(list(same))
+    own = ", ".join(" ".join(words[first:]) for words in labels)
+    end = f": {split[0][2]}" if split[0][0] else ""
+    return " ".join([*labels[0][:first], own]).strip() + end if len(names) > 1 else names[0]

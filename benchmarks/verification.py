@@ -16,7 +16,6 @@ its bounds.
 """
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -83,7 +82,6 @@ Measured before records and bounds were kept, and to be made anew: {", ".join(un
         else ""
     )
     here = [name for name in SECTIONS if name in sections]
-    contents = "\n".join(f"- {_link(SECTIONS[name].title)}" for name in here)
     body = "\n".join(sections[name] for name in here)
     return f"""# Verification
 
@@ -92,21 +90,12 @@ answers: each method, compared with independent results. Its figures are not edi
 Version {__version__}. {verdict}
 
 Every section is also a test: `make test` runs the same comparisons on smaller samples. Each ends
-with its bounds, many bounds of one kind in one row from the smallest figure to the largest, and
-with the commit, the library versions and the seed that it was measured with.
-`python -m benchmarks --all` prints every bound by itself, and `make stale` names the sections whose
-source files have changed since their commit. Where a figure is a count of random events, its bound
-is one that chance alone passes once in 10,000 times.
+with its bounds, beside a table with their number alone, and with the commit, the library versions
+and the seed that it was measured with. `python -m benchmarks --all` prints every bound, and `make
+stale` names the sections whose source files have changed since their commit. Where a figure is a
+count of random events, its bound is one that chance alone passes once in 10,000 times.
 {older}
-{contents}
-
 {body}"""
-
-
-def _link(title: str) -> str:
-    """A link to the heading of a section of the same page."""
-    anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-    return f"[{title}](#{anchor})"
 
 
 def remake(names: Sequence[str], quick: bool, seed: int, output: Path) -> bool:

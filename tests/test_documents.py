@@ -35,12 +35,6 @@ def test_no_document_is_left_with_a_gap(document):
 
 
 PARTS = {
-    "CONTRIBUTING.md": ("op", "sa", "CURRENT"),
-    "calibration.md": ("stars",),
-    "definitive-attitude.md": (
-        *("tai_ns", "rate_rad_s", "measured_ns", "quaternion", "covariance_rad2"),
-        *("next_gyro", "next_attitudes"),
-    ),
     "webhooks.md": ("body", "headers"),
 }
 """Documents whose examples are parts of a program, and the names that it would have."""

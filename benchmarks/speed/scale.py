@@ -1,7 +1,7 @@
 """What a batch takes in SQLite, PostgreSQL and the archive.
 
     python -m benchmarks scale --quick      twenty thousand batches
-    python -m benchmarks.speed.scale --batches 1000000 --write      into docs/scale.md
+    python -m benchmarks.speed.scale --batches 1000000
 
 Batches of a simulated pass, one a second and no two alike, are recorded in bulk, five stars
 each, moved to an archive with every verification, listed and counted before and after, restored,
@@ -29,9 +29,8 @@ from sqlalchemy import create_engine, select, text
 from tqdm import tqdm
 
 from benchmarks.bounds import Bound, at_least, at_most, equal
-from benchmarks.record import ROOT, SERVICE, record_of
+from benchmarks.record import ROOT
 from benchmarks.report import Report
-from benchmarks.sections import bounds_table, table
 from benchmarks.speed.posts import FIRST
 from benchmarks.speed.stored import milliseconds
 from service.app.factory import App, open_app
@@ -319,30 +318,16 @@ def size_text(size: float) -> str:
     return f"{size / 1e15:.3g} PB"
 
 
-def write(report: Report, count: int, seed: int) -> None:
-    """Put a run between the comments of docs/scale.md."""
-    start, end = "<!-- measured by benchmarks.speed.scale -->", "<!-- end of scale -->"
-    before, _, rest = TARGET.read_text(encoding="utf-8").partition(start)
-    figures = table(("", "figure"), report.figures.items())
-    again = f"python -m benchmarks.speed.scale --batches {count} --seed {seed}"
-    part = [start, figures, bounds_table(report.bounds)]
-    part.append(f"{record_of(SERVICE).sentence} Again: `{again}`.\n{end}")
-    TARGET.write_text(before + "\n\n".join(part) + rest.partition(end)[2], encoding="utf-8")
-
-
 def main() -> int:
-    """Measure, print, and write the page if asked to; 1 where a figure is out of bounds."""
+    """Measure and print; 1 where a figure is out of bounds."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--batches", type=int, default=BATCHES)
     parser.add_argument("--seed", type=int, default=3)
-    parser.add_argument("--write", action="store_true", help="the figures of docs/scale.md")
     parsed = parser.parse_args()
     report = measured(parsed.batches, parsed.seed)
     print(report.text())
-    if parsed.write:
-        write(report, parsed.batches, parsed.seed)
     return 0 if report.passed else 1
 
 

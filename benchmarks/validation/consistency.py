@@ -193,25 +193,6 @@ def bounds_of(rows: list[Row]) -> list[Bound]:
 def write(quick: bool, seed: int) -> Written:
     """The section of the verification."""
     rows = measured(quick, seed)
-    cells = [
-        (
-            *row.label,
-            f"{100.0 * row.good / row.solved:.1f}",
-            f"{100.0 * row.expected:.1f}",
-            f"{row.error_sigma:.2f}" if row.good else "-",
-            f"{row.error_arcsec:.1f}" if row.good else "-",
-        )
-        for row in rows
-    ]
-    head = (
-        "",
-        "stars",
-        "what is wrong",
-        "good, %",
-        "expected, %",
-        "error over its sigma",
-        "median error, arcsec",
-    )
     text = f"""
 The status `suspect` is a test of whether the stars agree with one another: TASTE beyond the 99.9 %
 point of chi-square. It is no proof that an attitude is right. By its nature it lets pass noise that
@@ -219,14 +200,29 @@ is larger than the sigma that is told, where there are few stars to show it; a m
 10 to 30 arcsec between trackers that see a star or two each; and any misalignment whatever of a
 tracker that is the only one. Every row has {QUICK_CASES if quick else CASES:,} random fields of
 {RADIUS_DEG:g} deg radius with rightly named stars of {SIGMA_ARCSEC:.2f} arcsec per axis; two
-trackers are {BETWEEN_DEG:g} deg apart, and the second one is turned about any axis. Given are the
-percentage whose status is `good`, beside what chi-square foresees (central for noise, non-central
-for a misalignment), and of the good ones the error over the sigma that the covariance states (1
-where that is true) and the median error about all axes.
+trackers are {BETWEEN_DEG:g} deg apart, and the second one is turned about any axis. A cell holds
+the percentage whose status is `good`, in brackets what chi-square foresees (central for noise,
+non-central for a misalignment); then of the good ones the error over the sigma that the covariance
+states (1 where that is true), and the median error about all axes in arcsec.
 
-{table(head, cells, numbers=4)}
+{_table(rows, "one tracker")}
+
+{_table(rows, "two trackers")}
 """
     return Written(text, bounds_of(rows))
+
+
+def _table(rows: list[Row], trackers: str) -> str:
+    """A row for what is wrong, a column for each number of stars."""
+    cells: dict[str, list[str]] = {}
+    shown = [row for row in rows if row.label[0] == trackers]
+    for row in shown:
+        errors = f"; {row.error_sigma:.2f}; {row.error_arcsec:.1f}" if row.good else ""
+        good = f"{100.0 * row.good / row.solved:.1f} ({100.0 * row.expected:.1f})"
+        cells.setdefault(row.label[2], []).append(f"{good}{errors}")
+    stars = tuple(dict.fromkeys(row.label[1] for row in shown))
+    lines = [(wrong, *of_stars) for wrong, of_stars in cells.items()]
+    return table((trackers, *stars), lines, numbers=len(stars))
 
 
 SECTION = Section("What the consistency test lets pass", write, CORE)

@@ -23,13 +23,12 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most, between
 from benchmarks.record import CORE, IMAGING, record_of
 from benchmarks.report import Report
-from benchmarks.sections import bounds_table, table
+from benchmarks.sections import bounds_table, tables_of
 from benchmarks.validation.frames import (
     CROSSED,
     DOCUMENT,
     FOUND_PX,
     PRIORS,
-    RIGHT_ARCSEC,
     SEPARATE_PX,
     SPACECRAFT,
     Measured,
@@ -235,8 +234,7 @@ def document(report: Report, seed: int) -> str:
 Written by
 `python -m benchmarks.validation.crossed_frames --frames {frames} --seed {seed} --write`;
 its figures are not edited by hand. {verdict}
-
-{record.sentence} Seed {seed}.
+{record.sentence}
 <!-- {record} -->
 
 The frames are those above with one difference: two wires each way, a tenth of
@@ -247,10 +245,7 @@ by the shape of the cross, with the arms of all others as its background. All li
 colour, which the camera assumes too; for light of many colours a camera has a `band_nm`
 ([missions.md](missions.md#light-of-many-colours) has the figures).
 
-A star counts as found, and an attitude as right, as above: within {FOUND_PX:g} pixels, and
-within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it.
-
-{table(("", "figure"), report.figures.items())}
+{tables_of(report.figures)}
 
 {bounds_table(report.bounds)}
 """

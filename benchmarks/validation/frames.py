@@ -29,7 +29,7 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most, between
 from benchmarks.record import CORE, IMAGING, ROOT, record_of
 from benchmarks.report import Report
-from benchmarks.sections import bounds_table, table
+from benchmarks.sections import bounds_table, tables_of
 from service.acquire import Acquisition, acquire
 from service.errors import NotAvailable
 from service.imaging.detection.detect import detect, detection_kernel
@@ -378,8 +378,7 @@ For engineers who send frames: how well stars are found, placed and identified o
 Written by
 `python -m benchmarks.validation.frames --frames {report.figures["frames"]} --seed {seed} --write`;
 its figures are not edited by hand. {verdict}
-
-{record.sentence} Seed {seed}.
+{record.sentence}
 <!-- {record} -->
 
 Each frame is drawn from the real sky as the shipped mission IMAGER sees it: 1024 x 1024 pixels of
@@ -394,16 +393,13 @@ and made a batch, and the batch goes through the pipeline: with an a priori atti
 A star to V 6.5 counts as found where a candidate lies within {FOUND_PX:g} pixels of its true place,
 unless its image is part of a brighter star's (nearer than {SEPARATE_PX:g} pixels). An attitude is
 right within {RIGHT_ARCSEC[0]:g} arcsec across the boresight and {RIGHT_ARCSEC[2]:g} about it: some
-hundred sigmas, and far less than any false star would move it by. A *good* one is what the service
-calls good.
+hundred sigmas, and far less than any false star would move it by.
 
-{table(("", "figure"), report.figures.items())}
+{tables_of(report.figures)}
 
 {bounds_table(report.bounds)}
 
 ![A frame with its stars, their names and residual arrows](images/overlay.png)
-
-The picture is that of the first frame, as `GET /api/v1/batches/{{id}}/overlay` gives it.
 """
 
 

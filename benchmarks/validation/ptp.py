@@ -46,7 +46,7 @@ def run(quick: bool, seed: int) -> Report:
     for px in (0.5, 1.0, 2.0):
         accepted = sum(_is_accepted(scene, guide) for scene in _random(sky, px, fields, seed))
         figures[f"random points at {px:g} px accepted"] = f"{accepted} of {fields:,}"
-        bounds.append(at_most(f"random points at {px:g} px accepted", accepted, ALLOWED))
+        bounds.append(at_most(f"{px:g} px: random points accepted", accepted, ALLOWED))
     conditions = Conditions(position_px=1.0, magnitude_sigma_mag=0.0, fewest=6)
     mirrored = shared = 0
     drawn = draw_scenes(sky, conditions, fields, seed)

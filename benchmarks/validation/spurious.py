@@ -218,9 +218,7 @@ body Z, Y and X, except in the last rows, where it is drawn evenly up to {WIDE_D
 ![Real stars right, and spurious stars named](plots/spurious.svg)
 
 With three of five spurious in a band two real stars are left among thousands. Two stars fit by
-chance, so that hardly any is named; the ranked list mostly has the right one first. In the forest
-three points that agree by chance come before it in one view of six: two stars among unexplained
-ones are given less weight, so that random points do not pass for stars. In a cap two
+chance, so that hardly any is named; the ranked list mostly has the right one first. In a cap two
 real stars suffice where the a priori attitude is known to an arcminute. Where it may be degrees
 off, they do not: only the share of the row with 3 of 5 and 0 to {WIDE_DEG:g}° is named.
 """

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most
 from benchmarks.record import CORE, SIMULATOR
 from benchmarks.report import Report
-from benchmarks.sections import Section, Written, table
+from benchmarks.sections import Section, Written
 from service.acquire import acquire
 from service.missions.mission import Mission
 from service.observations.batch import QuaternionPrior
@@ -110,7 +110,8 @@ The same identifier where nothing is known of the attitude: the zone is a cap of
 mission file may ask for, with all stars to V 8 and their pairs to 4°; a field of 2° radius, five
 stars, 3 arcsec, 0.1 mag. The heavy-tailed prior has a uniform share, which then is all there is.
 
-{table(("", "figure"), _figures(found).items())}
+Of {found.views:,} views {found.right:,} of {found.stars:,} stars are named rightly, and
+{found.wrong:,} wrongly.
 """
     return Written(text, bounds)
 

@@ -159,15 +159,19 @@ def times(rows: Sequence[Row]) -> str:
     return markdown(header, lines)
 
 
+ABOUT_TIMES = (
+    "NCAP and NTOT are those of the fastest and of the slowest zone; the greatest times include "
+    "other work of the machine."
+)
+
+
 def limit(rows: Sequence[Row]) -> str:
     """The time that the missions allow, beside the slowest zone of a table."""
     slowest = max(rows, key=lambda row: float(row["slowest_ms"]))
     allowed = LIMITS_S[slowest["table"]]
     return (
         f"The mission allows {allowed:g} s; the slowest zone ({slowest['case']}), its pairs and "
-        f"the first identification took {slowest['slowest_ms']:.3f} ms together. NCAP and NTOT are "
-        "those of the fastest and of the slowest zone; the greatest times include other work of "
-        "the machine."
+        f"the first identification took {slowest['slowest_ms']:.3f} ms together."
     )
 
 

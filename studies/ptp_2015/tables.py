@@ -38,6 +38,12 @@ OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
 }
 """Tables of all triangles of the sky: no field is drawn for these."""
 
+NOT_ON_THE_PAGE = (
+    *("ptp-1", "ptp-2", "ptp-3", "figure-6", "figure-7"),
+    *("figure-10", "figure-11", "figure-12", "figure-13"),
+)
+"""The page leaves out their rows, which the command prints; it has their notes and pictures."""
+
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
 """The columns of Figure 11, first to last."""
@@ -48,6 +54,9 @@ RATES = (
     "three or more behind the attitude check, all rightly; *wrong*: behind the check a star is "
     "misnamed. The paper does not say when it counts a field as identified. Its times are "
     "averages; ours are the median and, in brackets, the average of this machine."
+)
+ROWS = (
+    "`acquire simulate paper --table ptp-1` or `figure-12`, for example, prints the rows left out."
 )
 
 
@@ -101,6 +110,15 @@ def section(found: Measurements, name: str) -> str:
         shown = line_table(tallies, "magnitude_sigma_mag", "mag", paper.figure_13)
     parts = [f"### {TITLES[name]}", shown, *([note] if note else [])]
     return "\n\n".join(parts)
+
+
+def on_the_page(found: Measurements, name: str) -> str:
+    """The section as the page has it: without the rows that the command alone prints."""
+    whole = section(found, name)
+    if name not in NOT_ON_THE_PAGE:
+        return whole
+    heading, *rest = whole.split("\n\n")
+    return "\n\n".join([heading, *(part for part in rest if not part.startswith("|"))])
 
 
 def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:

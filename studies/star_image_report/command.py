@@ -28,9 +28,7 @@ ROWS: Mapping[str, Callable[[Study], Row]] = {
 
 _INTRODUCTION = """\
 For optical engineers who know the star image detection report: each of its claims, checked.
-The star image detection report makes star images with wire filters, finds their place by
-correlation, by a sequential estimator and by scans, and recognises fields by one number. All of it
-is rebuilt, each system a row: apertures, spectra, images and centroids in `service/imaging`, scans
+Apertures, spectra, images and centroids are in `service/imaging`, scans
 in `service/observations/scans`, the other systems in `studies/star_image_report`. A claim
 is *confirmed* where ours agrees, *corrected* where the report has a slip that ours mends,
 *qualified* where it is right within limits that are measured here, *added* where ours goes beyond
@@ -44,35 +42,24 @@ _LEFT_OUT = """\
 ## Parts of the report that this project leaves out or does differently
 
 - 1.1, kinds of trackers, a field of view that adapts, and the trade of field of view, optics and
-  detection: no study compares or joins them; `acquire simulate frames`, `acquire frame` and
-  `acquire simulate mission` give the error of a camera's places and the rates of identification at
-  a given error one after the other.
-- 2.5 to 2.7, plates and wedges: claims of IM-1; a camera has wires, and no other mask or plate.
+  detection: no study compares or joins them.
 - 2.5, 7.1, colours: in these claims every star and its background have one spectrum. The cameras'
   images `airy` and `cross` are of one colour, or of the camera's `band_nm` with a colour for each
   star ([missions.md](missions.md#light-of-many-colours)).
 - 3.3, the synthesis of a filter from a wanted correlation: the report names three steps and gives
-  none; nothing is made of it. Aperture times image width: it follows from 2.9 and is no claim of
-  its own.
+  none; nothing is made of it.
 - 4.2, a filter behind the lens: tails shrink with the distance to the sensor and nothing else is
   claimed; the signal to noise of shorter tails is not measured. Pinhole, film and shutter are not
   modelled, and the advice on lenses and shutters is of hardware.
-- 4.2, the width of the intersection, 2 lambda/d: we take it for a slip, the intersection being as
-  wide as the image of the whole aperture.
 - Figure 4-2: ten wires each way, as the printed pitch gives for this aperture, not the drawing's
   eight, which have fainter orders.
-- 4.4, eight and two wires: the light of all tails together is compared, not each tail. An optimum
-  number of wires needs a figure of merit that the report does not give; the table is the trade.
+- 4.4, eight and two wires: the light of all tails together is compared, not each tail.
 - 4.5, Vega: the report's photograph through 18 meshes does show dots, against its own rule and
   IM-4, by which only a band of colours blurs them; its exposure and band are not told.
 - 5.4, the negative is cut at 1 % of the peak, without a film's curve or a scan's lines.
-- 6.3, 6.12, 6.4: the learned quantity is one variance of the noise, Q is diagonal, and the rule to
-  stop is the study's; the centroid `recursive` of the service stops by a step of 0.01 sigma.
+- 6.3, 6.12, 6.4: the learned quantity is one variance of the noise, and Q is diagonal.
 - 7.5, a detector's threshold against the size of the image is not measured.
-- 7.7, M scans: a star of a batch has one scan an axis; several are averaged before they are sent.
 - 7.8, recognition by K is the study's and no identifier: K alone is right too seldom (IM-11).
-- 7.9, accuracy against range: IM-8 and IM-10 give the two laws; the service avoids the trade by
-  moving its window with the star.
 """
 
 
@@ -149,9 +136,12 @@ def document(rows: Sequence[Row], seed: int, folder: Path, file: Path) -> str:
         parts.append(_LEFT_OUT.strip())
     for row in rows:
         parts.append(table(row))
-        for name, picture in row.pictures.items():
-            if link := links(row.title, folder / f"{name}.svg", file):
-                parts += [*link, picture.caption]
+        shown = [
+            f"- {link.removeprefix('!')}: {picture.caption}"
+            for name, picture in row.pictures.items()
+            for link in links(name, folder / f"{name}.svg", file)
+        ]
+        parts += ["\n".join(shown)] if shown else []
     return "\n\n".join(parts) + "\n"
 
 

@@ -2,7 +2,7 @@
 
 from benchmarks.record import ROOT, record_of
 from benchmarks.report import Report
-from benchmarks.sections import table
+from benchmarks.sections import tables_of
 
 DOCUMENT = ROOT / "docs" / "cameras.md"
 SOURCES = (
@@ -24,7 +24,7 @@ def write_part(name: str, report: Report, options: str) -> None:
     """Put the figures of a run of a module of this folder between its comments."""
     module = f"benchmarks.validation.pictures.{name}"
     start, end = f"<!-- measured by {module} -->", f"<!-- end of {name} -->"
-    figures = table(("", "figure"), list(report.figures.items()))
+    figures = tables_of(report.figures)
     record = record_of(SOURCES)
     again = f"{record.sentence} Again:\n`python -m {module} {options}`."
     part = f"{start}\n\n{figures}\n\n{again}\n{end}"
