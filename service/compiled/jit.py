@@ -16,7 +16,7 @@ def njit(*function: Callable[..., Any], **options: Any) -> Any:
     """Compile a kernel, with the options of `numba.njit`; the cache on disk keeps it."""
     if function:
         return Kernel(*function, **options)
-    return lambda given: Kernel(given, **options)
+    return lambda kernel: Kernel(kernel, **options)
 
 
 def njit_no_refcount(kernel: Callable[..., Any]) -> Any:

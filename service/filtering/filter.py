@@ -120,10 +120,10 @@ def _order(
     gyro: GyroSamples,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Kind and row of the measurements within the gyro's samples, in order of time."""
-    for name, given in (("attitudes", attitudes), ("directions", directions)):
-        if state is not None and len(given.tai_ns) and given.tai_ns[0] < state.tai_ns:
+    for name, measurements in (("attitudes", attitudes), ("directions", directions)):
+        if state is not None and len(measurements.tai_ns) and measurements.tai_ns[0] < state.tai_ns:
             expected = f"must be no earlier than the state, {state.tai_ns}"
-            raise BadInput(Fault(f"{name}.tai_ns[0]", expected, str(int(given.tai_ns[0]))))
+            raise BadInput(Fault(f"{name}.tai_ns[0]", expected, str(int(measurements.tai_ns[0]))))
     a, d = len(attitudes.tai_ns), len(directions.tai_ns)
     times = np.concatenate([attitudes.tai_ns, directions.tai_ns])
     kind = np.repeat(np.array([ATTITUDE, DIRECTION]), [a, d])

@@ -111,8 +111,8 @@ def no_directions() -> DirectionMeasurements:
     return DirectionMeasurements(np.zeros(0, dtype=np.int64), empty, empty, np.zeros(0))
 
 
-def _set_times(given: Any, name: str, strictly: bool = False) -> None:
-    times = np.asarray(given.tai_ns)
+def _set_times(record: Any, name: str, strictly: bool = False) -> None:
+    times = np.asarray(record.tai_ns)
     field = f"{name}.tai_ns"
     if times.ndim != 1 or times.dtype.kind not in "iu":
         expected = "must be whole nanoseconds in an array of one dimension"
@@ -122,21 +122,21 @@ def _set_times(given: Any, name: str, strictly: bool = False) -> None:
     wrong = np.append(False, steps <= 0 if strictly else steps < 0)[: len(times)]
     later = "later than" if strictly else "no earlier than"
     _refuse(field, wrong, f"must be {later} the one before", times)
-    object.__setattr__(given, "tai_ns", read_only(times))
+    object.__setattr__(record, "tai_ns", read_only(times))
 
 
-def _set(given: Any, name: str, field: str, shape: tuple[int, ...]) -> None:
+def _set(record: Any, name: str, field: str, shape: tuple[int, ...]) -> None:
     """Keep a copy of an array, checked for shape and for numbers."""
-    shown, expected = f"{name}.{field}", (len(given.tai_ns), *shape)
+    shown, expected = f"{name}.{field}", (len(record.tai_ns), *shape)
     try:
-        values = np.array(getattr(given, field), dtype=np.float64)
+        values = np.array(getattr(record, field), dtype=np.float64)
     except (TypeError, ValueError):
         raise BadInput(Fault(shown, "must be an array of numbers")) from None
     if values.shape != expected:
         raise BadInput(Fault(shown, f"must have the shape {expected}", str(values.shape)))
     bad = ~np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
     _refuse(shown, bad, "must be finite numbers", values)
-    object.__setattr__(given, field, read_only(values))
+    object.__setattr__(record, field, read_only(values))
 
 
 def _check_units(name: str, field: str, vectors: Vector) -> None:

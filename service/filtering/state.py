@@ -81,8 +81,8 @@ class FilterState:
     @staticmethod
     def from_record(record: dict[str, Any]) -> "FilterState":
         """The state of a record that `as_record` made."""
-        given: dict[str, Any] = {
+        values: dict[str, Any] = {
             name: read_only(np.array(value, dtype=np.float64)) if isinstance(value, list) else value
             for name, value in record.items()
         }
-        return FilterState(**{**given, "status": Status[record["status"]]})
+        return FilterState(**{**values, "status": Status[record["status"]]})

@@ -199,8 +199,8 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     both = np.empty((2, count, 3))
     observed, reference = both[0], both[1]
     sigma = np.empty(count)
-    given = direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
-    match(*given, observed, reference, sigma)
+    stars = direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
+    match(*stars, observed, reference, sigma)
     return observed, reference, sigma
 
 

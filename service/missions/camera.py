@@ -181,9 +181,9 @@ class Camera(Strict):
 
         The root of the mean of the variances along two tangent axes: half the trace.
         """
-        here = self.directions(u_px, v_px)
-        along_u = self.directions(u_px + 1.0, v_px) - here
-        along_v = self.directions(u_px, v_px + 1.0) - here
+        direction = self.directions(u_px, v_px)
+        along_u = self.directions(u_px + 1.0, v_px) - direction
+        along_v = self.directions(u_px, v_px + 1.0) - direction
         variance = np.sum(along_u**2, axis=1) * sigma_u_px**2
         variance += np.sum(along_v**2, axis=1) * sigma_v_px**2
         return np.asarray(np.sqrt(variance / 2.0) * ARCSEC_PER_RADIAN)

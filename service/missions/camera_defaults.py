@@ -30,20 +30,20 @@ def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
         return table
     camera = dict(camera)
     try:
-        focal_px, told = _focal_px(camera)
+        focal_px, scale_key = _focal_px(camera)
         width, height = float(camera["width_px"]), float(camera["height_px"])
         if not (min(width, height) >= 16 and 10 <= focal_px < 1e8):
             raise ValueError
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
         # Refused in the mission's own words.
         return {**table, "trackers": [{"name": "CAMERA", "camera": camera}]} | {"camera": camera}
-    exact = told == "focal_length_px"
+    exact = scale_key == "focal_length_px"
     room = 1.0 if exact else ROOM
     radius_deg = math.degrees(math.atan(0.5 * math.hypot(width, height) / focal_px * 1.05)) * room
     short_deg = 2.0 * math.degrees(math.atan(0.5 * min(width, height) / focal_px))
     long_deg = 2.0 * math.degrees(math.atan(0.5 * max(width, height) / focal_px))
     pixel_deg = math.degrees(1.0 / focal_px)
-    limit_mag = _limit_mag(short_deg * long_deg) if told else UNKNOWN_LIMIT_MAG
+    limit_mag = _limit_mag(short_deg * long_deg) if scale_key else UNKNOWN_LIMIT_MAG
     rest = {key: value for key, value in table.items() if key != "camera"}
     return {
         "zone": {
@@ -98,12 +98,12 @@ def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:
         return float(camera["focal_length_px"]), "focal_length_px"
     if "focal_length_mm" in camera or "pixel_um" in camera:
         return 1000.0 * float(camera["focal_length_mm"]) / float(camera["pixel_um"]), "focal_mm"
-    told = "field_of_view_deg" if "field_of_view_deg" in camera else None
+    scale_key = "field_of_view_deg" if "field_of_view_deg" in camera else None
     field_deg = float(camera.get("field_of_view_deg", UNKNOWN_FIELD_DEG))
     if not 0.0 < field_deg < 150.0:
         raise ValueError
     side = max(float(camera["width_px"]), float(camera["height_px"]))
-    return 0.5 * side / math.tan(math.radians(0.5 * field_deg)), told
+    return 0.5 * side / math.tan(math.radians(0.5 * field_deg)), scale_key
 
 
 def _limit_mag(field_deg2: float) -> float:

@@ -350,8 +350,8 @@ class Mission(Strict):
 def parse_mission(text: str, file: str) -> Mission:
     """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
     try:
-        told = with_camera_defaults(tomllib.loads(text))
-        return Mission.model_validate(told, context=beside(file))
+        table = with_camera_defaults(tomllib.loads(text))
+        return Mission.model_validate(table, context=beside(file))
     except tomllib.TOMLDecodeError as error:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:

@@ -171,23 +171,23 @@ def linearised(
 
     Parameters are the small rotation about the camera's axes, then those of `lens_of`.
     """
-    here = lens_of(lens, names, free)
+    trial = lens_of(lens, names, free)
     body = star @ attitude.T
     x, y = (body[:, :2] / body[:, 2:]).T
-    plane = here.plane(u_px, v_px)
-    residual = (plane - np.column_stack([x, y])) * here.focal_px
+    plane = trial.plane(u_px, v_px)
+    residual = (plane - np.column_stack([x, y])) * trial.focal_px
     turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
-    columns = [here.focal_px * np.array(each) for each in turns]
+    columns = [trial.focal_px * np.array(each) for each in turns]
     # In pixels of one focal length: else a longer one would make all residuals longer.
-    columns.append(here.focal_px * plane.T)
+    columns.append(trial.focal_px * plane.T)
     if len(names) > 1:
-        center_u, center_v = here.center_px
-        across, down = (u_px - center_u) / here.radius_px, (v_px - center_v) / here.radius_px
+        center_u, center_v = trial.center_px
+        across, down = (u_px - center_u) / trial.radius_px, (v_px - center_v) / trial.radius_px
         square = across**2 + down**2
-        columns.append(-here.radius_px * square * np.array([across, down]))
+        columns.append(-trial.radius_px * square * np.array([across, down]))
     if len(names) > 2:
-        both = 2.0 * here.bend * across * down
-        along = 1.0 + here.bend * square + 2.0 * here.bend * np.array([across**2, down**2])
-        columns.append(here.radius_px * np.array([along[0], both]))
-        columns.append(here.radius_px * np.array([both, along[1]]))
+        both = 2.0 * trial.bend * across * down
+        along = 1.0 + trial.bend * square + 2.0 * trial.bend * np.array([across**2, down**2])
+        columns.append(trial.radius_px * np.array([along[0], both]))
+        columns.append(trial.radius_px * np.array([both, along[1]]))
     return residual.ravel(), np.stack([column.T.ravel() for column in columns], axis=1)

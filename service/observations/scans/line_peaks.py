@@ -12,8 +12,8 @@ def line_peaks(sums: Vector, threshold: float) -> Vector:
     line are the place of none.
     """
     padded = np.concatenate([[-np.inf], sums, [-np.inf]])
-    before, here, after = padded[:-2], padded[1:-1], padded[2:]
-    at = np.flatnonzero((here > threshold) & (here > before) & (here >= after))
+    before, middle, after = padded[:-2], padded[1:-1], padded[2:]
+    at = np.flatnonzero((middle > threshold) & (middle > before) & (middle >= after))
     # Maxima without a valley between them are one star and its noise.
     kept: list[int] = []
     for line in at.tolist():
@@ -26,6 +26,6 @@ def line_peaks(sums: Vector, threshold: float) -> Vector:
 
 
 def _fine(sums: Vector, at: int) -> float:
-    before, here, after = sums[at - 1 : at + 2]
-    bend = before - 2.0 * here + after
+    before, middle, after = sums[at - 1 : at + 2]
+    bend = before - 2.0 * middle + after
     return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0
