@@ -8,20 +8,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.jit import njit_no_refcount
-from service.filtering.filter import noise_of
-from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING, UNCHECKED
-from service.filtering.gyro import ConstantRateModel, GyroModel
-from service.filtering.matrices import (
+from service.attitude.covariance import (
     cholesky,
     congruence,
     copy,
     multiply_transposed,
     solve_factored,
 )
+from service.attitude.quaternions import rotation_between, turn
+from service.compiled.jit import njit_no_refcount
+from service.filtering.filter import noise_of
+from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING, UNCHECKED
+from service.filtering.gyro import ConstantRateModel, GyroModel
 from service.filtering.propagation import predict, workspace
 from service.filtering.result import AttitudeHistory, FilterResult
-from service.filtering.rotations import rotation_between, turn
 from service.vectors import read_only
 
 

@@ -13,12 +13,11 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from service.attitude.rotations import rotation_vectors
 from service.filtering.result import AttitudeHistory, FilterResult, Integers
 from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Outcome
 from service.filtering.updates import ATTITUDE
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""

@@ -7,10 +7,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from service.attitude.kernels import TASTE, FitWorkspace, fit_attitude
-from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import (
+from service.attitude.solution import (
     METHODS,
     WORST_AXIS_RAD,
+    AttitudeSolution,
+    NoAttitude,
     solution_of,
     taste_bound,
     tracker_fits,

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.attitude.solution import AttitudeSolution
-from service.attitude.solve import solve_attitude
+from service.attitude.solution import AttitudeSolution, solve_attitude
 from service.filtering.samples import AttitudeMeasurements
 from service.filtering.state import Status
 from service.vectors import ARCSEC_PER_RADIAN, unit

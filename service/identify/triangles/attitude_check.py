@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit
 from service.identify.hypotheses.fitting import fit_match
 from service.identify.hypotheses.local_search import LARGEST_GATE_RAD

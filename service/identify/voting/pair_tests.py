@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.identify.budget import COMPARISONS_PER_UNIT
 from service.identify.identification import Outcome
