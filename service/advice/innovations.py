@@ -32,8 +32,8 @@ from service.advice.statements import FileChange, Statement
 from service.advice.trackers import NoiseFinding
 from service.filtering.state import Outcome
 from service.grades.innovations import MeasuredInnovations, full_matrices
-from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings
 from service.vectors import Vector
 
 MOST = 20_000

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, fields
 
 from service.errors import BadInput, Fault, shown_value
-from service.missions.gyro import FIRST_BIAS_RAD_S, LARGEST_RATE_DEG_PER_S, RATE_RAD_S
+from service.missions.motion import FIRST_BIAS_RAD_S, LARGEST_RATE_DEG_PER_S, RATE_RAD_S
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from service.filtering.samples import (
 )
 from service.grades.innovations import full_matrices
 from service.gyro import Nanoseconds
-from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings, MotionSettings
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 LONGEST_GAP_S = 600.0

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from service.errors import BadInput, Fault, shown_value
-from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings
 from service.simulate.telemetry import DrawnBatch
 from service.times import Utc, parse_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors

@@ -12,8 +12,12 @@ from service.filtering.samples import (
 )
 from service.grades.day import grade_day
 from service.grades.stretches import Recorded
-from service.missions.gyro import GyroSettings, MotionSettings
-from service.missions.tracking import LiveFilterSettings, SmoothingSettings
+from service.missions.motion import (
+    GyroSettings,
+    LiveFilterSettings,
+    MotionSettings,
+    SmoothingSettings,
+)
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import START_NS
 

@@ -1,4 +1,4 @@
-"""A batch of scanning trackers as one of measured angles.
+"""A batch of scanning trackers as one of measured angles, and the Sun of a sun tracker.
 
 The record keeps what was sent; angles and sigmas are made of it with the settings of the
 mission, as often as it is read.
@@ -20,10 +20,9 @@ from service.observations.batch import (
     TrackerStars,
 )
 from service.observations.focal_plane import tracker_vectors
-from service.observations.scans.cross_scan import cross_scan
-from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.lines import BREAKDOWN_RATIO, cross_scan
 from service.observations.scans.raster import raster_stars
-from service.vectors import Vector, read_only, rotate_about
+from service.vectors import Vector, read_only, rotate_about, unit
 
 _GIVES = {CrossScan: "counts", Sweep: "times", Raster: "lines"}
 _FIELDS = {"counts": "h_counts", "times": "h_times"}
@@ -217,3 +216,33 @@ def crossing_of(times: Vector, scan: Sweep, field: str) -> Crossing:
     angles_deg = scan.start_deg + scan.rate_deg_per_s * seconds - wires_deg
     sigma_deg = scan.rate_deg_per_s * scan.time_sigma_s / math.sqrt(len(times))
     return Crossing(float(angles_deg.mean()), float(seconds.mean()), 3600.0 * sigma_deg)
+
+
+def sun_body(counts: Vector, mission: Mission, field: str) -> Vector:
+    """The unit vector (3,) to the Sun in body axes.
+
+    `counts` are I+ and I- of the pair along the tracker's X, then of that along Y.  Raises
+    `BadBatch` naming `field` for a mission without a sun tracker, for pairs without light, and
+    for signals beyond their straight part.
+    """
+    tracker = mission.sun_tracker
+    if tracker is None:
+        raise BadBatch(Fault(field, f"the mission file of {mission.name} has no sun_tracker"))
+    limit = tracker.slope_per_arcmin * tracker.straight_to_arcmin
+    plane = []
+    for axis, (plus, minus) in zip(
+        "XY", (counts - tracker.background_counts).reshape(2, 2), strict=True
+    ):
+        light = float(plus + minus)
+        if light < BREAKDOWN_RATIO * math.sqrt(2.0) * tracker.noise_counts:
+            message = f"the pair along {axis} has no sunlight: its light is below the noise"
+            raise BadBatch(Fault(field, message, shown_value(light)))
+        signal = float(plus - minus) / light
+        if abs(signal) > limit:
+            message = (
+                f"the signal along {axis} is beyond {limit:.3g}: the Sun is farther off than "
+                f"{tracker.straight_to_arcmin:g} arcmin, where the signal is not straight"
+            )
+            raise BadBatch(Fault(field, message, shown_value(signal)))
+        plane.append(math.tan(math.radians(signal / tracker.slope_per_arcmin / 60.0)))
+    return unit(tracker.body_from_tracker @ np.array([*plane, 1.0]))
