@@ -19,17 +19,25 @@ from service.filtering.forward import (
     Track,
     run_filter,
 )
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.propagation import Noise, Timeline, workspace
-from service.filtering.result import AttitudeHistory, FilterResult, Innovations, Steps
-from service.filtering.samples import (
+from service.filtering.inputs import (
     AttitudeMeasurements,
+    ConstantRateModel,
     DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
     GyroSamples,
     no_attitudes,
     no_directions,
 )
-from service.filtering.state import FilterState, Status
+from service.filtering.propagation import Noise, Timeline, workspace
+from service.filtering.result import (
+    AttitudeHistory,
+    FilterResult,
+    FilterState,
+    Innovations,
+    Status,
+    Steps,
+)
 from service.filtering.updates import ATTITUDE, DIRECTION, Measured
 from service.filtering.updates import Innovations as WrittenInnovations
 from service.vectors import Vector, read_only

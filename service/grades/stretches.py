@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.samples import (
+from service.filtering.inputs import (
     LARGEST_SIGMA_RAD,
     AttitudeMeasurements,
+    ConstantRateModel,
     DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
     GyroSamples,
 )
 from service.grades.innovations import full_matrices

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from service.attitude.quaternions import rotation_between, turn
 from service.filtering.filter import noise_of
-from service.filtering.gyro import GyroModel
+from service.filtering.inputs import GyroModel
 from service.filtering.propagation import bias_shift, predict, transition, workspace
 from service.vectors import matrix_from_quaternion
 

@@ -4,10 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.filtering.gyro import GyroModel
-from service.filtering.samples import (
+from service.filtering.inputs import (
     AttitudeMeasurements,
     DirectionMeasurements,
+    GyroModel,
     no_directions,
 )
 from service.grades.day import grade_day

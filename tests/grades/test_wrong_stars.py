@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.attitude.solution import AttitudeSolution, solve_attitude
-from service.filtering.samples import AttitudeMeasurements
-from service.filtering.state import Status
+from service.filtering.inputs import AttitudeMeasurements
+from service.filtering.result import Status
 from service.vectors import ARCSEC_PER_RADIAN, unit
 from tests.chance import at_least, at_most
 from tests.filtering.simulated import ARCSEC, gyro_of, slews, squares, truth_of

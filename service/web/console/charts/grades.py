@@ -5,9 +5,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from service.filtering.gyro import FilterSettings
-from service.filtering.result import Integers
-from service.filtering.state import Status
+from service.filtering.inputs import FilterSettings
+from service.filtering.result import Integers, Status
 from service.grades.innovations import MeasuredInnovations
 from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
