@@ -12,7 +12,7 @@ from service.identify.hypotheses.ledger import at_bound, keep, known, left_unexp
 from service.identify.hypotheses.local_search import NEGLIGIBLE
 from service.identify.hypotheses.scene import polar_difference, within_bounds
 from service.identify.sighting import PRIOR_ROTATION
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 
 class ObservedPair(NamedTuple):

@@ -26,7 +26,7 @@ from service.identify.hypotheses.scene import (
     Progress,
     with_magnitude,
 )
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 SHORT_PAIR_RAD = math.radians(0.35)
 CHANCE_PER_STAR, CHANCE_MARGIN = math.log(3.0), 12.0

@@ -16,7 +16,7 @@ from service.identify.budget import COMPARISONS_PER_UNIT
 from service.identify.identification import Outcome
 from service.identify.sighting import bounds_at, sighted_at
 from service.identify.voting.fov_rotation import rotation_rad
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
