@@ -15,8 +15,7 @@ from msgspec import structs
 from service.compiled.jit import njit
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import weigh
-from service.identify.hypotheses.ledger import LEAST_GROUP
-from service.identify.hypotheses.marginals import RIVAL_PROBABILITY
+from service.identify.hypotheses.ledger import LEAST_GROUP, RIVAL_PROBABILITY
 from service.identify.hypotheses.scene import (
     ObservedStars,
     ZoneStars,
