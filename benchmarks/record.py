@@ -45,9 +45,7 @@ IMAGING = (
     "service/imaging",
     "studies/star_image_report",
     "studies/documents.py",
-    "service/observations/scans/profile.py",
-    "service/observations/scans/cross_scan.py",
-    "service/observations/scans/line_peaks.py",
+    "service/observations/scans/lines.py",
 )
 SERVICE = ("service", "catalogs/stars.npz")
 

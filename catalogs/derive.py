@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from service.sky.catalog.neighbours import nearest_neighbours
-from service.sky.catalog.proper_motion import moved
+from service.sky.catalog.star_catalog import moved
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, to_ra_dec
 
 LIMIT_MAG = 9.0

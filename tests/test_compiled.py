@@ -14,9 +14,8 @@ from numba.core.errors import NumbaError
 
 from service.attitude.covariance import information
 from service.attitude.quest import quest
-from service.compiled.inner import _BitcodeLibrary
-from service.compiled.jit import njit, njit_no_refcount
-from service.compiled.views import borrowed_view
+from service.compiled.arrays import borrowed_view
+from service.compiled.jit import _BitcodeLibrary, njit, njit_no_refcount
 from service.identify.voting.fov_rotation import rotation_rad
 from service.vectors import unit
 

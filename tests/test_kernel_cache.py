@@ -19,7 +19,7 @@ import service
 from service.acquire.kernel_build import KernelBuild, mark_built
 from service.compiled.cache import SOURCES
 from service.compiled.checked_file import content_of
-from service.compiled.inner import Kernel
+from service.compiled.jit import Kernel
 from tests.scale import size
 
 PACKAGE = Path(service.__file__).parent

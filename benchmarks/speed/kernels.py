@@ -21,7 +21,7 @@ from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from benchmarks.speed.bare import bare_many, bare_one, room_for
 from service.attitude.kernels import QUEST, solve
-from service.attitude.solve import WORST_AXIS_DEG
+from service.attitude.solution import WORST_AXIS_DEG
 from service.compiled.jit import njit
 from service.identify.attitude_from_matches import attitude_of, match
 from service.identify.budget import MAX_WORK

@@ -21,7 +21,7 @@ from benchmarks.report import Report
 from service.acquire import Acquisition, acquire
 from service.compiled.jit import njit
 from service.identify.budget import MAX_WORK
-from service.identify.hypotheses.marginals import marginals
+from service.identify.hypotheses.ledger import marginals
 from service.identify.hypotheses.scene import ObservedStars, ledger_for, scratch_for
 from service.identify.hypotheses.search import search
 from service.identify.hypotheses.verified import UNIQUE_PROBABILITY

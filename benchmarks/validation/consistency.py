@@ -20,8 +20,7 @@ from benchmarks.bounds import Bound, at_most, every, mean_as_expected, share_as_
 from benchmarks.record import CORE
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.attitude.solution import AttitudeSolution
-from service.attitude.solve import solve_attitude
+from service.attitude.solution import AttitudeSolution, solve_attitude
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec
 
 Array = npt.NDArray[np.float64]

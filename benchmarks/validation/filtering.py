@@ -18,7 +18,7 @@ from benchmarks.bounds import Bound, at_least, at_most, between
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import FilterSettings, GyroModel
+from service.filtering.inputs import FilterSettings, GyroModel
 from service.filtering.result import AttitudeHistory
 from service.filtering.smoother import smooth
 from tests import chance

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from service.identify.blind.lens import Lens, LensFit
+from service.identify.blind.lens import Lens, LensFit, shared_variance_px2, simpler_fit
 from service.identify.blind.solver import (
     WIDEST_FIELD_DEG,
     BlindResult,
@@ -16,7 +16,6 @@ from service.identify.blind.solver import (
     FocalRange,
     rotation_between,
 )
-from service.identify.blind.systematics import shared_variance_px2, simpler_fit
 from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified
 from service.imaging.detection.points import (
     FIRST_THRESHOLD,

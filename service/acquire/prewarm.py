@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.acquire import acquire
-from service.filtering.compiling import compile_filtering
+from service.filtering.smoother import compile_filtering
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.imaging.frames.jpeg import compile_walk
 from service.missions.identifiers import IDENTIFIERS

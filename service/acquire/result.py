@@ -8,8 +8,7 @@ import numpy as np
 from msgspec import Struct
 
 from service.acquire.choices import Choices, idle_options, impossible_tests
-from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import taste_bound
+from service.attitude.solution import AttitudeSolution, NoAttitude, taste_bound
 from service.identify.identification import (
     MAX_RIVALS,
     Identification,

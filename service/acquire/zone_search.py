@@ -12,8 +12,7 @@ from msgspec import Struct
 
 from service.acquire.choices import Choices
 from service.acquire.result import Place
-from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import METHODS, WORST_AXIS_RAD
+from service.attitude.solution import METHODS, WORST_AXIS_RAD, AttitudeSolution, NoAttitude
 from service.errors import AcquisitionError
 from service.identify.attitude_from_matches import fit_sightings, room_for_fits, with_tracker_fits
 from service.identify.budget import WorkBudget

@@ -30,10 +30,10 @@ import numpy.typing as npt
 from service.advice.intervals import Interval
 from service.advice.statements import FileChange, Statement
 from service.advice.trackers import NoiseFinding
-from service.filtering.state import Outcome
+from service.filtering.result import Outcome
 from service.grades.innovations import MeasuredInnovations, full_matrices
-from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings
 from service.vectors import Vector
 
 MOST = 20_000

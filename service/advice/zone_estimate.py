@@ -19,8 +19,7 @@ from service.advice.zone_size import geometric_k_g
 from service.missions.mission import Band, Mission
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.pairs import PAIRS_PER_BIN
-from service.sky.geometry.star_buckets import BUCKETS_PER_STAR
-from service.sky.geometry.star_voxels import REACH_RAD
+from service.sky.geometry.star_hashes import BUCKETS_PER_STAR, REACH_RAD
 from service.vectors import Vector, to_ra_dec
 
 RINGS = 4

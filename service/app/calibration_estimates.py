@@ -36,9 +36,8 @@ from service.calibration.stars import IdentifiedStars, joined
 from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
 from service.ingest.submit import SubmissionService
-from service.missions.corrections import AS_MEASURED, Magnitudes
-from service.missions.corrections import Calibration as FocalPlaneSettings
-from service.missions.mission import Mission, Tracker
+from service.missions.mission import AS_MEASURED, Magnitudes, Mission, Tracker
+from service.missions.mission import Calibration as FocalPlaneSettings
 from service.observations.batch import ObservationBatch
 from service.storage import calibrations
 from service.storage.queries.pages import ResultFilter

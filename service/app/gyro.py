@@ -5,8 +5,8 @@ from collections.abc import Callable
 from service.app.context import Context, known_id
 from service.gyro import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
-from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import mission_named
+from service.missions.motion import largest_rate_deg_per_s
 from service.storage import gyro as blocks
 from service.storage.models.base import Page
 from service.storage.models.spacecraft import GyroBlockRow, GyroSamples

@@ -165,8 +165,8 @@ def fit_attitude(b, r, sigma_rad, worst_rad, chosen, workspace):  # type: ignore
         workspace.covariance_arcsec2,
         workspace.figures,
     )
-    given = b, r, weights, worst_rad, chosen
-    if not solve(*given, quaternions, covariance, squares, sums, scratch):
+    problem = b, r, weights, worst_rad, chosen
+    if not solve(*problem, quaternions, covariance, squares, sums, scratch):
         return False
     to_matrix(quaternions[chosen], workspace.attitude)
     for i in range(3):

@@ -20,8 +20,7 @@ from pydantic import ValidationError
 from service.calibration.elimination import NotObservable
 from service.calibration.stars import Indices
 from service.errors import BadInput, Fault
-from service.missions.corrections import AS_MEASURED, Magnitudes
-from service.missions.mission import Tracker
+from service.missions.mission import AS_MEASURED, Magnitudes, Tracker
 from service.vectors import Matrix, Vector
 
 ZERO, SCALE, COLOR = "magnitude zero", "magnitude scale", "magnitude colour"

@@ -10,8 +10,7 @@ from numpy.polynomial.legendre import leg2poly
 from service.calibration.estimate import Calibration
 from service.calibration.unknowns import SKEW, STRETCH, Unknown
 from service.errors import BadConfiguration
-from service.missions.corrections import Magnitudes
-from service.missions.mission import Mission, Tracker, parse_mission
+from service.missions.mission import Magnitudes, Mission, Tracker, parse_mission
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, rotate_about
 
 AXES = ("x_axis_body", "y_axis_body", "z_axis_body")

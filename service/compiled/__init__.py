@@ -1,1 +1,1 @@
-"""Everything about numba: how kernels are compiled, views without owners, the kernel cache."""
+"""Everything about numba: how kernels are compiled, arrays in them, the kernel cache."""

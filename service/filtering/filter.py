@@ -19,17 +19,25 @@ from service.filtering.forward import (
     Track,
     run_filter,
 )
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.propagation import Noise, Timeline, workspace
-from service.filtering.result import AttitudeHistory, FilterResult, Innovations, Steps
-from service.filtering.samples import (
+from service.filtering.inputs import (
     AttitudeMeasurements,
+    ConstantRateModel,
     DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
     GyroSamples,
     no_attitudes,
     no_directions,
 )
-from service.filtering.state import FilterState, Status
+from service.filtering.propagation import Noise, Timeline, workspace
+from service.filtering.result import (
+    AttitudeHistory,
+    FilterResult,
+    FilterState,
+    Innovations,
+    Status,
+    Steps,
+)
 from service.filtering.updates import ATTITUDE, DIRECTION, Measured
 from service.filtering.updates import Innovations as WrittenInnovations
 from service.vectors import Vector, read_only
@@ -120,10 +128,10 @@ def _order(
     gyro: GyroSamples,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
     """Kind and row of the measurements within the gyro's samples, in order of time."""
-    for name, given in (("attitudes", attitudes), ("directions", directions)):
-        if state is not None and len(given.tai_ns) and given.tai_ns[0] < state.tai_ns:
+    for name, measurements in (("attitudes", attitudes), ("directions", directions)):
+        if state is not None and len(measurements.tai_ns) and measurements.tai_ns[0] < state.tai_ns:
             expected = f"must be no earlier than the state, {state.tai_ns}"
-            raise BadInput(Fault(f"{name}.tai_ns[0]", expected, str(int(given.tai_ns[0]))))
+            raise BadInput(Fault(f"{name}.tai_ns[0]", expected, str(int(measurements.tai_ns[0]))))
     a, d = len(attitudes.tai_ns), len(directions.tai_ns)
     times = np.concatenate([attitudes.tai_ns, directions.tai_ns])
     kind = np.repeat(np.array([ATTITUDE, DIRECTION]), [a, d])

@@ -3,11 +3,11 @@
 import math
 from typing import Any, NamedTuple
 
+from service.attitude.covariance import cholesky, copy, solve_factored
+from service.attitude.quaternions import rotation_between, turn
 from service.compiled.jit import njit_no_refcount
-from service.filtering.matrices import cholesky, copy, solve_factored
 from service.filtering.propagation import bias_shift, predict
-from service.filtering.rotations import rotation_between, turn
-from service.filtering.state import Outcome, Status
+from service.filtering.result import Outcome, Status
 from service.filtering.updates import (
     ATTITUDE,
     add_curvature,

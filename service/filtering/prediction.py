@@ -1,9 +1,9 @@
 """From one attitude to a later one: by gyro samples, or at a rate that is believed constant.
 
-A rotation vector theta turns an attitude as in `rotations`: A' = exp(-[theta x]) A.  The rate of
-a body without a gyro is a random walk of density q (rad/s^1.5), so that after t seconds the
-angle has the variance q^2 t^3 / 3 where the rate is known at the beginning, and q^2 t^3 / 12
-where the mean of the rates at both ends is used.
+A rotation vector theta turns an attitude as in `attitude.quaternions`: A' = exp(-[theta x]) A.
+The rate of a body without a gyro is a random walk of density q (rad/s^1.5), so that after t
+seconds the angle has the variance q^2 t^3 / 3 where the rate is known at the beginning, and
+q^2 t^3 / 12 where the mean of the rates at both ends is used.
 """
 
 import math
@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.filtering.gyro import GyroModel
-from service.filtering.samples import GyroSamples
+from service.filtering.inputs import GyroModel, GyroSamples
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.attitude.covariance import congruence
 from service.compiled.jit import njit_no_refcount
-from service.filtering.matrices import congruence
 
 SERIES_BELOW = 0.1
 """Radians in a step, below which the differences of the closed form lose digits."""

@@ -8,21 +8,29 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.jit import njit_no_refcount
-from service.filtering.filter import noise_of
-from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING, UNCHECKED
-from service.filtering.gyro import ConstantRateModel, GyroModel
-from service.filtering.matrices import (
+from service.attitude.covariance import (
     cholesky,
     congruence,
     copy,
     multiply_transposed,
     solve_factored,
 )
+from service.attitude.quaternions import rotation_between, turn
+from service.compiled.jit import njit_no_refcount
+from service.filtering.filter import filter_attitude, noise_of
+from service.filtering.forward import DOUBTFUL, GOOD, LOST, NONE, STARTING, UNCHECKED
+from service.filtering.inputs import (
+    AttitudeMeasurements,
+    ConstantRateModel,
+    DirectionMeasurements,
+    GyroModel,
+    GyroSamples,
+)
 from service.filtering.propagation import predict, workspace
 from service.filtering.result import AttitudeHistory, FilterResult
-from service.filtering.rotations import rotation_between, turn
 from service.vectors import read_only
+
+_STEP_NS = 10**9
 
 
 class Filtered(NamedTuple):
@@ -184,3 +192,18 @@ def settle(filtered, smoothed):  # type: ignore[no-untyped-def]
             confirmed = True
         if status not in (NONE, LOST):
             smoothed.status[k] = DOUBTFUL if lasting else GOOD if confirmed else STARTING
+
+
+def compile_filtering() -> None:
+    """Compile the kernels by filtering and smoothing three seconds of rest."""
+    model = GyroModel(sigma_v_rad_s0_5=1e-6, sigma_u_rad_s1_5=1e-9)
+    tai_ns = np.arange(4, dtype=np.int64) * _STEP_NS
+    gyro = GyroSamples(tai_ns, np.zeros((4, 3)))
+    attitudes = AttitudeMeasurements(
+        tai_ns[:2], np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)), np.tile(np.eye(3) * 1e-10, (2, 1, 1))
+    )
+    x_axis = np.tile([1.0, 0.0, 0.0], (2, 1))
+    directions = DirectionMeasurements(tai_ns[2:], x_axis, x_axis, np.full(2, 1e-5))
+    result = filter_attitude(model, gyro, attitudes, directions)
+    assert result.innovations.accepted[1:].all()
+    smooth(result, model)

@@ -7,10 +7,9 @@ attitude to the measured one; of a direction, its two parts across the predicted
 import math
 from typing import Any, NamedTuple
 
-from service.attitude.quaternions import to_matrix
+from service.attitude.covariance import cholesky, congruence, solve_factored
+from service.attitude.quaternions import rotation_between, to_matrix
 from service.compiled.jit import njit_no_refcount
-from service.filtering.matrices import cholesky, congruence, solve_factored
-from service.filtering.rotations import rotation_between
 
 ATTITUDE, DIRECTION = 0, 1
 """Kinds of measurements."""

@@ -17,10 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel
-from service.filtering.result import FilterResult
-from service.filtering.samples import GyroSamples
-from service.filtering.state import FilterState
+from service.filtering.inputs import ConstantRateModel, GyroSamples
+from service.filtering.result import FilterResult, FilterState
 from service.grades.day import WARM_UP_S, GradedSamples, Model, samples_of
 from service.grades.stretches import (
     LONGEST_GAP_S,

@@ -13,10 +13,9 @@ import numpy as np
 
 from service.errors import BadInput, Fault
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel
-from service.filtering.result import AttitudeHistory, FilterResult, Integers
+from service.filtering.inputs import ConstantRateModel
+from service.filtering.result import AttitudeHistory, FilterResult, Integers, Outcome, Status
 from service.filtering.smoother import smooth
-from service.filtering.state import Outcome, Status
 from service.grades.innovations import UPPER, MeasuredInnovations, TimedColumns, innovations_of
 from service.grades.stretches import Mask, Recorded, Stretch, cut
 from service.missions.mission import Mission
@@ -39,7 +38,7 @@ STEP_NS = 10**9
 MOST_SAMPLES = 4_000_000
 """The most samples of a day with its surroundings: 30 Hz, all in memory at 1 kB each."""
 OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
-"""The outcomes of a measurement; see `filtering.state.Outcome`."""
+"""The outcomes of a measurement; see `filtering.result.Outcome`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +48,7 @@ class GradedSamples(TimedColumns):
     `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `covariance_arcsec2` (n, 6) of the small
     error rotation about the body axes (11, 12, 13, 22, 23, 33), `rate_deg_per_s` (n, 3) of the
     body in the step that ends at the sample, `bias_deg_per_h` (n, 3) of the gyro and
-    `bias_sigma_deg_per_h` (n, 3); `status` (n,) is a `filtering.state.Status`.  At a constant
+    `bias_sigma_deg_per_h` (n, 3); `status` (n,) is a `filtering.result.Status`.  At a constant
     rate there is no bias, and the sigma is that of the rate.
     """
 
@@ -74,7 +73,7 @@ class GradedStretch:
 class GradedDay:
     """The stretches of a day, and what became of what was recorded.
 
-    `measurements` counts by the names of `filtering.state.Outcome`, and `unusable` and `alone`
+    `measurements` counts by the names of `filtering.result.Outcome`, and `unusable` and `alone`
     ones; `gyro` counts samples, gaps and those beyond the largest rate.  `nis_per_degree` is
     the mean of z^T S^-1 z of the accepted measurements by their degrees of freedom: about 1.
     """

@@ -13,12 +13,10 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from service.attitude.rotations import rotation_vectors
-from service.filtering.result import AttitudeHistory, FilterResult, Integers
-from service.filtering.samples import AttitudeMeasurements
-from service.filtering.state import Outcome
+from service.filtering.inputs import AttitudeMeasurements
+from service.filtering.result import AttitudeHistory, FilterResult, Integers, Outcome
 from service.filtering.updates import ATTITUDE
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
 """Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""
@@ -54,7 +52,7 @@ class TimedColumns:
 class MeasuredInnovations(TimedColumns):
     """The innovations of m measured attitudes, in order of time; equal times are allowed.
 
-    `tai_ns` (m,) and `outcome` (m,), a `filtering.state.Outcome`.  About the body axes in
+    `tai_ns` (m,) and `outcome` (m,), a `filtering.result.Outcome`.  About the body axes in
     arcsec: `innovation_arcsec` (m, 3) with its covariance `predicted_arcsec2` (m, 6), the upper
     triangle 11, 12, 13, 22, 23, 33, and `nis` (m,) z^T S^-1 z of three degrees of freedom, which
     are NaN of a measurement that met no prediction; `measured_arcsec2` (m, 6) of the

@@ -9,17 +9,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.samples import (
+from service.filtering.inputs import (
     LARGEST_SIGMA_RAD,
     AttitudeMeasurements,
+    ConstantRateModel,
     DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
     GyroSamples,
 )
 from service.grades.innovations import full_matrices
 from service.gyro import Nanoseconds
-from service.missions.gyro import GyroSettings, MotionSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings, MotionSettings
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 LONGEST_GAP_S = 600.0

@@ -7,10 +7,11 @@ import numpy as np
 from msgspec.structs import replace
 
 from service.attitude.kernels import TASTE, FitWorkspace, fit_attitude
-from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import (
+from service.attitude.solution import (
     METHODS,
     WORST_AXIS_RAD,
+    AttitudeSolution,
+    NoAttitude,
     solution_of,
     taste_bound,
     tracker_fits,
@@ -199,8 +200,8 @@ def matched_vectors(  # type: ignore[no-untyped-def]
     both = np.empty((2, count, 3))
     observed, reference = both[0], both[1]
     sigma = np.empty(count)
-    given = direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
-    match(*given, observed, reference, sigma)
+    stars = direction_body, sigma_rad, star, catalog_direction, velocity, sun_distance_au
+    match(*stars, observed, reference, sigma)
     return observed, reference, sigma
 
 

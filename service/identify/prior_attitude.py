@@ -20,7 +20,7 @@ from service.observations.batch import (
     QuaternionPrior,
     SunPointedPrior,
 )
-from service.observations.scans.sun import sun_body
+from service.observations.scans.reduce import sun_body
 from service.sky.ephemeris import ecliptic_north, sun_direction
 from service.sky.zones import SearchRegion
 from service.times import Utc

@@ -14,9 +14,8 @@ from sqlalchemy import Connection
 from service.errors import BadInput
 from service.filtering import prediction
 from service.grades.stretches import believed, gyro_samples
-from service.missions.gyro import MotionSettings
 from service.missions.mission import Mission
-from service.missions.tracking import TrackingSettings
+from service.missions.motion import MotionSettings, TrackingSettings
 from service.observations.batch import ObservationBatch
 from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
 from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes

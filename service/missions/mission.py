@@ -26,17 +26,19 @@ from pydantic import (
 )
 
 from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
-from service.missions.camera import Camera
-from service.missions.camera_defaults import with_camera_defaults
-from service.missions.corrections import AS_MEASURED, Calibration, Magnitudes
-from service.missions.gyro import GyroSettings, MotionSettings
+from service.missions.camera import Camera, with_camera_defaults
 from service.missions.identifiers import IDENTIFIERS
+from service.missions.motion import (
+    GyroSettings,
+    LiveFilterSettings,
+    MotionSettings,
+    SmoothingSettings,
+    TrackingSettings,
+)
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
-from service.missions.scan import Scan
+from service.missions.scan import Scan, SunTracker
 from service.missions.strict import Components, Direction, Strict, is_missing
-from service.missions.sun_tracker import SunTracker
-from service.missions.tracking import LiveFilterSettings, SmoothingSettings, TrackingSettings
 from service.vectors import Matrix, Vector, read_only, unit
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -182,6 +184,33 @@ class RunCatalogSettings(Strict):
     def epoch_of(self, julian_year: float) -> float:
         """The epoch, in Julian years, of the run catalog that serves a time."""
         return round(julian_year / self.epoch_step_years) * self.epoch_step_years
+
+
+class Calibration(Strict):
+    """Focal-plane calibration: measured angles to true ones.
+
+    With u, v the measured `h_deg`, `v_deg`, each true angle is
+    scale (measured + sum of coefficient u^i v^j) over terms [i, j, coefficient].
+    """
+
+    scale: float = Field(default=1.0, gt=0.5, lt=2)
+    h_terms: tuple[tuple[int, int, float], ...] = ()
+    v_terms: tuple[tuple[int, int, float], ...] = ()
+
+
+class Magnitudes(Strict):
+    """Calibration of a tracker's magnitudes: measured ones to those of the run catalog.
+
+    The magnitude of a star is zero_mag + scale * measured.  The run catalog has V, plus the
+    polynomial of the mission's `catalog`, plus (B-V) times the mean `color_mag` of the trackers.
+    """
+
+    zero_mag: float = Field(default=0.0, ge=-30, le=30)
+    scale: float = Field(default=1.0, gt=0.5, lt=2)
+    color_mag: float = Field(default=0.0, ge=-2, le=2)
+
+
+AS_MEASURED = Magnitudes()
 
 
 class Tracker(Strict):
@@ -350,8 +379,8 @@ class Mission(Strict):
 def parse_mission(text: str, file: str) -> Mission:
     """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
     try:
-        told = with_camera_defaults(tomllib.loads(text))
-        return Mission.model_validate(told, context=beside(file))
+        table = with_camera_defaults(tomllib.loads(text))
+        return Mission.model_validate(table, context=beside(file))
     except tomllib.TOMLDecodeError as error:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
     except ValidationError as error:

@@ -182,8 +182,8 @@ class PacketMeasurement(Strict):
 
     @model_validator(mode="after")
     def _one_accuracy(self) -> Self:
-        given = (self.sigma, self.covariance, self.sigma_arcsec)
-        if sum(each is not None for each in given) != 1:
+        accuracies = (self.sigma, self.covariance, self.sigma_arcsec)
+        if sum(each is not None for each in accuracies) != 1:
             raise ValueError("needs one of sigma, covariance and sigma_arcsec")
         return self
 

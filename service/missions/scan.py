@@ -1,17 +1,21 @@
-"""A scanning tracker: how its times and counts stand for angles.
+"""Scanning trackers and sun trackers: how times, counts and signals stand for angles.
 
-Three kinds, after the report on star images: samples along a line through each star
-(`cross`, 7.2 to 7.5), the times at which a star crosses wires (`sweep`), and the sums of the
-lines of a raster (`raster`, 7.8).  The angles are those of a batch's `h_deg` and `v_deg`, as
-measured: the tracker's calibration applies to them.
+A scanning tracker is of three kinds, after the report on star images: samples along a line
+through each star (`cross`, 7.2 to 7.5), the times at which a star crosses wires (`sweep`), and
+the sums of the lines of a raster (`raster`, 7.8).  The angles are those of a batch's `h_deg` and
+`v_deg`, as measured: the tracker's calibration applies to them.  A sun tracker has two pairs of
+detectors on the tails of the sun's cross (5.3).
 """
 
+from functools import cached_property
 from itertools import pairwise
 from typing import Annotated, Literal, Self
 
+import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from service.missions.strict import Strict
+from service.missions.strict import Components, Strict
+from service.vectors import Matrix, read_only
 
 MOST_SAMPLES, MOST_WIRES, MOST_LINES = 1001, 16, 8192
 WIDEST_DEG = 89.0
@@ -126,3 +130,35 @@ class Raster(_Detector):
 
 
 Scan = Annotated[CrossScan | Sweep | Raster, Field(discriminator="kind")]
+
+
+class SunTracker(Strict):
+    """Where it looks in the body, and how its two signals grow with the sun's displacement.
+
+    A pair with the counts I+ and I- gives the signal (I+ - I-) / (I+ + I-); the first pair that
+    of the displacement towards the tracker's +X, the second towards +Y.
+    """
+
+    x_axis_body: Components
+    y_axis_body: Components
+    z_axis_body: Components
+    """The tracker's axes in body components; +Z is where both signals are zero."""
+    slope_per_arcmin: float = Field(gt=0, le=100)
+    straight_to_arcmin: float = Field(gt=0, le=600)
+    """As far as this the signals are straight; a larger one is refused."""
+    background_counts: float = Field(default=0.0, ge=0, le=1e9)
+    """Taken off each detector."""
+    noise_counts: float = Field(gt=0, le=1e9)
+    """One standard deviation of a detector; a pair whose light is below 5 of its sum has no sun."""
+
+    @model_validator(mode="after")
+    def _axes_are_right_handed(self) -> Self:
+        axes = self.body_from_tracker
+        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4) or np.linalg.det(axes) < 0:
+            raise ValueError("the three axes must be a right-handed set of unit vectors")
+        return self
+
+    @cached_property
+    def body_from_tracker(self) -> Matrix:
+        """The alignment (3, 3): body components = this @ tracker components."""
+        return read_only(np.column_stack([self.x_axis_body, self.y_axis_body, self.z_axis_body]))

@@ -13,8 +13,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from service.compiled.jit import njit, njit_no_refcount
-from service.missions.corrections import Magnitudes
-from service.missions.mission import Mission, Tracker
+from service.missions.mission import Magnitudes, Mission, Tracker
 from service.observations.batch import ObservationBatch
 from service.observations.columns import BatchColumns, Integers, joined, offsets_of
 from service.observations.focal_plane import true_tangents

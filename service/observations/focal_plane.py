@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.missions.corrections import Calibration
+from service.missions.mission import Calibration
 from service.vectors import Vector, unit
 
 

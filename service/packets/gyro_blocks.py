@@ -9,8 +9,8 @@ from typing import Any
 import msgspec
 
 from service.errors import shown_value
-from service.missions.gyro import largest_rate_deg_per_s
 from service.missions.mission import Mission
+from service.missions.motion import largest_rate_deg_per_s
 from service.packets.batches import counted_change
 from service.packets.clock import NS, Moment, finite, moment_of, whole
 from service.packets.definition import PacketFault

@@ -15,10 +15,9 @@ from typing import Any, Literal, Self
 import numpy as np
 import numpy.typing as npt
 
-from service.attitude.rotations import rotation_vectors
 from service.errors import BadBatch, Fault, shown_value
 from service.missions import product_settings
-from service.vectors import Vector
+from service.vectors import Vector, rotation_vectors
 
 Integers = npt.NDArray[np.int64]
 Texts = npt.NDArray[np.object_]

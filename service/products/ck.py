@@ -16,11 +16,10 @@ from pathlib import Path
 import erfa
 import numpy as np
 
-from service.attitude.rotations import matrices
 from service.errors import AcquisitionError, BadConfiguration
 from service.products import attitudes
 from service.products.spool import folder, pieces
-from service.vectors import Vector
+from service.vectors import Vector, attitude_matrices
 
 CHILD_S = 600.0
 """The longest that the child may take."""
@@ -82,7 +81,7 @@ def _records(part: attitudes.AttitudeBlock) -> Vector:
     ticks = clock_ticks(part.time_ns)[:, None]
     vector, scalar = part.quaternion[:, :3], part.quaternion[:, 3:]
     rate = np.radians(np.nan_to_num(part.rate_deg_per_s))
-    inertial = np.einsum("nji,nj->ni", matrices(part.quaternion), rate)
+    inertial = np.einsum("nji,nj->ni", attitude_matrices(part.quaternion), rate)
     return np.concatenate([ticks, scalar, -vector, inertial], axis=1)
 
 

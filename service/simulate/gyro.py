@@ -12,13 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from service.attitude.rotations import rotation_vectors
 from service.errors import BadInput, Fault, shown_value
-from service.missions.gyro import GyroSettings
 from service.missions.mission import Mission
+from service.missions.motion import GyroSettings
 from service.simulate.telemetry import DrawnBatch
 from service.times import Utc, parse_utc, shifted
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 
 SAMPLES_OF_A_BLOCK = 1_000
 GAP_AT, CLOCK_STEP_AT = 0.4, 0.7

@@ -21,10 +21,14 @@ from service.observations.calibrate import measured_magnitudes
 from service.observations.focal_plane import measured_angles_deg
 from service.simulate.motion import across, random_axis, turned_by
 from service.simulate.stretches import Stretch
-from service.sky.catalog.blending import Rows, merged_into
-from service.sky.catalog.proper_motion import moved
-from service.sky.catalog.run_catalog import J2000_YEAR, RunCatalog, instrument_magnitude
-from service.sky.catalog.star_catalog import Catalog
+from service.sky.catalog.run_catalog import (
+    J2000_YEAR,
+    Rows,
+    RunCatalog,
+    instrument_magnitude,
+    merged_into,
+)
+from service.sky.catalog.star_catalog import Catalog, moved
 from service.sky.ephemeris import KM_PER_AU, apparent
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about, unit

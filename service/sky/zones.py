@@ -21,9 +21,14 @@ from msgspec import Struct
 from service.compiled.jit import njit
 from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.geometry.pairs import PairIndex, build_pairs, separation_rad
-from service.sky.geometry.star_buckets import StarBuckets, build_star_buckets
-from service.sky.geometry.star_voxels import Bits, build_star_voxels
+from service.sky.geometry.directions import separation_rad
+from service.sky.geometry.pairs import PairIndex, build_pairs
+from service.sky.geometry.star_hashes import (
+    Bits,
+    StarBuckets,
+    build_star_buckets,
+    build_star_voxels,
+)
 from service.vectors import (
     Vector,
     angle_between_deg,

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from service.sky.planets import PLANETS, Planet, planet_place
+from service.sky.ephemeris import PLANETS, Planet, planet_place
 from service.tracks.extending import GATE
 from service.tracks.gathering import Batches, Indices, Points
 from service.tracks.linking import Link, Motion, fit_motion, link

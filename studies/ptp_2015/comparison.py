@@ -19,10 +19,9 @@ from service.sky.geometry.triangles import REACH_DEG
 from service.sky.whole_sky.guide import Guide, build_guide
 from studies.ptp_2015.projections import Projections, projections_of
 from studies.ptp_2015.rivals.liebe import build_liebe
-from studies.ptp_2015.rivals.p_vector import build_p_vector
 from studies.ptp_2015.rivals.planar_triangle import build_planar_triangle
+from studies.ptp_2015.rivals.projected_triangles import build_p_vector, build_ptp
 from studies.ptp_2015.rivals.proposed import Algorithm, Build
-from studies.ptp_2015.rivals.ptp import build_ptp
 from studies.ptp_2015.rivals.pyramid import build_pyramid
 from studies.ptp_2015.tally import COLUMNS, LIMIT_MAG, Case, Tally
 from studies.workers import mapping

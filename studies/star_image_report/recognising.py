@@ -11,7 +11,7 @@ import numpy.typing as npt
 from service.errors import BadInput, Fault
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Array
-from service.observations.scans.line_peaks import line_peaks
+from service.observations.scans.lines import line_peaks
 from service.sky.catalog.star_catalog import load_embedded
 from service.vectors import ARCSEC_PER_RADIAN, unit
 from studies.star_image_report.claims import Claim, Picture, Row, Study

@@ -10,8 +10,7 @@ import numpy.typing as npt
 from service.errors import BadInput, Fault
 from service.imaging.centroids.window import Array
 from service.imaging.optics import disc, image_by_fft
-from service.observations.scans.cross_scan import cross_scan, mean_of_scans
-from service.observations.scans.profile import ProfileMoment, moment
+from service.observations.scans.lines import ProfileMoment, cross_scan, mean_of_scans, moment
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
 

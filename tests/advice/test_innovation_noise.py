@@ -10,8 +10,7 @@ from service.advice.innovations import LEAST, InnovationNoise, innovation_findin
 from service.advice.intervals import Interval
 from service.advice.trackers import NoiseFinding
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import GyroModel
-from service.filtering.samples import AttitudeMeasurements
+from service.filtering.inputs import AttitudeMeasurements, GyroModel
 from service.filtering.smoother import smooth
 from service.grades.innovations import innovations_of
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.attitude.solve import solve_attitude
+from service.attitude.solution import solve_attitude
 from tests.reference.batches import quaternion_matrix, random_quaternion
 
 ARCSEC = 206264.80624709636

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from service.attitude.solve import METHODS, taste_bound
+from service.attitude.solution import METHODS, taste_bound
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.attitude.cases import field_of_stars, random_attitude, seen, solved
 from tests.chance import assert_chi_square, at_least, at_most

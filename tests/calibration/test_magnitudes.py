@@ -22,8 +22,7 @@ from service.calibration.magnitudes import (
 from service.calibration.mission_file import calibrated_mission_text
 from service.calibration.stars import joined as joined_stars
 from service.calibration.unknowns import Model
-from service.missions.corrections import Magnitudes
-from service.missions.mission import parse_mission
+from service.missions.mission import Magnitudes, parse_mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass

@@ -14,9 +14,13 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial.transform import Rotation
 
-from service.filtering.gyro import GyroModel
+from service.filtering.inputs import (
+    AttitudeMeasurements,
+    DirectionMeasurements,
+    GyroModel,
+    GyroSamples,
+)
 from service.filtering.result import AttitudeHistory
-from service.filtering.samples import AttitudeMeasurements, DirectionMeasurements, GyroSamples
 from service.vectors import read_only
 
 Array = npt.NDArray[np.float64]

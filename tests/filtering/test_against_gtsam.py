@@ -6,7 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import GyroModel
+from service.filtering.inputs import GyroModel
 from service.filtering.smoother import smooth
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.filtering.test_filter import CASES

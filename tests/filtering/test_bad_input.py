@@ -5,9 +5,15 @@ import pytest
 
 from service.errors import BadInput
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
+from service.filtering.inputs import (
+    AttitudeMeasurements,
+    ConstantRateModel,
+    DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
+    GyroSamples,
+)
 from service.filtering.result import joined
-from service.filtering.samples import AttitudeMeasurements, DirectionMeasurements, GyroSamples
 
 TIMES = np.arange(4, dtype=np.int64) * 10**9
 RATES = np.zeros((4, 3))

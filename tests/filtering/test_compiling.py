@@ -2,13 +2,11 @@
 
 import numpy as np
 
-from service.filtering.compiling import compile_filtering
 from service.filtering.filter import filter_attitude
 from service.filtering.forward import run_filter
-from service.filtering.gyro import ConstantRateModel, GyroModel
+from service.filtering.inputs import ConstantRateModel, GyroModel, GyroSamples
 from service.filtering.result import joined
-from service.filtering.samples import GyroSamples
-from service.filtering.smoother import run_smoother, settle, smooth
+from service.filtering.smoother import compile_filtering, run_smoother, settle, smooth
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
 
 

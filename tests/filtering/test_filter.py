@@ -8,10 +8,15 @@ from scipy.linalg import solve_discrete_are
 from scipy.spatial.transform import Rotation
 
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel, FilterSettings, GyroModel
-from service.filtering.result import joined
-from service.filtering.samples import AttitudeMeasurements, DirectionMeasurements, GyroSamples
-from service.filtering.state import FilterState, Status
+from service.filtering.inputs import (
+    AttitudeMeasurements,
+    ConstantRateModel,
+    DirectionMeasurements,
+    FilterSettings,
+    GyroModel,
+    GyroSamples,
+)
+from service.filtering.result import FilterState, Status, joined
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from tests.chance import assert_chi_square, at_least, at_most
 from tests.filtering.farrenkopf import steady_sigmas

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.filtering.gyro import GyroModel
+from service.filtering.inputs import GyroModel, GyroSamples
 from service.filtering.prediction import (
     Known,
     derived_rate,
@@ -15,7 +15,6 @@ from service.filtering.prediction import (
     predict_by_gyro,
     unknown_rate,
 )
-from service.filtering.samples import GyroSamples
 from tests.filtering.simulated import slews, truth_of
 
 MODEL = GyroModel(1e-6, 1e-9, bias_sigma_rad_s=1e-6)

@@ -5,10 +5,10 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
+from service.attitude.quaternions import rotation_between, turn
 from service.filtering.filter import noise_of
-from service.filtering.gyro import GyroModel
+from service.filtering.inputs import GyroModel
 from service.filtering.propagation import bias_shift, predict, transition, workspace
-from service.filtering.rotations import rotation_between, turn
 from service.vectors import matrix_from_quaternion
 
 NO_SHIFT = np.zeros(3)

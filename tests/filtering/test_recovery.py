@@ -8,11 +8,14 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel, FilterSettings
-from service.filtering.result import AttitudeHistory
-from service.filtering.samples import AttitudeMeasurements, GyroSamples
+from service.filtering.inputs import (
+    AttitudeMeasurements,
+    ConstantRateModel,
+    FilterSettings,
+    GyroSamples,
+)
+from service.filtering.result import AttitudeHistory, Outcome, Status
 from service.filtering.smoother import smooth
-from service.filtering.state import Outcome, Status
 from tests.chance import at_most
 from tests.filtering.simulated import (
     ARCSEC,

@@ -5,11 +5,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from service.filtering.filter import filter_attitude
-from service.filtering.gyro import ConstantRateModel, GyroModel
-from service.filtering.result import joined
-from service.filtering.samples import GyroSamples
+from service.filtering.inputs import ConstantRateModel, GyroModel, GyroSamples
+from service.filtering.result import Status, joined
 from service.filtering.smoother import smooth
-from service.filtering.state import Status
 from tests.chance import assert_chi_square
 from tests.filtering.simulated import (
     ARCSEC,

@@ -4,16 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 
-from service.filtering.gyro import GyroModel
-from service.filtering.samples import (
+from service.filtering.inputs import (
     AttitudeMeasurements,
     DirectionMeasurements,
+    GyroModel,
     no_directions,
 )
 from service.grades.day import grade_day
 from service.grades.stretches import Recorded
-from service.missions.gyro import GyroSettings, MotionSettings
-from service.missions.tracking import LiveFilterSettings, SmoothingSettings
+from service.missions.motion import (
+    GyroSettings,
+    LiveFilterSettings,
+    MotionSettings,
+    SmoothingSettings,
+)
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import START_NS
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.alarms.limits import above
-from service.filtering.samples import AttitudeMeasurements
+from service.filtering.inputs import AttitudeMeasurements
 from tests.filtering.simulated import ARCSEC
 from tests.grades.passes import NOON
 from tests.grades.records import put_pass

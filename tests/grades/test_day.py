@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.filtering.samples import AttitudeMeasurements, no_attitudes
-from service.filtering.state import Status
+from service.filtering.inputs import AttitudeMeasurements, no_attitudes
+from service.filtering.result import Status
 from service.grades.day import day_bounds, grade_day, packed, unpacked, window_of
 from service.grades.stretches import usable_attitudes
-from service.missions.gyro import GyroSettings
+from service.missions.motion import GyroSettings
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import (
     ARCSEC,

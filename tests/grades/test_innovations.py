@@ -5,8 +5,8 @@ import pytest
 from scipy.stats import chi2
 
 from service.errors import BadBatch
-from service.filtering.samples import AttitudeMeasurements
-from service.filtering.state import Outcome
+from service.filtering.inputs import AttitudeMeasurements
+from service.filtering.result import Outcome
 from service.grades.day import packed, unpacked_innovations
 from service.grades.innovations import MeasuredInnovations
 from service.storage.grades.period import latest_innovations

@@ -14,7 +14,7 @@ import pytest
 
 from service.app.live_filter import LiveFilter
 from service.errors import NotFound
-from service.filtering.samples import AttitudeMeasurements
+from service.filtering.inputs import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import grade_day, window_of
 from service.grades.stretches import attitudes_where

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from service.filtering.samples import DirectionMeasurements
-from service.filtering.state import Status
+from service.filtering.inputs import DirectionMeasurements
+from service.filtering.result import Status
 from service.vectors import ARCSEC_PER_RADIAN
 from tests.filtering.simulated import (
     ARCSEC,

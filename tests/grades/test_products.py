@@ -13,7 +13,7 @@ from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
 from service.cli import main
-from service.filtering.samples import AttitudeMeasurements
+from service.filtering.inputs import AttitudeMeasurements
 from service.products.formats import attitude_formats, write_attitudes
 from service.products.reading.aem import read_aem
 from service.times import parse_utc, shifted

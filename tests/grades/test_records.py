@@ -8,7 +8,7 @@ from sqlalchemy import func, select, update
 
 from service.cli import main
 from service.errors import NotFound
-from service.filtering.samples import AttitudeMeasurements
+from service.filtering.inputs import AttitudeMeasurements
 from service.grades.day import packed, unpacked
 from service.storage.sql.grade_tables import graded_blocks, graded_days
 from service.storage.upkeep.archiving import archive

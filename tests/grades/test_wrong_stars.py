@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.attitude.solution import AttitudeSolution
-from service.attitude.solve import solve_attitude
-from service.filtering.samples import AttitudeMeasurements
-from service.filtering.state import Status
+from service.attitude.solution import AttitudeSolution, solve_attitude
+from service.filtering.inputs import AttitudeMeasurements
+from service.filtering.result import Status
 from service.vectors import ARCSEC_PER_RADIAN, unit
 from tests.chance import at_least, at_most
 from tests.filtering.simulated import ARCSEC, gyro_of, slews, squares, truth_of

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from service.attitude.solution import AttitudeSolution, NoAttitude
-from service.attitude.solve import solve_attitude
+from service.attitude.solution import AttitudeSolution, NoAttitude, solve_attitude
 from service.identify.attitude_from_matches import attitude_of, matched_vectors
 from service.vectors import matrix_from_quaternion, read_only
 from tests.attitude.cases import ARCSEC, field_of_stars, random_attitude, seen

@@ -11,8 +11,12 @@ from service.identify.triangles.ptp import (
     observed_triangles,
     propose,
 )
-from service.identify.triangles.sharing import count_pairs, validate
-from service.identify.triangles.triangle_match import projection_sigma, side_sigma
+from service.identify.triangles.triangle_match import (
+    count_pairs,
+    projection_sigma,
+    side_sigma,
+    validate,
+)
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded

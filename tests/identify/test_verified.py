@@ -18,8 +18,7 @@ from service.identify.hypotheses.verified import identify_verified
 from service.identify.identification import Outcome
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
-from service.sky.geometry.star_buckets import build_star_buckets, nearest
-from service.sky.geometry.star_voxels import build_star_voxels
+from service.sky.geometry.star_hashes import build_star_buckets, build_star_voxels, nearest
 from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.views import EPOCH, batch_of, draw_zone

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.missions.corrections import Calibration
-from service.missions.mission import Mission
+from service.missions.mission import Calibration, Mission
 from service.observations.calibrate import correct
 from service.observations.focal_plane import tracker_vectors
 from service.observations.schema import submission_from_json

@@ -17,8 +17,7 @@ from service.observations.batch import SunPointedPrior
 from service.observations.calibrate import correct
 from service.observations.readers.csv_rows import write_batches_csv
 from service.observations.readers.telemetry import read_lines
-from service.observations.scans.reduce import reduced
-from service.observations.scans.sun import sun_body
+from service.observations.scans.reduce import reduced, sun_body
 from service.observations.schema import BatchIn, submission_from_json
 from service.simulate.sightings import readings
 from service.simulate.stretches import NO_TROUBLES, Pass

@@ -4,8 +4,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.identify.blind.lens import PARAMETERS, Lens, fit_lens, lens_of, linearised
-from service.identify.blind.systematics import shared_variance_px2, simpler_fit
+from service.identify.blind.lens import (
+    PARAMETERS,
+    Lens,
+    fit_lens,
+    lens_of,
+    linearised,
+    shared_variance_px2,
+    simpler_fit,
+)
 
 COUNT = 200
 

@@ -10,8 +10,8 @@ import zipfile
 import numpy as np
 import pytest
 
-from service.attitude.rotations import matrices
 from service.times import parse_utc
+from service.vectors import attitude_matrices
 from tests import scale
 from tests.products.series import ABOUT, GOLDEN, random_quaternions, rows, slew, whole, written
 
@@ -79,7 +79,7 @@ def test_random_attitudes_are_read_at_their_records(read, rng):
     block = whole(page)
     found = read(page, ticks=ticks_of(block))["found"]
     a = np.array([each[0] for each in found])
-    assert np.abs(a - matrices(block.quaternion)).max() < 1e-12
+    assert np.abs(a - attitude_matrices(block.quaternion)).max() < 1e-12
 
 
 def test_a_slew_is_that_of_the_body_between_records_and_its_rate_is_in_j2000(read):
@@ -88,7 +88,7 @@ def test_a_slew_is_that_of_the_body_between_records_and_its_rate_is_in_j2000(rea
     found = read(page, ticks=ticks_of(whole(page))[:-1] + 500_000)["found"]
     middles = slew(1_000, step_s=0.5, rate_deg_per_s=rate)[1:-1:2]
     a, w = (np.array([each[k] for each in found]) for k in (0, 1))
-    wanted = matrices(middles)
+    wanted = attitude_matrices(middles)
     assert np.abs(a - wanted).max() < 1e-9
     np.testing.assert_allclose(np.degrees(w), np.einsum("nji,j->ni", wanted, rate), atol=1e-9)
 
@@ -105,7 +105,9 @@ def test_intervals_are_the_stretches_and_nothing_is_found_between(read):
     spans = [ticks[a:b] for a, b in ((0, 10), (10, 13), (13, 14))]
     assert found["intervals"] == [[each[0], each[-1]] for each in spans]
     assert found["found"] == [None, None]
-    assert np.array(found["poses"][0]) == pytest.approx(matrices(block.quaternion)[13], abs=1e-15)
+    assert np.array(found["poses"][0]) == pytest.approx(
+        attitude_matrices(block.quaternion)[13], abs=1e-15
+    )
 
 
 def test_a_leap_second_is_a_second_like_any_other(read):
@@ -113,7 +115,9 @@ def test_a_leap_second_is_a_second_like_any_other(read):
     block = whole(page)
     found = read(page, utc=["2016-12-31T23:59:60", "2017-01-01T00:00:00"])
     assert found["ticks"] == pytest.approx(ticks_of(block)[5:7].tolist(), abs=0.5)
-    assert np.abs(np.array(found["matrices"]) - matrices(block.quaternion)[5:7]).max() < 1e-7
+    assert (
+        np.abs(np.array(found["matrices"]) - attitude_matrices(block.quaternion)[5:7]).max() < 1e-7
+    )
 
 
 def test_a_stretch_longer_than_a_segment_is_one_interval(read, rng):
@@ -124,9 +128,9 @@ def test_a_stretch_longer_than_a_segment_is_one_interval(read, rng):
     found = read(page, ticks=[*ticks[around], *(ticks[around] + 5e4)])
     assert found["intervals"] == [[ticks[0], ticks[-1]]]
     a = np.array([each[0] for each in found["found"]])
-    assert np.abs(a[:3] - matrices(block.quaternion[around])).max() < 1e-12
+    assert np.abs(a[:3] - attitude_matrices(block.quaternion[around])).max() < 1e-12
     middles = slew(120_002, step_s=0.05)[[2 * k + 1 for k in around]]
-    assert np.abs(a[3:] - matrices(middles)).max() < 1e-9
+    assert np.abs(a[3:] - attitude_matrices(middles)).max() < 1e-9
 
 
 CLOCK = """KPL/SCLK
@@ -156,4 +160,4 @@ def test_a_mission_s_own_clock_times_the_kernel(read, tmp_path):
     ((begin, end),) = found["intervals"]
     assert (end - begin) / 65536 == pytest.approx(99.0 / 1.00000002, abs=1e-5)
     middles = slew(200, step_s=0.5)[[1, 197]]
-    assert np.abs(np.array(found["matrices"]) - matrices(middles)).max() < 1e-8
+    assert np.abs(np.array(found["matrices"]) - attitude_matrices(middles)).max() < 1e-8

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from service.attitude.rotations import matrices
 from service.errors import BadFile
 from service.products.reading.aem import read_aem
 from service.products.reading.files import read_attitudes
 from service.times import parse_utc
+from service.vectors import attitude_matrices
 from tests import scale
 from tests.products.series import GOLDEN, START, random_quaternions, rows, slew, whole, written
 
@@ -257,4 +257,4 @@ def test_between_records_the_body_turns_at_a_constant_rate():
     known = read(written("aem", rows(slew(500))))
     middles = NOON + np.arange(499) * 10**9 + 5 * 10**8
     wanted = slew(1_000, step_s=0.5)[1:-1:2]
-    assert np.abs(matrices(known.at(middles)) - matrices(wanted)).max() < 1e-12
+    assert np.abs(attitude_matrices(known.at(middles)) - attitude_matrices(wanted)).max() < 1e-12

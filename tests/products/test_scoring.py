@@ -7,11 +7,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.attitude.rotations import turned_quaternion
 from service.cli.charts import errors_picture
 from service.products.reading.aem import read_aem
 from service.products.scoring import errors_of, histogram, statistics
-from service.vectors import ARCSEC_PER_RADIAN
+from service.vectors import ARCSEC_PER_RADIAN, turned_quaternion
 from tests.products.series import rows, series, slew, written
 
 SIGMA = np.array([1.5, 2.5, 30.0])

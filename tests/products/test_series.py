@@ -6,11 +6,16 @@ import itertools
 import numpy as np
 import pytest
 
-from service.attitude.rotations import matrices, rotation_vectors, turned_quaternion
 from service.errors import BadInput
 from service.products.attitudes import SeriesInfo
 from service.times import parse_utc, shifted
-from service.vectors import matrix_from_quaternion, rotate_about
+from service.vectors import (
+    attitude_matrices,
+    matrix_from_quaternion,
+    rotate_about,
+    rotation_vectors,
+    turned_quaternion,
+)
 from tests.products.series import ABOUT, GOLDEN, START, random_quaternions, rows, slew, whole
 
 
@@ -115,7 +120,7 @@ def test_rotation_vectors_and_matrices_are_those_of_the_conventions(rng):
     q = random_quaternions(rng, 500)
     turn = rng.normal(size=(500, 3))
     turned = turned_quaternion(q, turn)
-    a, b = matrices(q), matrices(turned)
+    a, b = attitude_matrices(q), attitude_matrices(turned)
     for k in range(500):
         np.testing.assert_allclose(a[k], matrix_from_quaternion(q[k]), atol=1e-15)
         r = rng.normal(size=3)

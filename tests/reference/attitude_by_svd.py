@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.attitude.kernels import QUEST, START, fit_attitude
-from service.attitude.solve import WORST_AXIS_RAD, fit_workspace
+from service.attitude.solution import WORST_AXIS_RAD, fit_workspace
 from service.vectors import ARCSEC_PER_RADIAN
 
 Array = npt.NDArray[np.float64]

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from service.identify.hypotheses.marginals import StarPosterior
+from service.identify.hypotheses.ledger import StarPosterior
 from service.identify.hypotheses.scene import ObservedStars, ZonePairs, ZoneStars, scene_in
 from service.identify.identification import MAX_RIVALS, Identification, room_for_identities
 from service.identify.sighting import (

@@ -6,7 +6,6 @@ import json
 import numpy as np
 import pytest
 
-from service.attitude.rotations import rotation_vectors, turned_quaternion
 from service.cli import main
 from service.errors import BadInput
 from service.gyro import block_from_line
@@ -14,7 +13,7 @@ from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass, read_objects, write_pass
 from service.times import parse_utc
-from service.vectors import ARCSEC_PER_RADIAN
+from service.vectors import ARCSEC_PER_RADIAN, rotation_vectors, turned_quaternion
 from tests.grades.passes import mission_with
 from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadInput
-from service.missions.corrections import Calibration
+from service.missions.mission import Calibration
 from service.observations.calibrate import correct
 from service.observations.focal_plane import measured_angles_deg, tracker_vectors
 from service.observations.schema import submission_from_json

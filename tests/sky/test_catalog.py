@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from service.errors import BadFile, NotFound
 from service.resources import shipped
 from service.sky.catalog.coding import COLUMNS
-from service.sky.catalog.proper_motion import moved
-from service.sky.catalog.star_catalog import Catalog, import_csv, load, load_embedded, save
+from service.sky.catalog.star_catalog import Catalog, import_csv, load, load_embedded, moved, save
 from service.vectors import angle_between_deg, from_ra_dec
 
 ARRAYS = [field.name for field in dataclasses.fields(Catalog)][2:]

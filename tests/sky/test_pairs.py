@@ -8,7 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from service.sky.geometry.pairs import build_pairs, separation_rad
+from service.sky.geometry.directions import separation_rad
+from service.sky.geometry.pairs import build_pairs
 from service.vectors import from_ra_dec
 
 

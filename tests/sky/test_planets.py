@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from service.sky.planets import PLANETS, planet_place
+from service.sky.ephemeris import PLANETS, planet_place
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
 

@@ -12,12 +12,12 @@ from scipy.spatial import cKDTree
 from service.acquire.pipeline import acquire
 from service.missions.mission import RunCatalogSettings
 from service.observations.schema import submission_from_json
-from service.sky.catalog.blending import merged_into
 from service.sky.catalog.run_catalog import (
     build_run_catalog,
     export_csv,
     export_rejected_csv,
     instrument_magnitude,
+    merged_into,
 )
 from service.sky.catalog.star_catalog import import_csv, load_embedded
 from service.times import parse_utc, shifted

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from service.sky.geometry.star_voxels import (
+from service.sky.geometry.star_hashes import (
     REACH_RAD,
     build_star_voxels,
     level_for,

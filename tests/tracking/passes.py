@@ -4,9 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from service.missions.gyro import MotionSettings
 from service.missions.mission import Band
-from service.missions.tracking import TrackingSettings
+from service.missions.motion import MotionSettings, TrackingSettings
 from service.simulate.motion import orbit_of, pointed, random_axis, turned_by
 from service.simulate.sightings import BatchScene, real_sky
 from service.simulate.stretches import Stretch

@@ -8,8 +8,8 @@ from service.app.factory import open_app
 from service.errors import BadBatch
 from service.gyro import block_from_json
 from service.ingest.reprocess import ReprocessProgress
-from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
+from service.missions.motion import GyroSettings
 from service.settings import Settings
 from service.storage.queries.results import read_result
 from service.storage.upkeep.verify import verify

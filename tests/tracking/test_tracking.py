@@ -12,8 +12,8 @@ from service.acquire import acquire
 from service.app.factory import open_app
 from service.errors import BadBatch
 from service.gyro import block_from_json
-from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
+from service.missions.motion import GyroSettings
 from service.observations.readers.csv_columns import batch_cells, batch_fields
 from service.observations.schema import (
     BatchIn,

@@ -12,8 +12,7 @@ from service.acquire import acquire
 from service.observations.schema import BatchIn, submission_from_model
 from service.simulate.sightings import BatchScene, anywhere, real_sky, shaken
 from service.simulate.stretches import Stretch
-from service.sky.ephemeris import apparent, observer_velocity
-from service.sky.planets import PLANETS, planet_place
+from service.sky.ephemeris import PLANETS, apparent, observer_velocity, planet_place
 from service.times import parse_utc, shifted
 from service.tracks.gathering import Gathering
 from service.vectors import (

@@ -16,7 +16,7 @@ import httpx
 
 from service.app.factory import App, open_app
 from service.missions.mission import load_missions
-from service.missions.tracking import LiveFilterSettings
+from service.missions.motion import LiveFilterSettings
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from service.app.factory import open_app
-from service.filtering.state import Status
+from service.filtering.result import Status
 from service.missions.mission import load_missions
 from service.times import parse_utc, shifted
 from service.vectors import matrix_from_quaternion

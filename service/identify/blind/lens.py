@@ -1,9 +1,15 @@
-"""A lens fitted to stars whose directions are known: focal length, centre, radial distortion."""
+"""A lens fitted to stars whose directions are known: focal length, centre, radial distortion.
+
+The error of a star's place averages down with the number of stars.  That of the model of
+the lens, of the catalog's epoch or of refraction does not: neighbours share it
+(`shared_variance_px2`).
+"""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from service.vectors import Matrix, Vector, rotate_about
 
@@ -17,6 +23,9 @@ PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
 """Of a lens, in the order in which they are fitted."""
 _ROUNDS = 12
 _CONVERGED = 1e-8
+NEIGHBOURS = 3
+"""Of a star, whose residuals tell what errors they share."""
+LEAST_SIGMA_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -171,23 +180,59 @@ def linearised(
 
     Parameters are the small rotation about the camera's axes, then those of `lens_of`.
     """
-    here = lens_of(lens, names, free)
+    trial = lens_of(lens, names, free)
     body = star @ attitude.T
     x, y = (body[:, :2] / body[:, 2:]).T
-    plane = here.plane(u_px, v_px)
-    residual = (plane - np.column_stack([x, y])) * here.focal_px
+    plane = trial.plane(u_px, v_px)
+    residual = (plane - np.column_stack([x, y])) * trial.focal_px
     turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
-    columns = [here.focal_px * np.array(each) for each in turns]
+    columns = [trial.focal_px * np.array(each) for each in turns]
     # In pixels of one focal length: else a longer one would make all residuals longer.
-    columns.append(here.focal_px * plane.T)
+    columns.append(trial.focal_px * plane.T)
     if len(names) > 1:
-        center_u, center_v = here.center_px
-        across, down = (u_px - center_u) / here.radius_px, (v_px - center_v) / here.radius_px
+        center_u, center_v = trial.center_px
+        across, down = (u_px - center_u) / trial.radius_px, (v_px - center_v) / trial.radius_px
         square = across**2 + down**2
-        columns.append(-here.radius_px * square * np.array([across, down]))
+        columns.append(-trial.radius_px * square * np.array([across, down]))
     if len(names) > 2:
-        both = 2.0 * here.bend * across * down
-        along = 1.0 + here.bend * square + 2.0 * here.bend * np.array([across**2, down**2])
-        columns.append(here.radius_px * np.array([along[0], both]))
-        columns.append(here.radius_px * np.array([both, along[1]]))
+        both = 2.0 * trial.bend * across * down
+        along = 1.0 + trial.bend * square + 2.0 * trial.bend * np.array([across**2, down**2])
+        columns.append(trial.radius_px * np.array([along[0], both]))
+        columns.append(trial.radius_px * np.array([both, along[1]]))
     return residual.ravel(), np.stack([column.T.ravel() for column in columns], axis=1)
+
+
+def shared_variance_px2(
+    u_px: Vector, v_px: Vector, residual_px: Vector, variance_px2: float
+) -> float:
+    """The variance per axis, in square pixels, of errors that the stars (n) may share.
+
+    The mean product of the residuals (n, 2) of neighbours, and beside it what so few stars
+    do not show: `variance_px2` of the residuals over the root of n.
+    """
+    places = np.column_stack([u_px, v_px])
+    _, near = cKDTree(places).query(places, k=min(NEIGHBOURS + 1, len(u_px)))
+    products = (residual_px[:, None, :] * residual_px[near[:, 1:]]).sum(axis=-1)
+    return max(0.5 * float(products.mean()), 0.0) + variance_px2 / math.sqrt(len(u_px))
+
+
+def simpler_fit(
+    fit: LensFit, u_px: Vector, v_px: Vector, star: Vector, residual_px: Vector
+) -> LensFit | None:
+    """The fit to stars (n, 3) without the lens's last parameters; None if it has a scale alone.
+
+    How far its attitude lies from that of the whole fit tells how much the terms of the lens
+    matter; those that are in no fit are not taken to matter less.
+    """
+    if fit.parameters == FREE_SCALE:
+        return None
+    fewer = FREE_SCALE if fit.parameters == SCALE_BEND else SCALE_BEND
+    bend = fit.lens.bend if fewer == SCALE_BEND else 0.0
+    start = replace(fit.lens, bend=bend, off_u=0.0, off_v=0.0)
+    sigma = max(math.sqrt(float(np.mean(residual_px**2))), LEAST_SIGMA_PX)
+    off = np.hypot(*residual_px.T)
+    usual = max(2.0 * float(np.median(off)), LEAST_SIGMA_PX)
+    return fit_lens(
+        *(start, fit.attitude, u_px, v_px, np.full(len(u_px), sigma), star, fewer),
+        weight=1.0 / (1.0 + (off / usual) ** 2),
+    )

@@ -182,15 +182,15 @@ class _Search:
             fits = (chord * lens.focal_px < wide * most_px) & (
                 chord * lens.focal_px > narrow * least_px
             )
-            here = np.flatnonzero(fits)
-            if len(here) == 0:
+            fitting = np.flatnonzero(fits)
+            if len(fitting) == 0:
                 continue
             level = self.solver.level(radius_deg)
-            self.patterns += len(here)
-            found = level.tree.query_ball_point(code[here], tolerance)
+            self.patterns += len(fitting)
+            found = level.tree.query_ball_point(code[fitting], tolerance)
             for k in np.flatnonzero([len(rows) > 0 for rows in found]).tolist():
-                quad = quads[here[k]]
-                focal_px = lens.focal_px * chord[here[k]] / level.chord[found[k]]
+                quad = quads[fitting[k]]
+                focal_px = lens.focal_px * chord[fitting[k]] / level.chord[found[k]]
                 within = (focal_px > 0.97 * least_px) & (focal_px < 1.03 * most_px)
                 for row, length in zip(
                     np.asarray(found[k])[within], focal_px[within].tolist(), strict=True

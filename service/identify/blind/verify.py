@@ -262,9 +262,9 @@ def matched(points: Points, u_px: Vector, v_px: Vector, gate_px: float) -> tuple
     """Stars and points that are each other's nearest, within a gate."""
     apart = (points.u_px[:, None] - u_px) ** 2 + (points.v_px[:, None] - v_px) ** 2
     star_of, point_of = apart.argmin(axis=1), apart.argmin(axis=0)
-    here = np.arange(len(star_of))
-    good = (point_of[star_of] == here) & (apart[here, star_of] < gate_px**2)
-    return star_of[good], here[good]
+    rows = np.arange(len(star_of))
+    good = (point_of[star_of] == rows) & (apart[rows, star_of] < gate_px**2)
+    return star_of[good], rows[good]
 
 
 def _weighed(

@@ -14,7 +14,7 @@ from service.compiled.jit import njit_no_refcount
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.scene import with_magnitude
 from service.identify.sighting import PRIOR_ROTATION
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 LEAST_SINE2 = 4e-10
 """Of the angle between the widest pair, four times its squared sine: 2 arcsec."""

@@ -15,8 +15,7 @@ from msgspec import structs
 from service.compiled.jit import njit
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.fitting import weigh
-from service.identify.hypotheses.ledger import LEAST_GROUP
-from service.identify.hypotheses.marginals import RIVAL_PROBABILITY
+from service.identify.hypotheses.ledger import LEAST_GROUP, RIVAL_PROBABILITY
 from service.identify.hypotheses.scene import (
     ObservedStars,
     ZoneStars,
@@ -146,8 +145,8 @@ def first_share(log_weight: float, other_log_weight: float, stars: int) -> float
     """
     difference = log_weight - other_log_weight
     noise = NOISE_SIGMAS * math.sqrt(3.0 * stars)
-    told = math.copysign(max(abs(difference) - noise, 0.0), difference)
-    return 1.0 / (1.0 + math.exp(min(-told, 700.0)))
+    significant = math.copysign(max(abs(difference) - noise, 0.0), difference)
+    return 1.0 / (1.0 + math.exp(min(-significant, 700.0)))
 
 
 def log_weight_of_group(

@@ -13,7 +13,7 @@ from service.identify.hypotheses.fitting import (
 )
 from service.identify.hypotheses.ledger import is_part, keep, known, spent
 from service.identify.hypotheses.scene import Progress, within_bounds
-from service.sky.geometry.star_buckets import nearest
+from service.sky.geometry.star_hashes import nearest
 
 MATCH_GATE = 34.0
 """In sigmas: how far a star may lie from where a hypothesis's attitude puts it."""

@@ -24,8 +24,7 @@ from service.identify.hypotheses.scene import (
     within_bounds,
 )
 from service.identify.sighting import PRIOR_DIRECTION
-from service.sky.geometry.star_buckets import nearest
-from service.sky.geometry.star_voxels import level_for, star_within_reach
+from service.sky.geometry.star_hashes import level_for, nearest, star_within_reach
 
 MAX_THIRDS = 8
 """So many stars, those that a pair fixes best, are tried with it where all together do not fit."""

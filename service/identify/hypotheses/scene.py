@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.compiled.jit import njit, njit_no_refcount
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 MAX_HYPOTHESES = 2048
 """Kept of a search, a power of two; lighter ones are only added up."""

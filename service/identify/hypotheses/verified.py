@@ -7,10 +7,10 @@ posterior (`search`, `evidence`); a star is unique from a probability of
 
 import numpy as np
 
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit, njit_no_refcount
 from service.identify.hypotheses.evidence import log_sum
-from service.identify.hypotheses.marginals import StarPosterior, marginals
+from service.identify.hypotheses.ledger import StarPosterior, marginals
 from service.identify.hypotheses.mirror import (
     LOG_MIRRORED,
     in_a_mirror,

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from service.attitude.triad import triad
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit
 from service.identify.lost_in_space import posterior
 from service.identify.lost_in_space.matching import faintest_star, nearest_stars, refine

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.attitude.solution import NoAttitude
+from service.compiled.arrays import borrowed_view
 from service.compiled.jit import njit
-from service.compiled.views import borrowed_view
 from service.identify.lost_in_space import decision, posterior
 from service.identify.lost_in_space.observations import FieldBounds, Points
 from service.identify.lost_in_space.pair_order import magnitude_gate

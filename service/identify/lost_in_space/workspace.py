@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.compiled.arrays import view_into
 from service.compiled.jit import njit
-from service.compiled.views import view_into
 from service.identify.lost_in_space.observations import Points
 
 LEDGER = 12

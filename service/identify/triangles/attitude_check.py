@@ -11,14 +11,13 @@ import math
 
 import numpy as np
 
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit
 from service.identify.hypotheses.fitting import fit_match
 from service.identify.hypotheses.local_search import LARGEST_GATE_RAD
 from service.identify.hypotheses.scene import scratch_for
-from service.sky.geometry.axes import axes_across
-from service.sky.geometry.pairs import separation_rad
-from service.sky.geometry.star_buckets import nearest
+from service.sky.geometry.directions import axes_across, separation_rad
+from service.sky.geometry.star_hashes import nearest
 
 CHORD_SIGMAS = 4.0
 """Two proposals agree where their separations do within so many standard deviations."""

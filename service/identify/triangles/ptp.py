@@ -20,12 +20,13 @@ from service.identify.hypotheses.scene import ObservedStars, ZoneStars
 from service.identify.identification import Identification, Outcome
 from service.identify.sighting import Sighting
 from service.identify.triangles.attitude_check import check_attitude
-from service.identify.triangles.sharing import count_pairs, validate
 from service.identify.triangles.triangle_match import (
     MAX_MATCHES,
     ImageTriangles,
+    count_pairs,
     guide_triangles,
     match_triangles,
+    validate,
 )
 from service.sky.geometry.triangles import (
     TriangleIndex,

@@ -147,16 +147,16 @@ def _group_of(v, near, least, star, start, neighbour, group, work):  # type: ign
 
 
 @njit(nogil=True, inline="always")
-def _common(some, others, out):  # type: ignore[no-untyped-def]
+def _common(ones, others, out):  # type: ignore[no-untyped-def]
     """Write what two ascending lists share; how many."""
     count = i = j = 0
-    while i < len(some) and j < len(others):
-        if some[i] < others[j]:
+    while i < len(ones) and j < len(others):
+        if ones[i] < others[j]:
             i += 1
-        elif some[i] > others[j]:
+        elif ones[i] > others[j]:
             j += 1
         else:
-            out[count] = some[i]
+            out[count] = ones[i]
             count += 1
             i += 1
             j += 1

@@ -10,13 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.copying import copy_rows
+from service.compiled.arrays import copy_rows
 from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.identify.budget import COMPARISONS_PER_UNIT
 from service.identify.identification import Outcome
 from service.identify.sighting import bounds_at, sighted_at
 from service.identify.voting.fov_rotation import rotation_rad
-from service.sky.geometry.pairs import separation_rad
+from service.sky.geometry.directions import separation_rad
 
 UNMATCHED, UNIQUE, AMBIGUOUS = (int(outcome) for outcome in Outcome)
 

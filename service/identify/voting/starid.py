@@ -86,9 +86,9 @@ def _tally_groups(
     sighted, bounds = sighted_at(seen, s), bounds_at(seen, s)
     rulebook = Rulebook(rules.limits, rules.switches, COMPARISONS_PER_UNIT * left)
     polar = polar_angles(zone.arrays.polar, stars, bounds, rulebook)
-    given = sighted, zone.arrays, polar, bounds, rulebook
+    comparison = sighted, zone.arrays, polar, bounds, rulebook
     ballots = ballots_for(n, stars)
-    compared = cast_votes(*given, ballots)
+    compared = cast_votes(*comparison, ballots)
     # For the edges of groups they are compared again.
     left = max(0, left - 2 * compared // COMPARISONS_PER_UNIT)
     bounded = compared > rulebook.max_comparisons
@@ -98,7 +98,7 @@ def _tally_groups(
         bounded = True
     else:
         again = ballots_for(n, stars, cast)
-        cast_votes(*given, again)
+        cast_votes(*comparison, again)
         bounded, nodes = keep_largest_groups(ballots.votes, again.edges, NODES_PER_UNIT * left)
         left -= nodes // NODES_PER_UNIT
     tallies = tallies_of(found, first, last)

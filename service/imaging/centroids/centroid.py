@@ -18,7 +18,7 @@ from service.imaging.centroids.moments import by_moments, is_blended
 from service.imaging.centroids.psf import Psf
 from service.imaging.centroids.sequential import diffuse
 from service.imaging.centroids.window import Window, brightest_pixel, square_about
-from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.lines import BREAKDOWN_RATIO
 
 Method = Literal["window", "scan", "matched", "recursive"]
 METHODS: Sequence[Method] = ("window", "scan", "matched", "recursive")

@@ -21,7 +21,7 @@ from service.imaging.centroids.record import (
 )
 from service.imaging.centroids.shape_fit import Fit, fit
 from service.imaging.centroids.window import Array, Region, Window, symmetric_square_about
-from service.observations.scans.profile import BREAKDOWN_RATIO, ProfileMoment, moment
+from service.observations.scans.lines import BREAKDOWN_RATIO, ProfileMoment, moment
 
 MOST_MOVES = 10
 MOST_SHARE = 0.9

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.lines import BREAKDOWN_RATIO
 
 
 class Flag(StrEnum):

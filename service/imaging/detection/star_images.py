@@ -21,7 +21,7 @@ from service.imaging.detection.cosmic_rays import is_sharp
 from service.imaging.detection.star_image import PsfAt, reach_px, still_psf
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera
-from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.lines import BREAKDOWN_RATIO
 
 ROUNDS = 4
 FAR_FWHMS = 1.2

@@ -12,8 +12,7 @@ import numpy as np
 
 from service.errors import BadBatch, Fault, shown_value
 from service.missions.scan import Raster
-from service.observations.scans.line_peaks import line_peaks
-from service.observations.scans.profile import BREAKDOWN_RATIO, moment
+from service.observations.scans.lines import BREAKDOWN_RATIO, line_peaks, moment
 from service.vectors import Vector
 
 SAME_LIGHT_SIGMAS = 4.0

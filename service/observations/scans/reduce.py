@@ -1,4 +1,4 @@
-"""A batch of scanning trackers as one of measured angles.
+"""A batch of scanning trackers as one of measured angles, and the Sun of a sun tracker.
 
 The record keeps what was sent; angles and sigmas are made of it with the settings of the
 mission, as often as it is read.
@@ -20,10 +20,9 @@ from service.observations.batch import (
     TrackerStars,
 )
 from service.observations.focal_plane import tracker_vectors
-from service.observations.scans.cross_scan import cross_scan
-from service.observations.scans.profile import BREAKDOWN_RATIO
+from service.observations.scans.lines import BREAKDOWN_RATIO, cross_scan
 from service.observations.scans.raster import raster_stars
-from service.vectors import Vector, read_only, rotate_about
+from service.vectors import Vector, read_only, rotate_about, unit
 
 _GIVES = {CrossScan: "counts", Sweep: "times", Raster: "lines"}
 _FIELDS = {"counts": "h_counts", "times": "h_times"}
@@ -61,20 +60,22 @@ def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -
     for k, reading in enumerate(stars.readings):
         if reading is None:
             continue
-        here = f"{field}.stars.{k}"
+        star_field = f"{field}.stars.{k}"
         if isinstance(tracker.scan, CrossScan) and reading.kind == "counts":
-            shift, of_scan = _of_counts(reading, tracker.scan, here)
+            shift, of_scan = _of_counts(reading, tracker.scan, star_field)
             angles[k] += shift
         elif isinstance(tracker.scan, Sweep) and reading.kind == "times":
-            angles[k], of_scan, passed_s = _of_times(reading, tracker, tracker.scan, rates, here)
+            angles[k], of_scan, passed_s = _of_times(
+                reading, tracker, tracker.scan, rates, star_field
+            )
             offset[k] += passed_s
         else:
-            raise _other_kind(tracker, f"{here}.{_FIELDS[reading.kind]}", reading.kind)
+            raise _other_kind(tracker, f"{star_field}.{_FIELDS[reading.kind]}", reading.kind)
         if not (np.abs(angles[k]) < WIDEST_DEG).all():
             h_deg, v_deg = angles[k].tolist()
             place = f"{h_deg:.4g}, {v_deg:.4g} deg from the boresight"
             message = f"is {place}: outside of any field of view"
-            raise BadBatch(Fault(here, message))
+            raise BadBatch(Fault(star_field, message))
         if math.isnan(sigma[k]):
             sigma[k] = of_scan
     return structs.replace(
@@ -87,8 +88,8 @@ def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -
 
 
 def _other_kind(tracker: Tracker, field: str, kind: str) -> BadBatch:
-    given = "no scan" if tracker.scan is None else f"a scan of the kind {tracker.scan.kind}"
-    message = f"the mission file gives {tracker.name} {given}, which has no {kind}"
+    scan = "no scan" if tracker.scan is None else f"a scan of the kind {tracker.scan.kind}"
+    message = f"the mission file gives {tracker.name} {scan}, which has no {kind}"
     return BadBatch(Fault(field, message))
 
 
@@ -96,14 +97,14 @@ def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, 
     """The displacement (2,) from the middle of the lines in deg, and its sigma in arcsec."""
     places, variance = [], scan.sigma_floor_arcsec**2
     for axis, counts in (("h", reading.h), ("v", reading.v)):
-        here = f"{field}.{axis}_counts"
+        line_field = f"{field}.{axis}_counts"
         if len(counts) != scan.samples:
             message = f"has {len(counts)} samples; a scan of the tracker has {scan.samples}"
-            raise BadBatch(Fault(here, message))
+            raise BadBatch(Fault(line_field, message))
         if scan.saturation_counts is not None and (counts >= scan.saturation_counts).any():
             at = int(np.argmax(counts))
             message = f"is full: a sample saturates at {scan.saturation_counts:g} counts"
-            raise BadBatch(Fault(f"{here}.{at}", message, str(float(counts[at]))))
+            raise BadBatch(Fault(f"{line_field}.{at}", message, str(float(counts[at]))))
         found = cross_scan(
             counts,
             scan.step_arcsec,
@@ -116,7 +117,7 @@ def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, 
                 f"holds no star: its light is {found.signal_ratio:.2f} times the noise, below "
                 f"{BREAKDOWN_RATIO:g}; leave the star out"
             )
-            raise BadBatch(Fault(here, message))
+            raise BadBatch(Fault(line_field, message))
         half_arcsec = (scan.samples // 2) * scan.step_arcsec
         if abs(found.displacement) > half_arcsec:
             message = (
@@ -124,7 +125,7 @@ def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, 
                 f"ends at {half_arcsec:g}: the level is not the {scan.background_counts:g} counts "
                 "of the mission file"
             )
-            raise BadBatch(Fault(here, message))
+            raise BadBatch(Fault(line_field, message))
         places.append(found.displacement / 3600.0)
         variance += 0.5 * found.sigma**2
     return np.array(places), math.sqrt(variance)
@@ -215,3 +216,33 @@ def crossing_of(times: Vector, scan: Sweep, field: str) -> Crossing:
     angles_deg = scan.start_deg + scan.rate_deg_per_s * seconds - wires_deg
     sigma_deg = scan.rate_deg_per_s * scan.time_sigma_s / math.sqrt(len(times))
     return Crossing(float(angles_deg.mean()), float(seconds.mean()), 3600.0 * sigma_deg)
+
+
+def sun_body(counts: Vector, mission: Mission, field: str) -> Vector:
+    """The unit vector (3,) to the Sun in body axes.
+
+    `counts` are I+ and I- of the pair along the tracker's X, then of that along Y.  Raises
+    `BadBatch` naming `field` for a mission without a sun tracker, for pairs without light, and
+    for signals beyond their straight part.
+    """
+    tracker = mission.sun_tracker
+    if tracker is None:
+        raise BadBatch(Fault(field, f"the mission file of {mission.name} has no sun_tracker"))
+    limit = tracker.slope_per_arcmin * tracker.straight_to_arcmin
+    plane = []
+    for axis, (plus, minus) in zip(
+        "XY", (counts - tracker.background_counts).reshape(2, 2), strict=True
+    ):
+        light = float(plus + minus)
+        if light < BREAKDOWN_RATIO * math.sqrt(2.0) * tracker.noise_counts:
+            message = f"the pair along {axis} has no sunlight: its light is below the noise"
+            raise BadBatch(Fault(field, message, shown_value(light)))
+        signal = float(plus - minus) / light
+        if abs(signal) > limit:
+            message = (
+                f"the signal along {axis} is beyond {limit:.3g}: the Sun is farther off than "
+                f"{tracker.straight_to_arcmin:g} arcmin, where the signal is not straight"
+            )
+            raise BadBatch(Fault(field, message, shown_value(signal)))
+        plane.append(math.tan(math.radians(signal / tracker.slope_per_arcmin / 60.0)))
+    return unit(tracker.body_from_tracker @ np.array([*plane, 1.0]))

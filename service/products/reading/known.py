@@ -7,11 +7,10 @@ from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
-from service.attitude.rotations import rotation_vectors, turned_quaternion
 from service.errors import BadFile, Fault
 from service.products.attitudes import SAME_MOMENT_NS, Integers
 from service.times import Utc
-from service.vectors import Vector
+from service.vectors import Vector, rotation_vectors, turned_quaternion
 
 MOST_RECORDS = 5_000_000
 """Attitudes that are held in memory, 40 bytes each."""

@@ -68,11 +68,11 @@ def _nearest(
     count = 4
     while waiting.size:
         chord, place = tree.query(direction[waiting], k=count, distance_upper_bound=reach)
-        there = np.isfinite(chord)
-        other = sought[np.where(there, place, 0)]
+        in_reach = np.isfinite(chord)
+        other = sought[np.where(in_reach, place, 0)]
         difference = others_magnitude[other] - magnitude[waiting, None]
         # Magnitudes are hundredths; 2.00 fainter still counts when the difference rounds up.
-        counts = there & (other != own[waiting, None]) & (difference <= fainter_by + 1e-9)
+        counts = in_reach & (other != own[waiting, None]) & (difference <= fainter_by + 1e-9)
         first = np.argmax(counts, axis=1)
         rows = np.arange(len(waiting))
         found = counts[rows, first]
@@ -81,6 +81,6 @@ def _nearest(
         distance[star] = 2.0 * np.arcsin(half) * ARCSEC_PER_RADIAN
         fainter[star] = difference[rows, first][found]
         # All candidates within reach were turned down, and there may be more of them.
-        waiting = waiting[~found & there[:, -1]]
+        waiting = waiting[~found & in_reach[:, -1]]
         count *= 4
     return distance, fainter

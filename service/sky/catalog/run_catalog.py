@@ -23,10 +23,9 @@ from erfa import ufunc
 
 from service.csv_cells import neutralised
 from service.missions.mission import RunCatalogSettings
-from service.sky.catalog.blending import Rows, combined, merged_into, pairs_within
-from service.sky.catalog.proper_motion import motion_in, moved
-from service.sky.catalog.star_catalog import Catalog
+from service.sky.catalog.star_catalog import Catalog, motion_in, moved
 from service.sky.files import Content
+from service.sky.geometry.pairs import build_pairs
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, read_only, to_ra_dec, unit
 
@@ -34,9 +33,8 @@ UNKNOWN_COLOR_BV_MAG = 0.6
 """The B-V of a star whose colour is not known: a Sun-like one, near the catalog's median."""
 
 J2000_YEAR, J2000_JD, DAYS_PER_YEAR = 2000.0, 2451545.0, 365.25
-
-
 _ARRAYS = ("ra_deg", "dec_deg", "motion", "parallax_rad", "magnitude_mag", "catalog_row")
+Rows = npt.NDArray[np.intp]
 
 
 @dataclass(frozen=True)
@@ -275,3 +273,56 @@ def _nearest_disturbing(
         counts &= difference <= fainter
         distance[counts] = np.minimum(distance[counts], apart_of_all[counts])
     return distance
+
+
+def merged_into(
+    direction: Vector,
+    magnitude: Vector,
+    light_elsewhere: npt.NDArray[np.bool_],
+    within_arcsec: float,
+) -> Rows:
+    """For every star (N,) the row of the star it is merged into: itself where it stands alone.
+
+    From the brightest down, a star that is still alone takes in every fainter
+    one that is still alone and not further than `within_arcsec` from it;
+    chains end there.  Stars whose light is elsewhere come last, so that none
+    of them leads a real one.
+    """
+    leader = np.arange(len(magnitude))
+    if within_arcsec > 0.0:
+        rank = np.empty_like(leader)
+        rank[np.lexsort((leader, magnitude, light_elsewhere))] = leader
+        pairs = pairs_within(direction, within_arcsec)
+        swap = rank[pairs[:, 0]] > rank[pairs[:, 1]]
+        pairs[swap] = pairs[swap, ::-1]
+        for first, second in pairs[np.lexsort(rank[pairs].T[::-1])]:
+            if leader[first] == first and leader[second] == second:
+                leader[second] = first
+    return leader
+
+
+def pairs_within(direction: Vector, within_arcsec: float) -> Rows:
+    """The pairs (P, 2) of rows not further apart than some arcsec."""
+    pairs = build_pairs(direction, within_arcsec / 3600.0)
+    return np.stack([pairs.brighter, pairs.dimmer], axis=1).astype(np.intp)
+
+
+def combined(
+    direction: Vector, magnitude: Vector, light_elsewhere: npt.NDArray[np.bool_], leader: Rows
+) -> tuple[Vector, Vector]:
+    """Directions (N, 3), not normalised, and magnitudes after merging.
+
+    Further columns of `direction`, such as motions, are combined alike.  A leader has
+    the light of its group and stands in the group's centre of light; every other star
+    is as it was.
+    """
+    direction, magnitude = direction.copy(), magnitude.copy()
+    lost = np.flatnonzero((leader != np.arange(len(leader))) & ~light_elsewhere)
+    group, place = np.unique(leader[lost], return_inverse=True)
+    light = 10.0 ** (-0.4 * magnitude)
+    total = light[group] + np.bincount(place, light[lost], len(group))
+    for axis in range(direction.shape[1]):
+        moment = np.bincount(place, light[lost] * direction[lost, axis], len(group))
+        direction[group, axis] = (light[group] * direction[group, axis] + moment) / total
+    magnitude[group] = -2.5 * np.log10(total)
+    return direction, magnitude

@@ -184,8 +184,8 @@ def _records(path: Path, faults: list[Fault]) -> Iterator[tuple[int, str]]:
                 if len(text) > RECORD_BYTES or len(faults) >= FAULTS_SHOWN:
                     return
     except (OSError, EOFError, zlib.error) as error:
-        said = getattr(error, "strerror", None) or error
-        raise BadFile(Fault(str(path), f"cannot be read: {said}")) from error
+        reason = getattr(error, "strerror", None) or error
+        raise BadFile(Fault(str(path), f"cannot be read: {reason}")) from error
 
 
 def _line_fault(raw: bytes, text: bytes) -> str | None:

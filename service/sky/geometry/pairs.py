@@ -10,8 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.compiled.jit import njit, njit_no_refcount
+from service.compiled.jit import njit
 from service.errors import BadInput, Fault
+from service.sky.geometry.directions import separation_of, separation_rad
 from service.vectors import Vector, locked, read_only
 
 Indices = npt.NDArray[np.int32]
@@ -97,17 +98,6 @@ def build_pairs(direction: Vector, separation_max_deg: float) -> PairIndex:
     return PairIndex(read_only(separation), read_only(rows), read_only(bin_start), bins_per_rad)
 
 
-@njit_no_refcount
-def separation_rad(a, b):  # type: ignore[no-untyped-def]
-    """Angle in radians between two unit vectors, accurate from zero to a half turn."""
-    dx, dy, dz = a[0] - b[0], a[1] - b[1], a[2] - b[2]
-    half_chord = 0.5 * math.sqrt(dx * dx + dy * dy + dz * dz)
-    if half_chord < 0.7:
-        return 2.0 * math.asin(half_chord)
-    sx, sy, sz = a[0] + b[0], a[1] + b[1], a[2] + b[2]
-    return 2.0 * math.atan2(half_chord, 0.5 * math.sqrt(sx * sx + sy * sy + sz * sz))
-
-
 @njit(nogil=True)
 def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore[no-untyped-def]
     """The number of pairs up to a separation, and whether there was room to write all of them.
@@ -184,24 +174,6 @@ def _find_pairs(direction, limit, separation, brighter, dimmer):  # type: ignore
         brighter[kept], dimmer[kept] = min(one, other), max(one, other)
         kept += angle <= limit
     return kept, True
-
-
-@njit(nogil=True)
-def separation_of(square):  # type: ignore[no-untyped-def]
-    """The angle in radians of a squared chord; short ones by a series as exact as the arc sine."""
-    quarter = 0.25 * square
-    half = math.sqrt(quarter)
-    if quarter < 0.0064:
-        series = 1.0 / 6.0 + quarter * (
-            3.0 / 40.0
-            + quarter
-            * (
-                15.0 / 336.0
-                + quarter * (105.0 / 3456.0 + quarter * (945.0 / 42240.0 + quarter * 0.01735276))
-            )
-        )
-        return 2.0 * (half + half * quarter * series)
-    return 2.0 * math.asin(min(1.0, half))
 
 
 @njit(nogil=True)

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.compiled.jit import njit
-from service.sky.geometry.axes import axes_across
+from service.sky.geometry.directions import axes_across
 from service.vectors import Vector
 
 CELLS = 1248

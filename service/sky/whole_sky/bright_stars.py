@@ -6,9 +6,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.sky.catalog.proper_motion import moved
 from service.sky.catalog.run_catalog import J2000_YEAR
-from service.sky.catalog.star_catalog import Catalog
+from service.sky.catalog.star_catalog import Catalog, moved
 from service.vectors import Vector, read_only
 
 FAINTEST_MAG = 9.0

@@ -7,7 +7,7 @@ import numpy as np
 
 from service.compiled.jit import njit
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.geometry.star_buckets import StarBuckets, build_star_buckets
+from service.sky.geometry.star_hashes import StarBuckets, build_star_buckets
 from service.sky.geometry.triangles import SLAVES, TriangleIndex, build_triangles
 from service.vectors import Vector, read_only
 

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from service.compiled.arrays import view_into
 from service.compiled.jit import njit
-from service.compiled.views import view_into
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.files import Content
 from service.sky.geometry.pairs import build_pairs

@@ -12,7 +12,7 @@ from msgspec import Struct
 from pydantic import Field
 from sqlalchemy import Connection, delete, func, insert, select, update
 
-from service.filtering.state import Status
+from service.filtering.result import Status
 from service.grades.day import (
     GRADES,
     MOST_PACKED,

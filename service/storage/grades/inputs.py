@@ -12,8 +12,8 @@ from sqlalchemy import BigInteger, Connection, bindparam, select
 from service.acquire.choices import aberration_velocity
 from service.attitude.solution import NoAttitude
 from service.errors import BadInput
+from service.filtering.inputs import DirectionMeasurements, no_directions
 from service.filtering.prediction import Known
-from service.filtering.samples import DirectionMeasurements, no_directions
 from service.grades.day import METHOD
 from service.grades.stretches import Recorded, arrays_of, usable_attitudes
 from service.gyro import Nanoseconds, tai_ns_of

@@ -12,8 +12,7 @@ from sqlalchemy import Connection, select, tuple_
 from service.alarms.quantities import REJECTED
 from service.alarms.window import Point, Sample, preview_of
 from service.errors import BadBatch, Fault, shown_value
-from service.filtering.result import Integers
-from service.filtering.state import Outcome, Status
+from service.filtering.result import Integers, Outcome, Status
 from service.grades.day import (
     GRADES,
     Grade,

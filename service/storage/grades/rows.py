@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sqlalchemy import ColumnElement, Connection, Select, func, select, tuple_
 
-from service.filtering.state import Status
+from service.filtering.result import Status
 from service.grades.carried import Carried
 from service.grades.day import Grade, day_bounds, unpacked
 from service.gyro import texts_of

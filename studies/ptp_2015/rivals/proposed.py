@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
-from service.identify.triangles.sharing import count_pairs, validate
+from service.identify.triangles.triangle_match import count_pairs, validate
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 

@@ -16,8 +16,9 @@ from service.compiled.jit import njit
 from service.identify.triangles.triangle_match import SIGMAS
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.geometry.directions import separation_rad
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
-from service.sky.geometry.pairs import build_pairs, separation_rad
+from service.sky.geometry.pairs import build_pairs
 from service.vectors import Vector
 from studies.ptp_2015.rivals.proposed import Proposed, Rows
 

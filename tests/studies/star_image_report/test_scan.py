@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from service.observations.scans.cross_scan import cross_scan, mean_of_scans
+from service.observations.scans.lines import cross_scan, mean_of_scans
 from studies.star_image_report.scanning import (
     nyquist_spacing,
     truncated,

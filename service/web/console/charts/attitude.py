@@ -5,10 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.attitude.rotations import rotation_vectors
 from service.storage.queries.period import PeriodAttitudes
 from service.times import Utc
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAxis, Values, band_of
 
 AXES = ("x", "y", "z")

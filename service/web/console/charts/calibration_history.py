@@ -7,8 +7,7 @@ import numpy as np
 
 from service.app.calibration_estimates import geometry_of
 from service.calibration.magnitudes import COLOR, SCALE
-from service.missions.corrections import AS_MEASURED
-from service.missions.mission import Mission
+from service.missions.mission import AS_MEASURED, Mission
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
 from service.storage.calibrations import CalibrationSummary, TrackerGeometry
 from service.times import parse_utc

@@ -5,14 +5,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from service.attitude.rotations import matrices, rotation_vectors
-from service.filtering.gyro import FilterSettings
-from service.filtering.result import Integers
-from service.filtering.state import Status
+from service.filtering.inputs import FilterSettings
+from service.filtering.result import Integers, Status
 from service.grades.innovations import MeasuredInnovations
 from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
-from service.vectors import Vector, to_ra_dec
+from service.vectors import Vector, attitude_matrices, rotation_vectors, to_ra_dec
 from service.web.console.charts.attitude import AXES, SMALL_DEG, SMALL_DEG_PER_S
 from service.web.console.charts.panels import (
     FINE_HEIGHT,
@@ -74,7 +72,7 @@ def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> 
     if not known.any():
         return None
     # Rows are the tracker's axes in inertial components.
-    axes = tracker.body_from_tracker.T @ matrices(samples.quaternion)
+    axes = tracker.body_from_tracker.T @ attitude_matrices(samples.quaternion)
     ra_deg, dec_deg = to_ra_dec(axes[:, 2])
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     north = np.column_stack([-np.sin(dec) * np.cos(ra), -np.sin(dec) * np.sin(ra), np.cos(dec)])

@@ -8,8 +8,7 @@ from datetime import datetime, timedelta
 import numpy as np
 import numpy.typing as npt
 
-from service.filtering.result import Integers
-from service.filtering.state import Status
+from service.filtering.result import Integers, Status
 from service.storage.grades.period import GradesOfPeriod
 from service.times import DAY_S, Utc
 from service.vectors import Vector

@@ -1,5 +1,9 @@
-"""The P-vector: one triangle a star, with its two brightest neighbours, found by one number.
+"""Triangles found by their projection: PTP, and the P-vector before it.
 
+PTP is taken as the comparison takes it: the service's own triangles, its sharing stars for an
+answer.
+
+The P-vector has one triangle a star, with its two brightest neighbours, found by one number.
 Yang Jian, Zhang Guangjun & Jiang Jie, "Fast Star Identification Algorithm Using
 P Vector", Acta Aeronautica et Astronautica Sinica 28(4), 2007, 897-900; as
 Zhou & Ye tell of it.  The projection is that of PTP.  What makes it weak is the
@@ -12,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.compiled.jit import njit
+from service.identify.triangles.ptp import propose
 from service.identify.triangles.triangle_match import (
     MAX_MATCHES,
     ImageTriangles,
@@ -20,7 +25,15 @@ from service.identify.triangles.triangle_match import (
 )
 from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
-from service.sky.geometry.triangles import TriangleIndex, chords, index_triangles, make_triangles
+from service.sky.geometry.triangles import (
+    REACH_DEG,
+    SLAVES,
+    TriangleIndex,
+    build_triangles,
+    chords,
+    index_triangles,
+    make_triangles,
+)
 from studies.ptp_2015.rivals.proposed import Proposed, proposed_by_votes
 
 NEIGHBOURS_WITHIN_DEG = 5.0
@@ -87,3 +100,32 @@ def brightest_near(direction, least, most, near):  # type: ignore[no-untyped-def
                 found += 1
                 if found == wanted:
                     break
+
+
+@dataclass(frozen=True)
+class Ptp:
+    """The guide triangles."""
+
+    triangles: TriangleIndex
+    stars: int
+
+    @property
+    def entries(self) -> int:
+        """Triangles: five of a star with four slaves."""
+        return self.triangles.count
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of triangles and k-vector."""
+        return self.triangles.nbytes
+
+    def identify(self, scene: Scene) -> Proposed:
+        """What sharing stars validate, without the attitude check behind it."""
+        proposals = propose(scene.direction, scene.sigma_rad, 0.0, self.triangles, self.stars)
+        match = proposals.validated(len(scene.direction))
+        return Proposed(match, proposals.image, proposals.star)
+
+
+def build_ptp(stars: RunCatalog, slaves: int = SLAVES) -> Ptp:
+    """The guide triangles of a star list, with so many slaves to a master."""
+    return Ptp(build_triangles(stars.direction, REACH_DEG, slaves), len(stars))

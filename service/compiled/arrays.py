@@ -1,4 +1,4 @@
-"""Arrays without an owner, for compiled code: views that are never to be returned."""
+"""Arrays in compiled code: copies, and views without an owner, which are never to be returned."""
 
 from typing import Any
 
@@ -6,6 +6,8 @@ from numba import types
 from numba.core.typing.templates import signature
 from numba.extending import intrinsic
 from numba.np.arrayobj import populate_array
+
+from service.compiled.jit import njit_no_refcount
 
 
 def _borrowed_view(_: Any, held: Any) -> Any:
@@ -75,3 +77,14 @@ view_into: Any = intrinsic(_view_into)
 The caller holds the block for as long as it runs.  Costs nothing, where a slice, a view
 and a shape of it are three calls.
 """
+
+
+@njit_no_refcount
+def copy_rows(source, target):  # type: ignore[no-untyped-def]
+    """Write an array of one or more dimensions over another of the same shape.
+
+    `target[:] = source` takes three seconds to compile, most of them for the message of an
+    error about their shapes.
+    """
+    for at in range(source.size):
+        target.flat[at] = source.flat[at]

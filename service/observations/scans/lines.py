@@ -1,0 +1,126 @@
+"""Stars along a line of samples: the first moment, the cross-scan made of it, and maxima.
+
+Of the cross-scan (report on star images, 7.2 to 7.5), `displacement` is where the star stands,
+plus the first moment over the sum.  The report writes the image as Phi(u + a), whose star is at
+-a, and drops that minus in 7.4 to 7.6 and 7.17 to 7.22.  What the telescope must be moved by is
+minus the displacement.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from service.vectors import Vector
+
+BREAKDOWN_RATIO = 5.0
+"""Light over its noise below which a ratio of sums has no usable variance (report, 7.30)."""
+
+
+@dataclass(frozen=True)
+class ProfileMoment:
+    """The first moment of one profile over its sum, in steps from its middle sample.
+
+    `variance` is the full law sum (n - d)² sigma_n² / (sum)², of which the report's 7.36
+    is the case of white noise without displacement and without photon noise.
+    """
+
+    displacement: float
+    variance: float
+    total: float
+    total_variance: float
+
+    @property
+    def signal_ratio(self) -> float:
+        """The sum over its own noise (7.30)."""
+        return self.total / math.sqrt(self.total_variance) if self.total_variance > 0 else math.inf
+
+
+def moment(samples: Vector, sample_variance: Vector, level_sigma: float = 0.0) -> ProfileMoment:
+    """The moment of samples n = -N ... N; `level_sigma` is an error common to all of them."""
+    steps = np.arange(len(samples), dtype=np.float64) - (len(samples) - 1) / 2.0
+    total = float(samples.sum())
+    displacement = float(steps @ samples) / total if total else math.nan
+    arm = steps - displacement
+    square = float(arm**2 @ sample_variance) + (level_sigma * float(arm.sum())) ** 2
+    total_variance = float(sample_variance.sum()) + (level_sigma * len(samples)) ** 2
+    variance = square / total**2 if total else math.inf
+    return ProfileMoment(displacement, variance, total, total_variance)
+
+
+@dataclass(frozen=True)
+class ScanResult:
+    """A displacement with its sigma; no number where the light is below the breakdown ratio."""
+
+    displacement: float
+    sigma: float
+    signal_ratio: float
+
+    @property
+    def refused(self) -> bool:
+        """Whether the scan held too little light to have a variance at all (7.30)."""
+        return math.isnan(self.displacement)
+
+
+def cross_scan(
+    samples: npt.ArrayLike,
+    spacing: float,
+    noise_sigma: float,
+    background: float = 0.0,
+    gain: float = math.inf,
+) -> ScanResult:
+    """D = T sum n Phi_n / sum Phi_n of samples n = -N ... N at steps of T (7.21, 7.22).
+
+    `background` is taken off first; left in, it pulls every displacement towards zero.
+    `gain` in photons per unit of Phi adds photon noise.
+    """
+    light = np.asarray(samples, dtype=np.float64) - background
+    variance = np.full(light.shape, noise_sigma**2) + np.maximum(light + background, 0.0) / gain
+    found = moment(light, variance)
+    if not found.signal_ratio >= BREAKDOWN_RATIO:
+        return ScanResult(math.nan, math.nan, found.signal_ratio)
+    return ScanResult(
+        spacing * found.displacement, spacing * math.sqrt(found.variance), found.signal_ratio
+    )
+
+
+def mean_of_scans(scans: npt.ArrayLike, spacing: float, noise_sigma: float) -> ScanResult:
+    """M scans (M, samples) of one place: the mean of their displacements, 1/M of the variance.
+
+    Each must hold enough light by itself, as in the report; where they do not, add the
+    samples first.
+    """
+    each = [cross_scan(scan, spacing, noise_sigma) for scan in np.atleast_2d(scans)]
+    m = len(each)
+    return ScanResult(
+        float(np.mean([one.displacement for one in each])),
+        math.sqrt(sum(one.sigma**2 for one in each)) / m,
+        float(min(one.signal_ratio for one in each)),
+    )
+
+
+def line_peaks(sums: Vector, threshold: float) -> Vector:
+    """Places of the maxima of `sums` above `threshold`, rising, in lines from the first one.
+
+    A parabola through three sums refines each, to about half a line.  The first and the last
+    line are the place of none.
+    """
+    padded = np.concatenate([[-np.inf], sums, [-np.inf]])
+    before, middle, after = padded[:-2], padded[1:-1], padded[2:]
+    at = np.flatnonzero((middle > threshold) & (middle > before) & (middle >= after))
+    # Maxima without a valley between them are one star and its noise.
+    kept: list[int] = []
+    for line in at.tolist():
+        if kept and sums[kept[-1] : line + 1].min() > min(sums[kept[-1]], sums[line]) - threshold:
+            kept[-1] = max(kept[-1], line, key=lambda each: float(sums[each]))
+        else:
+            kept.append(line)
+    inner = [line for line in kept if 0 < line < len(sums) - 1]
+    return np.array([line + _fine(sums, line) for line in inner])
+
+
+def _fine(sums: Vector, at: int) -> float:
+    before, middle, after = sums[at - 1 : at + 2]
+    bend = before - 2.0 * middle + after
+    return float(0.5 * (before - after) / bend) if bend < 0.0 else 0.0
