@@ -1,1 +1,1 @@
-"""WHO FLIES: what is fixed for a mission, read from its TOML file."""
+"""Missions: what is fixed for a spacecraft, read from its TOML file."""

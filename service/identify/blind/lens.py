@@ -25,7 +25,7 @@ _ROUNDS = 12
 _CONVERGED = 1e-8
 NEIGHBOURS = 3
 """Of a star, whose residuals tell what errors they share."""
-LEAST_SIGMA_PX = 0.05
+LEAST_RESIDUAL_PX = 0.05
 
 
 @dataclass(frozen=True)
@@ -229,9 +229,9 @@ def simpler_fit(
     fewer = FREE_SCALE if fit.parameters == SCALE_BEND else SCALE_BEND
     bend = fit.lens.bend if fewer == SCALE_BEND else 0.0
     start = replace(fit.lens, bend=bend, off_u=0.0, off_v=0.0)
-    sigma = max(math.sqrt(float(np.mean(residual_px**2))), LEAST_SIGMA_PX)
+    sigma = max(math.sqrt(float(np.mean(residual_px**2))), LEAST_RESIDUAL_PX)
     off = np.hypot(*residual_px.T)
-    usual = max(2.0 * float(np.median(off)), LEAST_SIGMA_PX)
+    usual = max(2.0 * float(np.median(off)), LEAST_RESIDUAL_PX)
     return fit_lens(
         *(start, fit.attitude, u_px, v_px, np.full(len(u_px), sigma), star, fewer),
         weight=1.0 / (1.0 + (off / usual) ** 2),
