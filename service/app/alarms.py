@@ -7,7 +7,7 @@ from typing import cast
 import msgspec
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.alarms import state_machine
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import REJECTED, SILENCE, QuantityName, tracker_names

@@ -12,7 +12,7 @@ import msgspec
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.app.calibration_estimates import (
     CalibrationRequest,
     CalibrationRun,

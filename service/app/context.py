@@ -10,7 +10,7 @@ from typing import TypeVar
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.alarms.subjects import limited_trackers
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named

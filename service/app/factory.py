@@ -1,6 +1,6 @@
 """The app: every part of the service, put together in one place."""
 
-from service.access.tokens import Access, Tokens
+from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits

@@ -11,8 +11,7 @@ from typing import IO, TypedDict, Unpack
 
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
-from service.access.tokens import Caller
+from service.access import Caller, Entry
 from service.app.context import Context, checked_run_name, known_id
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.gyro import GyroBlock

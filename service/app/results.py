@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
 from service.advice.advice import RunAgain
 from service.app.context import ALL_RUNS, Context, known_id

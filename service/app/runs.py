@@ -7,7 +7,7 @@ from pathlib import Path
 
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess

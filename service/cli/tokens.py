@@ -12,8 +12,7 @@ import msgspec
 from sqlalchemy import Connection
 
 from service import errors
-from service.access.audit import Entry
-from service.access.tokens import MAX_DAYS, Tokens
+from service.access import MAX_DAYS, Entry, Tokens
 from service.cli.arguments import print_json
 from service.cli.configuration import http_client, refusal_of, service_url, settings_of
 from service.missions.mission import load_missions

@@ -16,8 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import to_json
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
-from service.access.tokens import Caller
+from service.access import Caller, Entry
 from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.acquire.kernel_build import KernelBuild

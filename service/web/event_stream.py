@@ -18,7 +18,7 @@ from typing import TypeVar
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.factory import App
 from service.errors import Busy, RateLimited, Unauthenticated
 from service.storage.recording.events import Event

@@ -18,7 +18,7 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
-from service.access.tokens import Access
+from service.access import Access
 from service.errors import Busy
 from service.settings import is_loopback
 from service.web.requests.access import authorize, entry_of, is_open

@@ -6,7 +6,7 @@ import time
 import pytest
 from acquire_client import Client
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.factory import open_app
 from service.errors import BadFile
 from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block

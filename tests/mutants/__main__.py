@@ -47,7 +47,7 @@ from tests.torture import digest_of
 ROOT = Path(__file__).parents[2]
 AREAS = {
     "alarms": ("service/alarms",),
-    "access": ("service/access",),
+    "access": ("service/access.py",),
     "webhooks": ("service/webhooks",),
     "recording": ("service/storage/recording",),
     "ingest": ("service/ingest",),

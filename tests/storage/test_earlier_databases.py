@@ -19,7 +19,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import MetaData, create_engine, inspect, select, text
 from sqlalchemy.pool import NullPool
 
-from service.access.tokens import add_token, new_secret
+from service.access import add_token, new_secret
 from service.alarms.quantities import trend_names
 from service.app.factory import open_app
 from service.settings import Settings

@@ -374,7 +374,7 @@ def _note(parsed: Namespace) -> Any:
 
 def note(connection: "Connection", action: str, about: str, asked: dict[str, Any]) -> None:
     """Add an entry to the audit list: the user of this command did this."""
-    from service.access.audit import Entry
+    from service.access import Entry
     from service.storage.recording.ids import Ulids
     from service.times import utc_now
 

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, ConfigDict, Field, StringConstraints, model
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
 from service.errors import NotFound, shown_value

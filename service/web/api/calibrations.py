@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
 from service.calibration.unknowns import LARGEST_DEGREE

@@ -7,8 +7,7 @@ from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.audit import list_entries
-from service.access.tokens import DEFAULT_DAYS, MAX_DAYS, SESSION_H
+from service.access import DEFAULT_DAYS, MAX_DAYS, SESSION_H, list_entries
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList

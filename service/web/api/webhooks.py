@@ -7,7 +7,7 @@ from pydantic import Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.observations.schema import Key, RunName, Wire
 from service.storage import webhooks
 from service.storage.models.alarms import SeverityName

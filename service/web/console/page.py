@@ -22,7 +22,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from service import __version__, logs
-from service.access.tokens import Caller
+from service.access import Caller
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults

@@ -17,8 +17,7 @@ from starlette.requests import Request
 from starlette.types import Scope as HttpScope
 
 from service import logs
-from service.access.audit import Entry
-from service.access.tokens import OPEN_CALLER, Access, Caller
+from service.access import OPEN_CALLER, Access, Caller, Entry
 from service.app.factory import App
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
 from service.storage.models.access import Scope
