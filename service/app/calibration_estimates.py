@@ -23,6 +23,7 @@ from service.calibration.estimate import (
     calibrate_with_chosen_degree,
 )
 from service.calibration.evidence import identified_magnitudes, identified_stars
+from service.calibration.linearise import LARGEST_DEGREE, Model
 from service.calibration.magnitudes import (
     UNITS,
     MagnitudeCalibration,
@@ -33,7 +34,6 @@ from service.calibration.magnitudes import (
 from service.calibration.magnitudes import joined as joined_magnitudes
 from service.calibration.mission_file import Lines, magnitude_lines, tracker_lines
 from service.calibration.stars import IdentifiedStars, joined
-from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
 from service.ingest.submit import SubmissionService
 from service.missions.corrections import AS_MEASURED, Magnitudes

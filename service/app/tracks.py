@@ -14,7 +14,7 @@ from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now
 from service.tracks.finding import Track as FoundTrack
 from service.tracks.finding import figures, find_tracks
-from service.tracks.gathering import Batches, Points
+from service.tracks.linking import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000

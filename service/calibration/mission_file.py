@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial.legendre import leg2poly
 
 from service.calibration.estimate import Calibration
-from service.calibration.unknowns import SKEW, STRETCH, Unknown
+from service.calibration.linearise import SKEW, STRETCH, Unknown
 from service.errors import BadConfiguration
 from service.missions.corrections import Magnitudes
 from service.missions.mission import Mission, Tracker, parse_mission

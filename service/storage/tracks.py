@@ -19,7 +19,7 @@ from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.results import answer_from_json, read_result
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.tracks.gathering import Gathering
+from service.tracks.linking import Gathering
 from service.vectors import matrix_from_quaternion
 
 _ROWS: Select[Any] = select(

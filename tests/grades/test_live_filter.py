@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.app.live_filter import LiveFilter
+from service.app.grades import LiveFilter
 from service.errors import NotFound
 from service.filtering.samples import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window

@@ -15,7 +15,7 @@ from service.simulate.stretches import Stretch
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.planets import PLANETS, planet_place
 from service.times import parse_utc, shifted
-from service.tracks.gathering import Gathering
+from service.tracks.linking import Gathering
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     matrix_from_quaternion,

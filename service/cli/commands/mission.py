@@ -10,7 +10,7 @@ from service.cli.arguments import add_command, add_group, add_json, print_json
 from service.errors import BadConfiguration, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.advice.zone_estimate import ZoneEstimate
+    from service.advice.zone_size import ZoneEstimate
     from service.missions.mission import Mission
 
 
@@ -127,7 +127,7 @@ def estimate(parsed: Namespace) -> int:
     acquire mission estimate XTE --size 6 8 10.66 15
     acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
     """
-    from service.advice.zone_estimate import neighbours_of, zone_estimates
+    from service.advice.zone_size import neighbours_of, zone_estimates
     from service.cli.configuration import mission_of_file_or_name
     from service.cli.mission_report import epoch_of
     from service.settings import Settings

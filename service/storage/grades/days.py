@@ -19,10 +19,10 @@ from service.grades.day import (
     GradedDay,
     GradedSamples,
     GradedStretch,
+    MeasuredInnovations,
     day_bounds,
     packed,
 )
-from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.storage.models.base import Count, Digest, Id, Moment, Stamp, doc
 from service.storage.sql.columns import Row

@@ -9,8 +9,8 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
+from service.alarms.limits import Point, Sample, preview_of
 from service.alarms.quantities import REJECTED
-from service.alarms.window import Point, Sample, preview_of
 from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers
 from service.filtering.state import Outcome, Status
@@ -18,11 +18,11 @@ from service.grades.day import (
     GRADES,
     Grade,
     GradedSamples,
+    MeasuredInnovations,
     day_bounds,
     unpacked,
     unpacked_innovations,
 )
-from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.missions.mission import Mission
 from service.storage.grades.days import DayKey, GradedDayRow, shown

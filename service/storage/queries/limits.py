@@ -8,9 +8,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, bindparam, insert, select, update
 
 from service.alarms import quantities, subjects
-from service.alarms.limits import LimitSettings
+from service.alarms.limits import LimitSettings, Sample
 from service.alarms.quantities import QuantityName
-from service.alarms.window import Sample
 from service.missions.mission import Mission
 from service.storage.models.alarms import Limit, LimitHistory
 from service.storage.queries.pages import ResultFilter, newest_first

@@ -10,7 +10,7 @@ from starlette.responses import Response
 from service.access import Caller
 from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
-from service.calibration.unknowns import LARGEST_DEGREE
+from service.calibration.linearise import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
 from service.storage import calibrations as models

@@ -9,7 +9,7 @@ from service.attitude.rotations import matrices, rotation_vectors
 from service.filtering.gyro import FilterSettings
 from service.filtering.result import Integers
 from service.filtering.state import Status
-from service.grades.innovations import MeasuredInnovations
+from service.grades.day import MeasuredInnovations
 from service.missions.mission import Tracker
 from service.storage.grades.period import PARTS, GradesOfPeriod
 from service.vectors import Vector, to_ra_dec

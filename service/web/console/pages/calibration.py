@@ -7,7 +7,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.app.calibration_estimates import CALIBRATION_SAMPLE
-from service.calibration.unknowns import LARGEST_DEGREE
+from service.calibration.linearise import LARGEST_DEGREE
 from service.errors import NotFound
 from service.storage.calibrations import Calibration, CalibrationSummary
 from service.storage.recording.unsaved_result import LIVE
