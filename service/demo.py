@@ -27,10 +27,16 @@ from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.resources import shipped
 from service.settings import PREFIX, Settings, require_free, url_of
-from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.score import Score, score, score_table, together
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass, read_objects, truth_path, write_pass
+from service.simulate.telemetry import (
+    GyroWanted,
+    draw_pass,
+    read_objects,
+    truth_path,
+    with_gyro,
+    write_pass,
+)
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel

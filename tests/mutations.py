@@ -39,8 +39,7 @@ from service.observations.readers.decompress import MAX_LINE_BYTES, unpacked_lin
 from service.observations.readers.telemetry import read_lines
 from service.observations.schema import BatchIn, submission_from_json
 from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketReader
-from service.packets.upload import PacketLines, archive_of
+from service.packets.reader import PacketLines, PacketReader, archive_of
 from service.products.reading.aem import read_aem
 from service.products.reading.oem import read_oem
 from service.products.reading.tle import read_tle

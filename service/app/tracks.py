@@ -7,7 +7,7 @@ import numpy as np
 from service import __version__
 from service.app.context import Context, known_id
 from service.errors import NotFound
-from service.products.tdm import TrackedObject, write_tdm
+from service.products.ccsds import TrackedObject, write_tdm
 from service.storage import tracks
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE

@@ -141,7 +141,7 @@ def _run_mission(parsed: Namespace) -> int:
     acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
     acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
     """
-    from service.cli.configuration import mission_of_file_or_name
+    from service.cli.arguments import mission_of_file_or_name
     from service.settings import Settings
     from studies.mission_rates import plot
     from studies.mission_rates.report import report_json, report_text

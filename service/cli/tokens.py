@@ -13,8 +13,7 @@ from sqlalchemy import Connection
 
 from service import errors
 from service.access import MAX_DAYS, Entry, Tokens
-from service.cli.arguments import print_json
-from service.cli.configuration import http_client, refusal_of, service_url, settings_of
+from service.cli.arguments import http_client, print_json, refusal_of, service_url, settings_of
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.storage.models.access import NewToken, Token

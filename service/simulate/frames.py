@@ -19,7 +19,7 @@ import numpy as np
 
 from service.errors import BadFile, BadInput, Fault, shown_value
 from service.imaging.centroids.psf import ColouredPsf, Psf
-from service.imaging.detection.star_image import (
+from service.imaging.detection.star_images import (
     TrailPsf,
     psfs_of_colours,
     reach_px,

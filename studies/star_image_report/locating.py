@@ -7,7 +7,7 @@ import numpy as np
 
 from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Array
-from service.imaging.detection.star_image import AIRY_OVER_SIGMA
+from service.imaging.detection.star_images import AIRY_OVER_SIGMA
 from service.imaging.optics import behind_wires, disc, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.star_image_report import correlate, rotation, sun_acquisition

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import progress_bar, settings_of, settings_of_existing
+from service.cli.arguments import progress_bar, settings_of, settings_of_existing
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection

@@ -5,8 +5,15 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import SERVICE, add_command, add_json, count, print_json
-from service.cli.configuration import service_url, settings_of
+from service.cli.arguments import (
+    SERVICE,
+    add_command,
+    add_json,
+    count,
+    print_json,
+    service_url,
+    settings_of,
+)
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:

@@ -15,9 +15,12 @@ from service.cli.arguments import (
     add_database,
     add_url_or_in_process,
     degrees,
+    http_client,
     positive,
+    refusal_of,
+    service_url,
+    settings_of,
 )
-from service.cli.configuration import http_client, refusal_of, service_url, settings_of
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
 

@@ -128,7 +128,7 @@ def estimate(parsed: Namespace) -> int:
     acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
     """
     from service.advice.zone_size import neighbours_of, zone_estimates
-    from service.cli.configuration import mission_of_file_or_name
+    from service.cli.arguments import mission_of_file_or_name
     from service.cli.mission_report import epoch_of
     from service.settings import Settings
     from service.sky.catalog.run_catalog import build_run_catalog

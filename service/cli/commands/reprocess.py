@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
 if TYPE_CHECKING:

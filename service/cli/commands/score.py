@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
 _BAR = 48

@@ -6,8 +6,16 @@ The commands write into the database; where a service writes to its SQLite file,
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from service.cli.arguments import SERVICE, add_command, add_database, add_group, add_json, count
-from service.cli.configuration import service_url, settings_of_existing
+from service.cli.arguments import (
+    SERVICE,
+    add_command,
+    add_database,
+    add_group,
+    add_json,
+    count,
+    service_url,
+    settings_of_existing,
+)
 
 
 def add(commands: Any) -> None:

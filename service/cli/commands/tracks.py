@@ -5,8 +5,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period, print_json
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli.arguments import (
+    MISSION,
+    add_command,
+    add_database,
+    add_period,
+    period_of,
+    print_json,
+    settings_of_existing,
+)
 from service.errors import BadInput, Fault
 
 

@@ -3,30 +3,276 @@
 The rows of one (spacecraft, run, batch) form a batch; `CsvTable` gives them together.  A row
 whose star cells are all empty stands for a tracker that saw none.  What the rows give is
 the same JSON as that of an NDJSON file, so that the same checks hold for it.
+
+The columns are named after the fields of the JSON object; an empty cell is an absent field.
 """
 
 import csv
+import difflib
 import json
+import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, TextIO
 
 from service.csv_cells import neutralised
-from service.errors import Fault
+from service.errors import BadFile, Fault, shown_value
+from service.observations import schema
 from service.observations.batch import MAX_STARS_PER_TRACKER, MAX_TRACKERS
-from service.observations.readers import csv_columns
 from service.observations.readers.csv_table import CsvRow, Row, RowKind
 from service.observations.readers.decompress import Line
 from service.observations.schema import BatchIn
 
+KEY = ("spacecraft", "run", "batch")
+REQUIRED = ("spacecraft", "batch", "time", "tracker")
+TEXTS = ("spacecraft", "batch", "run", "time", "frame", "aberration")
+VECTORS = {
+    "quaternion": ("q1", "q2", "q3", "qc"),
+    "boresight": ("boresight_ra_deg", "boresight_dec_deg"),
+    "body_rates_deg_per_s": ("rate_x_deg_per_s", "rate_y_deg_per_s", "rate_z_deg_per_s"),
+    "velocity_km_per_s": ("velocity_x_km_per_s", "velocity_y_km_per_s", "velocity_z_km_per_s"),
+    "position_km": ("position_x_km", "position_y_km", "position_z_km"),
+    "sun_vector": ("sun_vector_x", "sun_vector_y", "sun_vector_z"),
+    "measured_quaternion": ("measured_q1", "measured_q2", "measured_q3", "measured_qc"),
+    "measured_sigma_arcsec": (
+        "measured_sigma_x_arcsec",
+        "measured_sigma_y_arcsec",
+        "measured_sigma_z_arcsec",
+    ),
+    "measured_covariance_arcsec2": tuple(
+        f"measured_p{each}_arcsec2" for each in ("11", "12", "13", "22", "23", "33")
+    ),
+}
+DIRECTION = ("x", "y", "z")
+STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
+READINGS = ("h_counts", "v_counts", "h_times", "v_times")
+"""Columns of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
+LINES = ("column_counts", "row_counts")
+"""Columns of a tracker with a raster, in a row by themselves: it has no stars."""
+STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
+PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
+BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
+COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
+MEASURED = ("measured_quaternion", "measured_sigma_arcsec", "measured_covariance_arcsec2")
+"""Vectors of an attitude that a tracker measured itself: a row that has them has no star."""
+VERBATIM = (*TEXTS, "tracker")
+"""Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
+
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+
+
+class BadCell(Exception):
+    """A cell that cannot be read; knows its column, not its line."""
+
+    def __init__(self, column: str, message: str, value: object = None) -> None:
+        self.column, self.message = column, message
+        self.value = None if value is None else shown_value(value)
+
+    def fault(self, line: int) -> Fault:
+        """The fault as it is reported, with the line."""
+        return Fault(f"line {line}, column {self.column}", self.message, self.value)
+
+
+def checked_header(names: list[str], where: str) -> None:
+    """Raise `BadFile` for a column that is unknown, missing or there twice."""
+    faults = [
+        Fault(f"{where}, column {name or '(empty)'}", f"there is no such column; {_near(name)}")
+        for name in names
+        if name not in COLUMNS
+    ]
+    faults += [
+        Fault(f"{where}, column {name}", "occurs twice")
+        for name in sorted({name for name in names if names.count(name) > 1})
+    ]
+    wanted = list(REQUIRED)
+    # A group of columns is there as a whole or not at all; a star needs a direction.
+    groups = *VECTORS.values(), DIRECTION, ("h_deg", "v_deg"), READINGS[:2], READINGS[2:], LINES
+    for group in groups:
+        wanted += group if any(name in names for name in group) else ()
+    if not any(
+        name in names
+        for name in (*VECTORS["measured_quaternion"], "h_deg", "v_deg", *READINGS[2:], *LINES)
+    ):
+        wanted += DIRECTION
+    faults += [
+        Fault(f"{where}, column {name}", "is missing")
+        for name in dict.fromkeys(wanted)
+        if name not in names
+    ]
+    if faults:
+        raise BadFile(faults)
+
+
+def _near(name: str) -> str:
+    close = difflib.get_close_matches(name, COLUMNS, n=1)
+    return f"{close[0]} is meant?" if close else f"there are {', '.join(COLUMNS)}"
+
+
+def number_cell(row: CsvRow, column: str) -> float:
+    """The finite number in a cell; raises `BadCell`."""
+    cell = row[column]
+    if not cell:
+        raise BadCell(column, "is empty, while the columns that belong to it are not")
+    return _number(column, cell)
+
+
+def _number(column: str, cell: str) -> float:
+    if not _NUMBER.fullmatch(cell):
+        raise BadCell(column, "must be a number", cell)
+    number = float(cell)
+    if not math.isfinite(number):
+        raise BadCell(column, "must be a finite number", cell)
+    return number
+
+
+def _group(row: CsvRow, columns: tuple[str, ...]) -> list[float] | None:
+    """The numbers of columns that are given together, or None where all are empty."""
+    if not any(row.get(column) for column in columns):
+        return None
+    return [number_cell(row, column) for column in columns]
+
+
+def batch_fields(row: CsvRow) -> dict[str, Any]:
+    """The fields of the batch itself, without its stars; raises `BadCell`."""
+    fields: dict[str, Any] = {name: row[name] for name in TEXTS if row.get(name)}
+    frame = fields.pop("frame", None)
+    values = {name: _group(row, columns) for name, columns in VECTORS.items()}
+    quaternion, boresight = values.pop("quaternion"), values.pop("boresight")
+    measured = {name: values.pop(name) for name in MEASURED}
+    if any(measured.values()):
+        fields["measurement"] = _measurement(row, measured, frame)
+    fields.update({name: value for name, value in values.items() if value is not None})
+    priors: list[dict[str, Any]] = []
+    if quaternion is not None:
+        priors.append({"quaternion": quaternion})
+    if boresight is not None:
+        priors.append({"boresight": dict(zip(("ra_deg", "dec_deg"), boresight, strict=True))})
+    if sun_pointed := row.get("sun_pointed", ""):
+        if sun_pointed.lower() not in ("true", "false", "1", "0"):
+            raise BadCell("sun_pointed", "must be true, false or empty", sun_pointed)
+        if sun_pointed.lower() in ("true", "1"):
+            priors.append({"sun_pointed": True, **_numbers(row, ("sun_counts",))})
+    if row.get("sun_counts") and "sun_pointed" not in (priors[-1] if priors else ()):
+        raise BadCell("sun_counts", "belongs to sun_pointed, which is not true", row["sun_counts"])
+    if source := row.get("a_priori_from", ""):
+        if source != "last":
+            raise BadCell("a_priori_from", "must be last or empty", source)
+        priors.append({"from": source})
+    if len(priors) > 1:
+        kinds = " and ".join(next(iter(prior)) for prior in priors)
+        raise BadCell("batch", f"has more than one a priori attitude: {kinds}", row["batch"])
+    prior = priors[0] if priors else None
+    if prior is not None and frame is not None and "from" not in prior:
+        prior["frame"] = frame
+    fields["a_priori"] = prior
+    if options := row.get("options"):
+        try:
+            fields["options"] = json.loads(options)
+        except ValueError:
+            raise BadCell("options", "must be a JSON object", options) from None
+    return fields
+
+
+def _measurement(
+    row: CsvRow, measured: dict[str, list[float] | None], frame: str | None
+) -> dict[str, Any]:
+    """A tracker's own attitude; the cell `tracker` may be empty: then it is that of the body."""
+    fields: dict[str, Any] = {
+        name.removeprefix("measured_"): value
+        for name, value in measured.items()
+        if value is not None
+    }
+    if "covariance_arcsec2" in fields:
+        p11, p12, p13, p22, p23, p33 = fields["covariance_arcsec2"]
+        fields["covariance_arcsec2"] = [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
+    if row["tracker"]:
+        fields["tracker"] = row["tracker"]
+    if frame is not None:
+        fields["frame"] = frame
+    return fields
+
+
+def star_of(row: CsvRow) -> dict[str, Any]:
+    """The star of a row; raises `BadCell`."""
+    star: dict[str, Any] = {name: number_cell(row, name) for name in STAR_NUMBERS if row.get(name)}
+    star |= _numbers(row, READINGS)
+    vector = _group(row, DIRECTION)
+    return star if vector is None else {"vector": vector, **star}
+
+
+def lines_of(row: CsvRow) -> dict[str, list[float]]:
+    """The sums of the lines of a raster in a row, if it has any; raises `BadCell`."""
+    return _numbers(row, LINES)
+
+
+def _numbers(row: CsvRow, columns: tuple[str, ...]) -> dict[str, list[float]]:
+    """The columns that are not empty, each with numbers between spaces."""
+    return {
+        column: [_number(column, cell) for cell in row[column].split()]
+        for column in columns
+        if row.get(column)
+    }
+
+
+def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
+    """Numbers as cells, by column."""
+    # repr gives the shortest text that reads back as the same number.
+    return {column: repr(value) for column, value in cells}
+
+
+def list_cells(model: schema.StarIn | schema.TrackerIn | schema.SunPointedIn) -> CsvRow:
+    """The cells of readings: of a star, of a tracker's raster, of the sun tracker."""
+    names = *READINGS, *LINES, "sun_counts"
+    lists = ((name, getattr(model, name, None)) for name in names)
+    return {name: " ".join(map(repr, values)) for name, values in lists if values is not None}
+
+
+def batch_cells(batch: schema.BatchIn) -> CsvRow:
+    """The cells of a checked batch that are the same in each of its rows."""
+    prior = batch.a_priori
+    cells: CsvRow = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
+    cells |= {"time": batch.time, "aberration": batch.aberration}
+    vectors: dict[str, tuple[float, ...] | None] = {
+        name: getattr(batch, name, None) for name in VECTORS
+    }
+    if isinstance(prior, schema.FromLastIn):
+        if not prior.by_default:
+            cells["a_priori_from"] = prior.from_
+    elif prior is not None:
+        cells["frame"] = prior.frame
+    if isinstance(prior, schema.QuaternionIn):
+        vectors["quaternion"] = prior.quaternion
+    elif isinstance(prior, schema.BoresightIn):
+        vectors["boresight"] = (prior.boresight.ra_deg, prior.boresight.dec_deg)
+    elif isinstance(prior, schema.SunPointedIn):
+        cells["sun_pointed"] = "true"
+        cells |= list_cells(prior)
+        vectors["sun_vector"] = prior.sun_vector or batch.sun_vector
+        vectors["position_km"] = prior.position_km or batch.position_km
+    if (measured := batch.measurement) is not None:
+        cells |= {"tracker": measured.tracker or "", "frame": measured.frame}
+        vectors["measured_quaternion"] = measured.quaternion
+        vectors["measured_sigma_arcsec"] = measured.sigma_arcsec
+        if measured.covariance_arcsec2 is not None:
+            (p11, p12, p13), (_, p22, p23), (_, _, p33) = measured.covariance_arcsec2
+            vectors["measured_covariance_arcsec2"] = (p11, p12, p13, p22, p23, p33)
+    for name, columns in VECTORS.items():
+        cells |= number_cells(zip(columns, vectors[name] or (), strict=False))
+    options = batch.options.model_dump(mode="json", exclude_defaults=True)
+    if options:
+        cells["options"] = json.dumps(options, separators=(",", ":"))
+    return cells
+
+
 MAX_ROWS = MAX_STARS_PER_TRACKER * MAX_TRACKERS
 BATCH_ROWS = RowKind(
     "batch",
-    csv_columns.KEY,
-    csv_columns.COLUMNS,
-    texts=frozenset((*csv_columns.TEXTS, "tracker", "options", "sun_pointed", "a_priori_from")),
-    verbatim=frozenset(csv_columns.VERBATIM),
-    check_header=csv_columns.checked_header,
+    KEY,
+    COLUMNS,
+    texts=frozenset((*TEXTS, "tracker", "options", "sun_pointed", "a_priori_from")),
+    verbatim=frozenset(VERBATIM),
+    check_header=checked_header,
     ordered_by_time=False,
 )
 
@@ -51,7 +297,7 @@ class JoinedRows(ABC):
         if self.fault is None:
             try:
                 self.take(row)
-            except csv_columns.BadCell as bad:
+            except BadCell as bad:
                 self.refuse(number, bad.fault(number))
 
     @abstractmethod
@@ -113,7 +359,7 @@ def joined_lines(rows: Iterator[Row], kind: type[JoinedRows]) -> Iterator[Line]:
 class BatchRows(JoinedRows):
     """The rows of one batch: its own fields once, then a star a row."""
 
-    key_columns = csv_columns.KEY
+    key_columns = KEY
     may_lack = "the batch may lack a star"
     refuses_faulty_rows = True
 
@@ -129,29 +375,25 @@ class BatchRows(JoinedRows):
         """Take the cells of a row; raises `BadCell`."""
         self.rows += 1
         if self.rows > MAX_ROWS:
-            raise csv_columns.BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
+            raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
         if self.rows == 1:
-            self.first, self.fields = row, csv_columns.batch_fields(row)
-        for column in csv_columns.BATCH_COLUMNS:
+            self.first, self.fields = row, batch_fields(row)
+        for column in BATCH_COLUMNS:
             if row.get(column, "") != self.first.get(column, ""):
                 message = f"differs from line {self.number}, the first of the batch"
-                raise csv_columns.BadCell(column, message, row[column])
+                raise BadCell(column, message, row[column])
         if "measurement" in self.fields:
             if self.rows > 1:
-                raise csv_columns.BadCell("batch", "has a second measured attitude", self.key[-1])
-            if cell := next(
-                (row[each] for each in csv_columns.STAR_COLUMNS[1:] if row.get(each)), None
-            ):
-                raise csv_columns.BadCell("batch", "has stars beside a measured attitude", cell)
+                raise BadCell("batch", "has a second measured attitude", self.key[-1])
+            if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
+                raise BadCell("batch", "has stars beside a measured attitude", cell)
             return
         stars = self.trackers.setdefault(row["tracker"], [])
-        if any(row.get(column) for column in csv_columns.STAR_COLUMNS[1:]):
-            stars.append(csv_columns.star_of(row))
-        if lines := csv_columns.lines_of(row):
+        if any(row.get(column) for column in STAR_COLUMNS[1:]):
+            stars.append(star_of(row))
+        if lines := lines_of(row):
             if row["tracker"] in self.rasters:
-                raise csv_columns.BadCell(
-                    next(iter(lines)), "has lines of the tracker a second time"
-                )
+                raise BadCell(next(iter(lines)), "has lines of the tracker a second time")
             self.rasters[row["tracker"]] = lines
 
     def body(self) -> Mapping[str, Any]:
@@ -169,29 +411,26 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     A Sun vector or position inside an a priori attitude is written as the
     batch's own, which means the same.
     """
-    writer = csv.DictWriter(stream, csv_columns.COLUMNS, restval="", lineterminator="\n")
+    writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
     for batch in batches:
-        common = _neutralised(csv_columns.batch_cells(batch))
+        common = _neutralised(batch_cells(batch))
         if batch.measurement is not None:
             writer.writerow(common)
         for tracker in batch.observations:
             tracker_cells = {**common, "tracker": neutralised(tracker.tracker)}
             if not tracker.stars:
-                writer.writerow({**tracker_cells, **csv_columns.list_cells(tracker)})
+                writer.writerow({**tracker_cells, **list_cells(tracker)})
             for star in tracker.stars:
-                numbers = star.model_dump(exclude_none=True, include={*csv_columns.STAR_NUMBERS})
-                direction = zip(csv_columns.DIRECTION, star.vector or (), strict=False)
+                numbers = star.model_dump(exclude_none=True, include={*STAR_NUMBERS})
+                direction = zip(DIRECTION, star.vector or (), strict=False)
                 cells = {
-                    **csv_columns.number_cells(direction),
-                    **csv_columns.number_cells(numbers.items()),
+                    **number_cells(direction),
+                    **number_cells(numbers.items()),
                 }
-                writer.writerow({**tracker_cells, **cells, **csv_columns.list_cells(star)})
+                writer.writerow({**tracker_cells, **cells, **list_cells(star)})
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:
     """Cells whose texts no spreadsheet takes for formulas."""
-    return {
-        name: neutralised(cell) if name in csv_columns.VERBATIM else cell
-        for name, cell in cells.items()
-    }
+    return {name: neutralised(cell) if name in VERBATIM else cell for name, cell in cells.items()}

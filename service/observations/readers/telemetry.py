@@ -16,8 +16,15 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.observations.readers.csv_columns import COLUMNS, BadCell, number_cell
-from service.observations.readers.csv_rows import BATCH_ROWS, BatchRows, JoinedRows, joined_lines
+from service.observations.readers.csv_rows import (
+    BATCH_ROWS,
+    COLUMNS,
+    BadCell,
+    BatchRows,
+    JoinedRows,
+    joined_lines,
+    number_cell,
+)
 from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
 from service.observations.readers.decompress import Line, physical_lines
 from service.times import parse_utc
