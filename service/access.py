@@ -35,8 +35,8 @@ from service.missions.mission import Mission, mission_named
 from service.storage.models.access import AuditEntry, NewToken, Scope, Token, TokenState
 from service.storage.models.base import Page
 from service.storage.recording.ids import Ulids
-from service.storage.sql.access_tables import access_sessions, access_tokens, audit
 from service.storage.sql.columns import Row
+from service.storage.sql.tables import access_sessions, access_tokens, audit
 from service.times import DAY_S, Utc, shifted, utc_now
 
 MAX_BODY_KEPT = 4_000

@@ -29,7 +29,7 @@ from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models import advice as records
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import BatchSample, sample_batches
+from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 

@@ -42,7 +42,7 @@ from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch
 from service.storage import calibrations
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import sample_batches
+from service.storage.queries.results import sample_batches
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector

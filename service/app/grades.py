@@ -22,17 +22,16 @@ from service.missions.mission import Mission, mission_named
 from service.storage.archive.reading import holds_any
 from service.storage.grades import days as recorded_days
 from service.storage.grades import period
+from service.storage.grades.days import live_attitude
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.grades.rows import live_attitude
 from service.storage.models.base import Page
 from service.storage.models.products import DefinitiveJob, Innovation, LiveAttitude
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.access_tables import audit
 from service.storage.sql.grade_tables import gyro_blocks
-from service.storage.sql.tables import batches, results
+from service.storage.sql.tables import audit, batches, results
 from service.times import DAY_S, Utc, bucket_start, recorded_utc, shifted, utc_now
 
 log = logging.getLogger(__name__)

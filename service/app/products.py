@@ -17,7 +17,7 @@ from service.products import attitudes as attitude_series
 from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
 from service.settings import Settings
-from service.storage.grades.rows import count_samples_of, graded_pages
+from service.storage.grades.days import count_samples_of, graded_pages
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter

@@ -18,17 +18,20 @@ from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.storage.queries import results
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period
-from service.storage.queries.recorded_batch import (
+from service.storage.queries.results import (
+    OutcomeName,
+    StatusName,
     batch_with_options,
+    neighbours,
+    place_of,
     recorded_batch,
     recorded_mission,
     sample_batches,
 )
-from service.storage.queries.results import OutcomeName, StatusName, neighbours, place_of
 from service.storage.queries.star_field import StarField, star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid

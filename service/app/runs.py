@@ -14,8 +14,14 @@ from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
-from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
-from service.storage.models.runs import Forgotten, Run, RunState
+from service.storage.models.runs import (
+    Forgotten,
+    RatesOfRuns,
+    Run,
+    RunChange,
+    RunComparison,
+    RunState,
+)
 from service.storage.queries import fleet, histories
 from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter

@@ -22,8 +22,7 @@ from service.products.tables import Page as TablePage
 from service.storage import gyro as blocks
 from service.storage.models import spacecraft as records
 from service.storage.models.base import Page
-from service.storage.models.overview import Overview
-from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches

@@ -17,7 +17,7 @@ from service.acquire import Acquisition
 from service.advice.advice import RunAgain
 from service.alarms.quantities import QUANTITIES
 from service.observations.batch import ObservationBatch
-from service.storage.models import compare as records
+from service.storage.models import runs as records
 from service.storage.models.answers import StarCounts
 from service.storage.recording.answer import StarRow, star_rows
 from service.storage.recording.result_metrics import metrics_of

@@ -29,8 +29,7 @@ from service.observations.batch import ObservationBatch
 from service.observations.faults import faults_of
 from service.observations.schema import OptionsIn, Submission, submission_from_json
 from service.sky.model import SkyModel
-from service.storage.queries.recorded_batch import batch_with_options
-from service.storage.queries.results import read_parent
+from service.storage.queries.results import batch_with_options, read_parent
 from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,

@@ -14,7 +14,7 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.with_archive import count
 from service.storage.sql.tables import batches, results
 from service.storage.upkeep import archiving
-from service.storage.upkeep.restoring import PartFilter, restore
+from service.storage.upkeep.archiving import PartFilter, restore
 from service.times import shifted
 from tests.storage.samples import START
 

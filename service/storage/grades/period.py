@@ -25,13 +25,12 @@ from service.grades.day import (
 )
 from service.gyro import texts_of
 from service.missions.mission import Mission
-from service.storage.grades.days import DayKey, GradedDayRow, shown
+from service.storage.grades.days import BLOCKS, PLACE, DayKey, GradedDayRow, block_conditions, shown
 from service.storage.grades.inputs import inside
-from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
 from service.storage.models.base import Page
 from service.storage.models.products import Innovation
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
-from service.storage.queries.limits import limits_of
+from service.storage.queries.alarms import limits_of
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days

@@ -13,7 +13,7 @@ from service.gyro import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns

@@ -14,7 +14,7 @@ from service.calibration.linearise import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
 from service.storage import calibrations as models
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.web.api.batches import COMPARISON_S
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params

@@ -6,7 +6,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.observations.schema import APrioriIn, Key, Wire
-from service.storage.models.overview import Dropped, ZoneCache, ZoneList
+from service.storage.models.spacecraft import Dropped, ZoneCache, ZoneList
 from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import CallerDep
 from service.web.requests.dependencies import AppDep, json_response

@@ -307,7 +307,7 @@ def test_a_damaged_part_ends_it_by_name_and_what_was_done_stays(archived, place)
 def test_an_archive_of_another_database_is_refused(archived, place, tmp_path):
     from service.app.factory import open_app
     from service.settings import Settings
-    from service.storage.upkeep.restoring import PartFilter, restore
+    from service.storage.upkeep.archiving import PartFilter, restore
 
     other = open_app(Settings(database=f"sqlite:///{tmp_path / 'other.db'}", replay_processes=0))
     try:

@@ -12,7 +12,7 @@ from starlette.responses import Response
 from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.compare import Comparison, RatesOfRuns
+from service.storage.models.runs import Comparison, RatesOfRuns
 from service.times import DAY_S, parse_utc, utc_now
 from service.web.api.batches import COMPARISON_S
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
