@@ -23,8 +23,13 @@ from service.errors import Busy
 from service.settings import is_loopback
 from service.web.requests.access import authorize, entry_of, is_open
 from service.web.requests.metrics import Metrics
-from service.web.requests.problem_types import WRONG_HOST, ProblemType
-from service.web.requests.problems import error_response, internal_error, problem_response
+from service.web.requests.problems import (
+    WRONG_HOST,
+    ProblemType,
+    error_response,
+    internal_error,
+    problem_response,
+)
 from service.web.requests.request_body import BodyBudget
 
 log = logging.getLogger(__name__)

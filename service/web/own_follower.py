@@ -25,10 +25,9 @@ from service.errors import (
 from service.extras import require_extra
 from service.follow.source import EXPECTED, Source, refusals_of, server_and_stream
 from service.settings import Settings
-from service.web.requests.dependencies import json_response
+from service.web.requests.access import json_response
 from service.web.requests.metrics import Metrics
-from service.web.requests.problem_types import INTERNAL_ERROR, problem_type_of
-from service.web.requests.problems import FAILED
+from service.web.requests.problems import FAILED, INTERNAL_ERROR, problem_type_of
 from service.web.requests.request_body import MAX_JSON_BYTES, refused
 
 if TYPE_CHECKING:

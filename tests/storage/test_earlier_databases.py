@@ -27,7 +27,7 @@ from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
 from service.storage.upkeep.verify import earlier_results, verify
 from service.web.app import create_app
-from service.web.requests.problem_types import types_with_pages
+from service.web.requests.problems import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
 from tests.scale import some_in_a_sitting
 from tests.waiting import wait_until

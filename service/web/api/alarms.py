@@ -15,8 +15,14 @@ from service.observations.schema import Key, Wire
 from service.storage.models import alarms as models
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    page_response,
+    require_all_spacecraft,
+)
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
 

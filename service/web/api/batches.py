@@ -18,12 +18,14 @@ from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroS
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep, require_scope
-from service.web.requests.dependencies import (
+from service.web.requests.access import (
     AppDep,
+    CallerDep,
+    ChangeDep,
     MetricsDep,
     json_response,
     page_response,
+    require_scope,
 )
 from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who

@@ -18,8 +18,7 @@ from service.storage.models.runs import Comparison
 from service.web.api.batches import COMPARISON_S
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, ChangeDep, json_response, page_response
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 

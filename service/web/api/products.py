@@ -28,8 +28,7 @@ from service.storage.models.products import (
 from service.storage.tracks import TrackList
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, author
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, author, json_response, page_response
 from service.web.requests.exports import ExportsDep, attached_as
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model

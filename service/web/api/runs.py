@@ -15,8 +15,13 @@ from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
-from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
-from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    require_all_spacecraft,
+)
 from service.web.requests.query_parameters import FromQuery, Query
 from service.web.requests.request_body import (
     MAX_JSON_BYTES,

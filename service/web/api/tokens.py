@@ -12,8 +12,14 @@ from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.web.openapi import LINK, ApiRouter, Returns
-from service.web.requests.access import COOKIE, CallerDep, ChangeDep
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import (
+    COOKIE,
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    page_response,
+)
 from service.web.requests.query_parameters import AuditQuery, FromQuery
 from service.web.requests.request_body import JsonBody, SessionBody, read_model
 
