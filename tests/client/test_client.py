@@ -35,8 +35,8 @@ from acquire_client import (
     operations,
     spacecraft,
 )
-from acquire_client._sync import batches, connection, replays
 from acquire_client._sync import client as whole
+from acquire_client._sync import connection
 from acquire_client.encoding import json_of
 from acquire_client.errors import problem_of
 from sqlalchemy import update
@@ -68,7 +68,7 @@ def test_the_examples_of_the_methods_give_what_they_show(client, example, tmp_pa
     (tmp_path / "pass.ndjson").write_text(json.dumps(example) + '\n{"cut": \n', "utf-8")
     monkeypatch.chdir(tmp_path)
     tried = 0
-    for module in (batches, spacecraft, operations, replays, whole):
+    for module in (spacecraft, operations, whole):
         found = doctest.testmod(
             module, extraglobs={"client": client, "batch": example, "block": GYRO}
         )

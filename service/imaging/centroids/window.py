@@ -12,7 +12,6 @@ from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
-from scipy.ndimage import correlate
 
 from service.errors import BadInput, Fault
 from service.observations.scans.profile import BREAKDOWN_RATIO
@@ -312,6 +311,9 @@ def symmetric_square_about(window: Window, column: int, row: int, half: int) -> 
 
 def brightest_pixel(window: Window) -> tuple[int, int]:
     """(column, row) of the brightest 3 x 3 pixels, by their middle; a full pixel counts as full."""
+    # The service starts with this module, and without scipy.
+    from scipy.ndimage import correlate
+
     counts = np.minimum(window.counts, window.detector.saturation_counts) - window.background_counts
     known = np.isfinite(counts) if window.good is None else np.isfinite(counts) & window.good
     summed = correlate(np.where(known, counts, 0.0), np.ones((3, 3)), mode="constant")
