@@ -68,7 +68,7 @@ def test_the_examples_of_the_methods_give_what_they_show(client, example, tmp_pa
     (tmp_path / "pass.ndjson").write_text(json.dumps(example) + '\n{"cut": \n', "utf-8")
     monkeypatch.chdir(tmp_path)
     tried = 0
-    for module in (spacecraft, operations, whole):
+    for module in (whole, spacecraft, operations):
         found = doctest.testmod(
             module, extraglobs={"client": client, "batch": example, "block": GYRO}
         )
