@@ -24,12 +24,7 @@ from service.storage.gyro import Recorded
 from service.storage.models import runs as records
 from service.storage.models.base import FieldFault
 from service.storage.models.runs import Replay, ReplayStateName
-from service.storage.queries.replays import (
-    CANCELLED,
-    insert_replay,
-    is_cancelled,
-    update_replay,
-)
+from service.storage.queries import replays
 from service.storage.recording import events
 from service.storage.recording.unsaved_result import Answered
 from service.storage.store import Store
@@ -102,7 +97,7 @@ class ProgressRecorder:
         )
 
         def store(connection: Connection) -> None:
-            insert_replay(connection, replay)
+            replays.insert_replay(connection, replay)
             also(connection)
             events.add_event(connection, "replay", progress, run=self.run)
 
@@ -142,11 +137,11 @@ class ProgressRecorder:
 
         def store(connection: Connection) -> None:
             stored = progress
-            if is_cancelled(connection, self.id):
+            if replays.is_cancelled(connection, self.id):
                 self._on_cancelled()
                 ended = finished or self._now()
-                stored = structs.replace(progress, state=CANCELLED, finished=ended)
-            update_replay(connection, stored, packets, errors)
+                stored = structs.replace(progress, state=replays.CANCELLED, finished=ended)
+            replays.update_replay(connection, stored, packets, errors)
             events.add_event(connection, "replay", stored, run=self.run)
 
         self.require_saved()
@@ -430,7 +425,7 @@ class RunningReplay:
                 if close is not None:
                     close()
                 if self._cancelled and state == "interrupted":
-                    state = CANCELLED
+                    state = replays.CANCELLED
                 self._progress.conclude(state, self._closing)
                 self._ended(state)
             finally:

@@ -14,6 +14,7 @@ import msgspec
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from service import vectors
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.observations.batch import ObservationBatch
@@ -23,13 +24,6 @@ from service.observations.schema import RunName, Submission, submission_from_jso
 from service.packets.reader import PacketReader, file_lines
 from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.times import Utc
-from service.vectors import (
-    Matrix,
-    Vector,
-    matrix_from_quaternion,
-    quaternion_from_matrix,
-    rotate_about,
-)
 
 Problem = dict[str, Any]
 
@@ -231,9 +225,9 @@ CARRIED_WITHIN_S = 3600.0
 class _KnownAttitude:
     """The attitude (3, 3), inertial to body, found for a batch."""
 
-    attitude: Matrix
+    attitude: vectors.Matrix
     time: Utc
-    rates_deg_per_s: Vector
+    rates_deg_per_s: vectors.Vector
 
 
 class AttitudeCarrier:
@@ -261,7 +255,9 @@ class AttitudeCarrier:
         rates = [each for each in (known.rates_deg_per_s, batch.body_rates_deg_per_s) if each.any()]
         rates_deg_per_s = np.mean(rates, axis=0) if rates else np.zeros(3)
         body = json.loads(item.submission.text)
-        quaternion = quaternion_from_matrix(turned(known.attitude, rates_deg_per_s, passed_s))
+        quaternion = vectors.quaternion_from_matrix(
+            turned(known.attitude, rates_deg_per_s, passed_s)
+        )
         body["a_priori"] = {"quaternion": quaternion.tolist(), "frame": "EME2000"}
         return replace(item, submission=submission_from_json(json.dumps(body)))
 
@@ -274,7 +270,9 @@ class AttitudeCarrier:
             return
         batch = outcome.item.submission.batch
         self._known[batch.spacecraft] = _KnownAttitude(
-            matrix_from_quaternion(attitude["quaternion"]), batch.time, batch.body_rates_deg_per_s
+            vectors.matrix_from_quaternion(attitude["quaternion"]),
+            batch.time,
+            batch.body_rates_deg_per_s,
         )
 
 
@@ -288,7 +286,9 @@ def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
     return both
 
 
-def turned(attitude: Matrix, rates_deg_per_s: Vector, seconds: float) -> Matrix:
+def turned(
+    attitude: vectors.Matrix, rates_deg_per_s: vectors.Vector, seconds: float
+) -> vectors.Matrix:
     """The attitude after the body has turned with constant rates, in body axes, for a time."""
     # A direction fixed in inertial space turns the other way in the body.
-    return rotate_about(-np.radians(rates_deg_per_s) * seconds, attitude.T).T
+    return vectors.rotate_about(-np.radians(rates_deg_per_s) * seconds, attitude.T).T

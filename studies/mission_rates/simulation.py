@@ -29,15 +29,8 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
 from service.vectors import Vector, from_ra_dec, to_ra_dec
+from studies.paper_1994 import tally
 from studies.paper_1994.printed import PrintedCounts, Reference, Run, World
-from studies.paper_1994.tally import (
-    AMBIGUOUS,
-    CORRECT,
-    MISIDENTIFIED,
-    UNMATCHED,
-    Integers,
-    counts_of,
-)
 from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone
 from studies.workers import mapping, number_of
 
@@ -266,10 +259,10 @@ CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
 """The sigma in place of no error at all, by which the bound could not be divided."""
 OUTCOMES = {
-    "unique_right": CORRECT,
-    "ambiguous": AMBIGUOUS,
-    "unmatched": UNMATCHED,
-    "wrong": MISIDENTIFIED,
+    "unique_right": tally.CORRECT,
+    "ambiguous": tally.AMBIGUOUS,
+    "unmatched": tally.UNMATCHED,
+    "wrong": tally.MISIDENTIFIED,
 }
 
 
@@ -330,7 +323,7 @@ def simulate(
     return [_rates(*each) for each in zip(plan.settings, by_setting, strict=True)]
 
 
-def _rates(setting: Setting, counts: Integers) -> Rates:
+def _rates(setting: Setting, counts: tally.Integers) -> Rates:
     """The rates of counts (zones, 4)."""
     total = counts.sum(axis=1)
     zone = np.repeat(np.arange(len(total)), total)
@@ -339,7 +332,7 @@ def _rates(setting: Setting, counts: Integers) -> Rates:
     return Rates(setting=setting, stars=int(total.sum()), **shares)
 
 
-def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
+def zone_counts(plan: Plan, number: int, sky: SkyModel) -> tally.Integers:
     """The outcome of one zone's stars: counts (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
@@ -351,7 +344,7 @@ def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
                 found = acquire_many(BatchColumns.of(batches), mission, sky)
                 for row, view in enumerate(views):
                     identified = found.acquisition(row).trackers[0].identification
-                    counts[place] += counts_of(identified, view.star)
+                    counts[place] += tally.counts_of(identified, view.star)
     return counts
 
 
@@ -397,7 +390,7 @@ def _run(errors: Errors) -> Run:
     )
 
 
-def _zone_counts(plan: Plan, catalog: Path | None, number: int) -> Integers:
+def _zone_counts(plan: Plan, catalog: Path | None, number: int) -> tally.Integers:
     return zone_counts(plan, number, _sky(catalog))
 
 

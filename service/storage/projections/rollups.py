@@ -26,13 +26,7 @@ from sqlalchemy import (
 )
 
 from service.storage.queries.time_buckets import TRENDS, Bucket, Trend
-from service.storage.recording.result_metrics import (
-    OF_TRACKERS,
-    SUMMED,
-    SUMMED_OF_TRACKERS,
-    merge,
-    rolled_up,
-)
+from service.storage.recording import result_metrics
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
@@ -156,7 +150,7 @@ def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
     of_hour: dict[tuple[str, str, str, int], list[Row]] = {}
     for (spacecraft, run, hour), row in new:
         of_hour.setdefault((spacecraft, run, row.get("tracker", WHOLE), hour), []).append(row)
-    _add_hours(connection, {key: rolled_up(rows) for key, rows in of_hour.items()})
+    _add_hours(connection, {key: result_metrics.rolled_up(rows) for key, rows in of_hour.items()})
 
 
 def add_shares(
@@ -242,9 +236,13 @@ def _of_hour(connection: Connection, key: BucketKey) -> Rollups:
 
 def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
     """The rollups of some results by tracker, that of the `WHOLE` first."""
-    whole = connection.execute(select(*SUMMED.values()).where(*chosen)).mappings().one()
+    whole = (
+        connection.execute(select(*result_metrics.SUMMED.values()).where(*chosen)).mappings().one()
+    )
     tracker = tracker_values.c.tracker
-    query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
+    query = select(tracker, *result_metrics.SUMMED_OF_TRACKERS.values()).select_from(
+        result_metrics.OF_TRACKERS
+    )
     of_tracker: Rollups = {WHOLE: dict(whole)}
     for found in connection.execute(query.where(*chosen).group_by(tracker)).mappings():
         row = dict(found)
@@ -270,7 +268,7 @@ def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Roll
 
 def _put(found: Rollups, key: Any, row: Row) -> None:
     if key in found:
-        merge(found[key], row)
+        result_metrics.merge(found[key], row)
     else:
         # A copy: merging changes it in place.
         found[key] = dict(row)
@@ -296,7 +294,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         results, batches, results.c.batch_id == batches.c.id
     )
     if of_trackers:
-        source = OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
+        source = result_metrics.OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
         query = select(tracker_values, *place).select_from(source)
     width_s = TRENDS[bucket].width_s
     found: Rollups = {}
@@ -308,7 +306,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         tracker = (row["tracker"],) if of_trackers else ()
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number
-        _put(found, key, rolled_up([dict(row)]))
+        _put(found, key, result_metrics.rolled_up([dict(row)]))
     for spacecraft, run, name, hour, share in _shares(connection):
         if (name != WHOLE) == of_trackers:
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)

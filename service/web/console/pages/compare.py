@@ -15,13 +15,8 @@ from service.observations.schema import Key, OptionsIn, RunName
 from service.storage.models.runs import Comparison, RatesOfRuns
 from service.times import DAY_S, parse_utc, utc_now
 from service.web.api.batches import COMPARISON_S
+from service.web.console import options
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.options import (
-    asked_options,
-    faults_of_form,
-    fields_of,
-    settings_of_mission,
-)
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
@@ -65,7 +60,7 @@ async def _query(request: Request) -> CompareQuery:
     try:
         return CompareQuery.model_validate(plain)
     except ValidationError as error:
-        raise BadBatch(faults_of_form(error)) from None
+        raise BadBatch(options.faults_of_form(error)) from None
 
 
 @console_page("/compare", "Compare", Policy("read", "nothing"), position=40)
@@ -82,7 +77,7 @@ def compare_page(
     if pair is not None and (query.other is not None or query.spacecraft is None):
         runs = context.app.runs.compare_latest(*pair, start, end)
         rates = _drawn(context.app.runs.rates(*pair, start, end))
-    asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
+    asked = {side: options.asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
     if query.spacecraft is not None and query.other is None:
         context.caller.require(query.spacecraft)
@@ -110,8 +105,8 @@ def compare_page(
         rates=rates,
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
-        forms={side: fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
-        now={} if mission is None else settings_of_mission(mission),
+        forms={side: options.fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
+        now={} if mission is None else options.settings_of_mission(mission),
         result=result,
         sides=SIDES,
         matrix=_matrix(result),
