@@ -9,12 +9,13 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from typing import Unpack
 
 from msgspec import structs
 from sqlalchemy import Connection, func, select
 
 from service.acquire.kernel_build import KernelBuild
-from service.app.context import Context, checked_run_name
+from service.app.context import Context, PageOfPeriod, checked_run_name
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import LOOK_AHEAD_S, day_bounds, grade_day, window_of
@@ -116,21 +117,9 @@ class Grades:
             step(progress)
         return progress
 
-    def innovations(
-        self,
-        name: str,
-        *,
-        run: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        limit: int = 100,
-        cursor: str | None = None,
-    ) -> Page[Innovation]:
+    def innovations(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[Innovation]:
         """How the measured attitudes of a period met the filter, the earliest first."""
-        self._context.mission(name)
-        selected = ResultFilter(run or LIVE, name, start, end)
-        with self._context.reading() as connection:
-            return period.list_innovations(connection, selected, limit=limit, cursor=cursor)
+        return self._context.page(period.list_innovations, ResultFilter, name, asked)
 
     def of_period(self, name: str, run: str, start: Utc, end: Utc) -> period.GradesOfPeriod | None:
         """A bounded number of samples and innovations of a period; None where none are recorded."""

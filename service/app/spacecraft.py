@@ -4,14 +4,15 @@ Also their gyro blocks: recorded once, however often they are sent, and read bac
 """
 
 from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, Unpack
 
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
 from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
-from service.app.context import Context, known_id
+from service.app.context import Context, PageOfPeriod, known_id
 from service.errors import BadBatch, Fault, shown_value
 from service.gyro import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
@@ -79,23 +80,10 @@ class Spacecraft:
                 history=histories.mission_history(connection, name),
             )
 
-    def attitudes(
-        self,
-        name: str,
-        *,
-        run: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        limit: int = 100,
-        cursor: str | None = None,
-    ) -> Page[records.AttitudeRow]:
+    def attitudes(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.AttitudeRow]:
         """The attitudes of current results, oldest batch time first."""
-        self._context.mission(name)
-        stretch = ResultFilter(run or LIVE, name, start, end)
-        with self._context.reading() as connection:
-            return histories.list_attitudes(
-                connection, self._context.store.archive, stretch, limit=limit, cursor=cursor
-            )
+        listing = partial(histories.list_attitudes, archive=self._context.store.archive)
+        return self._context.page(listing, ResultFilter, name, asked)
 
     def rates(
         self,
@@ -325,21 +313,9 @@ class Gyro:
             lambda connection: blocks.record_block(connection, block, row)
         ).result
 
-    def page(
-        self,
-        name: str,
-        *,
-        run: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        limit: int = 100,
-        cursor: str | None = None,
-    ) -> Page[GyroBlockRow]:
+    def page(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[GyroBlockRow]:
         """The blocks of a period without their samples, the earliest first."""
-        self._context.mission(name)
-        selected = blocks.BlockFilter(name, run or LIVE, start, end)
-        with self._context.reading() as connection:
-            return blocks.list_blocks(connection, selected, limit=limit, cursor=cursor)
+        return self._context.page(blocks.list_blocks, blocks.BlockFilter, name, asked)
 
     def get(self, name: str, id: str) -> GyroSamples:
         """A block of a spacecraft with its samples."""

@@ -53,9 +53,9 @@ class Retired:
 
 def list_attitudes(
     connection: Connection,
-    archive: Archive,
     selected: pages.ResultFilter,
     *,
+    archive: Archive,
     limit: int,
     cursor: str | None,
 ) -> Page[AttitudeRow]:
