@@ -20,7 +20,7 @@ from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
-from service.observations.readers.decompress import Coding, unpacked_lines
+from service.observations.decompress import Coding, unpacked_lines
 from service.packets.reader import PacketLines
 from service.storage.gyro import Recorded
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines

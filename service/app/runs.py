@@ -181,8 +181,8 @@ class Runs:
 
         Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
         """
-        from service.ingest.partitions.coordinator import reprocess_partitions
-        from service.ingest.partitions.tasks import LocalProcesses, OwnProcess, Workers
+        from service.ingest.partition_coordinator import reprocess_partitions
+        from service.ingest.partition_tasks import LocalProcesses, OwnProcess, Workers
 
         plan = self._plan(run, source, spacecraft, start, end, processes)
         if plan.run == LIVE:
@@ -192,7 +192,7 @@ class Runs:
 
         def workers() -> Workers:
             if scheduler is not None:
-                from service.ingest.partitions.dask_workers import DaskWorkers
+                from service.ingest.dask_workers import DaskWorkers
 
                 return DaskWorkers(scheduler, config, folder)
             count = processes or os.cpu_count() or 1

@@ -18,7 +18,7 @@ from sqlalchemy import Connection
 
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping, problem_of
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
-from service.observations.readers.decompress import Line
+from service.observations.decompress import Line
 from service.packets.reader import PacketLines, PacketTotals
 from service.storage.gyro import Recorded
 from service.storage.models import runs as records

@@ -19,7 +19,7 @@ from msgspec import Struct
 
 from service.errors import BadFile, BadInput, Fault, shown_value
 from service.missions.mission import Mission
-from service.observations.readers.decompress import Line
+from service.observations.decompress import Line
 from service.packets.batches import (
     BatchMaker,
     MeasuredBatch,

@@ -18,9 +18,9 @@ from service import vectors
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.observations.batch import ObservationBatch
-from service.observations.readers.decompress import Line
-from service.observations.readers.telemetry import read_lines
+from service.observations.decompress import Line
 from service.observations.schema import RunName, Submission, submission_from_json
+from service.observations.telemetry import read_lines
 from service.packets.reader import PacketReader, file_lines
 from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.times import Utc

@@ -19,7 +19,7 @@ from msgspec import to_builtins
 
 from service import errors
 from service.gyro import json_of_block
-from service.observations.readers.telemetry import read_lines
+from service.observations.telemetry import read_lines
 from service.packets.reader import archive_of
 from service.replay.items import (
     AttitudeCarrier,

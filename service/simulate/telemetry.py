@@ -28,9 +28,9 @@ from service.errors import BadFile, BadInput, Fault, shown_value
 from service.missions.gyro import GyroSettings
 from service.missions.mission import Band, Mission
 from service.observations.batch import Aberration
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.telemetry import telemetry_format
+from service.observations.csv_rows import write_batches_csv
 from service.observations.schema import BatchIn
+from service.observations.telemetry import telemetry_format
 from service.simulate import motion
 from service.simulate.sightings import BatchScene, Seen, real_sky
 from service.simulate.stretches import Pass

@@ -55,9 +55,12 @@ AREAS = {
     "products": ("service/products",),
     "requests": (
         "service/web/requests",
-        "service/observations/readers",
+        "service/observations/csv_rows.py",
+        "service/observations/csv_table.py",
         "service/observations/decode.py",
+        "service/observations/decompress.py",
         "service/observations/schema.py",
+        "service/observations/telemetry.py",
     ),
 }
 SUITES: dict[str, list[str]] = {"sitting": [], "full": ["--full"]}

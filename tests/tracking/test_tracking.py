@@ -14,7 +14,7 @@ from service.errors import BadBatch
 from service.gyro import block_from_json
 from service.missions.gyro import GyroSettings
 from service.missions.mission import load_missions
-from service.observations.readers.csv_rows import batch_cells, batch_fields
+from service.observations.csv_rows import batch_cells, batch_fields
 from service.observations.schema import (
     BatchIn,
     OptionsIn,

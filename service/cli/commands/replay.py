@@ -238,7 +238,7 @@ def _is_in_bulk(parsed: Namespace) -> bool:
 
 def _checked_files(parsed: Namespace) -> list[Path]:
     """The files to send; one that is missing or is no telemetry is refused before that."""
-    from service.observations.readers.telemetry import require_telemetry
+    from service.observations.telemetry import require_telemetry
 
     if bool(parsed.files) == bool(parsed.packets):
         raise BadInput(

@@ -300,7 +300,7 @@ def _run_telemetry(parsed: Namespace) -> int:
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
-    from service.observations.readers.telemetry import telemetry_format
+    from service.observations.telemetry import telemetry_format
     from service.simulate.telemetry import GyroWanted
 
     flaws = parsed.gyro_quantum, parsed.gyro_gap, parsed.clock_step

@@ -20,8 +20,8 @@ from service.csv_cells import neutralised
 from service.errors import BadFile, Fault, shown_value
 from service.observations import schema
 from service.observations.batch import MAX_STARS_PER_TRACKER, MAX_TRACKERS
-from service.observations.readers.csv_table import CsvRow, Row, RowKind
-from service.observations.readers.decompress import Line
+from service.observations.csv_table import CsvRow, Row, RowKind
+from service.observations.decompress import Line
 from service.observations.schema import BatchIn
 
 KEY = ("spacecraft", "run", "batch")

@@ -18,7 +18,7 @@ import pyarrow as pa
 from sqlalchemy import ColumnElement, Connection, func, select
 
 from service.errors import BadBatch, Fault, shown_value
-from service.ingest.partitions.tasks import (
+from service.ingest.partition_tasks import (
     PartitionResult,
     PartitionTask,
     Source,

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.observations.readers import csv_rows
-from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
-from service.observations.readers.decompress import Line, physical_lines
+from service.observations import csv_rows
+from service.observations.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
+from service.observations.decompress import Line, physical_lines
 from service.times import parse_utc
 
 TelemetryFormat = Literal["ndjson", "csv"]
