@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol, get_args
+from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
@@ -32,12 +32,66 @@ from service.errors import (
     shown_value,
 )
 from service.missions.mission import Mission, mission_named
-from service.storage.models.access import AuditEntry, NewToken, Scope, Token, TokenState
-from service.storage.models.base import Page
+from service.storage.models.base import Id, Page, Record, Stamp, doc, list_record, page_record
 from service.storage.recording.ids import Ulids
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import access_sessions, access_tokens, audit
 from service.times import DAY_S, Utc, shifted, utc_now
+
+Scope = Literal["read", "submit", "operate"]
+
+
+class Session(Record, frozen=True, kw_only=True):
+    """The caller and its scopes."""
+
+    name: str | None
+    """The token's name, which the audit list records with each change."""
+    scopes: list[Scope]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
+
+
+TokenState = Literal["good", "expired", "revoked"]
+
+
+class Token(Record, frozen=True, kw_only=True):
+    """A token without its secret, of which only a digest is stored."""
+
+    name: Annotated[str, doc("The audit list records changes under it; never used again.")]
+    scopes: list[Scope]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
+    rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
+    created: Stamp
+    expires: Stamp
+    revoked: Stamp | None
+    state: TokenState
+
+
+class NewToken(Token, frozen=True, kw_only=True):
+    """A new token with its secret, which is shown this once."""
+
+    token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
+
+
+TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
+
+
+class AuditEntry(Record, frozen=True, kw_only=True):
+    """One change."""
+
+    component: ClassVar[str] = "AuditRow"
+    id: Id
+    moment: Stamp
+    who: Annotated[str, doc("The token's name; `local` while access is open.")]
+    action: Annotated[str, doc("The operation's name in this description.")]
+    about: Annotated[str, doc("Path and query of the request.")]
+    body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
+    status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
+
+
+AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")
+
 
 MAX_BODY_KEPT = 4_000
 

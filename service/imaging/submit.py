@@ -24,8 +24,8 @@ from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
-from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
+from service.observations.schema import faults_of
 from service.times import utc_now
 from service.vectors import Vector
 

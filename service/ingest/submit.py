@@ -26,8 +26,7 @@ from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.faults import faults_of
-from service.observations.schema import OptionsIn, Submission, submission_from_json
+from service.observations.schema import OptionsIn, Submission, faults_of, submission_from_json
 from service.sky.model import SkyModel
 from service.storage.queries.results import batch_with_options, read_parent
 from service.storage.recording.answer import answer_of

@@ -7,10 +7,20 @@ from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access import DEFAULT_DAYS, MAX_DAYS, SESSION_H, list_entries
+from service.access import (
+    DEFAULT_DAYS,
+    MAX_DAYS,
+    SESSION_H,
+    AuditPage,
+    NewToken,
+    Scope,
+    Session,
+    Token,
+    TokenList,
+    list_entries,
+)
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
-from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests.access import (
     COOKIE,

@@ -22,10 +22,9 @@ from starlette.responses import Response
 from starlette.types import Scope as HttpScope
 
 from service import logs
-from service.access import OPEN_CALLER, Access, Caller, Entry
+from service.access import OPEN_CALLER, Access, Caller, Entry, Scope
 from service.app.factory import App
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
-from service.storage.models.access import Scope
 from service.storage.models.base import Page
 from service.web.requests.metrics import Metrics
 from service.web.requests.request_body import JSON

@@ -22,7 +22,7 @@ from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
-from service.observations.faults import faults_of
+from service.observations.schema import faults_of
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
