@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from service.errors import BadInput, Fault, shown_value
-from service.settings import Settings
+from service.settings import Settings, url_of
 
 if TYPE_CHECKING:
     import httpx
@@ -287,8 +287,6 @@ def settings_of(parsed: Namespace) -> Settings:
 
 def service_url(parsed: Namespace) -> str:
     """The address of the service: that of `--url`, else where the settings have it listen."""
-    from service.settings import url_of
-
     settings = settings_of(parsed)
     return parsed.url or url_of(settings.host, settings.port)
 

@@ -11,6 +11,7 @@ from service.cli.arguments import (
     add_json,
     add_json_file,
     count,
+    mission_of_file_or_name,
     print_json,
     table,
 )
@@ -141,7 +142,6 @@ def _run_mission(parsed: Namespace) -> int:
     acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
     acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
     """
-    from service.cli.arguments import mission_of_file_or_name
     from service.settings import Settings
     from studies.mission_rates import report
     from studies.mission_rates.report import report_json, report_text

@@ -44,8 +44,7 @@ from service.storage.archive.folder import (
     manifests,
 )
 from service.storage.archive.reading import Archive, PlacedPart, parts_between
-from service.storage.queries.pages import PLACE, Place, ResultFilter
-from service.storage.queries.with_archive import bounds_of
+from service.storage.queries.pages import PLACE, Place, ResultFilter, bounds_of
 from service.storage.recording.identity import look_up
 from service.storage.sql.tables import batches, results, rollups_daily
 from service.storage.store import Store

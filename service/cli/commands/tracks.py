@@ -34,7 +34,6 @@ def run(parsed: Namespace) -> int:
     acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
     """
     from service.app.factory import open_app
-    from service.cli.arguments import written_to
     from service.cli.texts import tracks_text
 
     if parsed.output is not None and parsed.format != "tdm":
@@ -43,7 +42,7 @@ def run(parsed: Namespace) -> int:
     with closing(open_app(arguments.settings_of_existing(parsed), reads_only=True)) as app:
         found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
-            written_to(parsed.output, app.tracks.tdm(found))
+            arguments.written_to(parsed.output, app.tracks.tdm(found))
         elif parsed.format == "json":
             arguments.print_json(found)
         else:

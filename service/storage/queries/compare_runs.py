@@ -11,9 +11,8 @@ from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, selec
 
 from service.storage.archive.reading import Archive, parts_between, places
 from service.storage.models import runs as models
-from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter, newest_first
+from service.storage.queries import pages
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
-from service.storage.queries.with_archive import Listing, bounds_of
 from service.storage.sql import tables
 from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
@@ -28,7 +27,7 @@ _READ_AT_ONCE = 10_000
 def compare_runs(
     connection: Connection,
     archive: Archive,
-    selected: ResultFilter,
+    selected: pages.ResultFilter,
     other: str,
     latest: int | None = None,
 ) -> models.RunComparison:
@@ -82,7 +81,7 @@ def compare_runs(
 def changed_batches(
     connection: Connection,
     archive: Archive,
-    selected: ResultFilter,
+    selected: pages.ResultFilter,
     other: str,
     latest: int,
     limit: int,
@@ -100,14 +99,18 @@ def changed_batches(
 
 
 def _groups(
-    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
+    connection: Connection,
+    archive: Archive,
+    selected: pages.ResultFilter,
+    other: str,
+    latest: int | None,
 ) -> Iterator[tuple[Connection, Subquery]]:
     """The pairs of results of both runs with the database that they are in, latest first.
 
     Without an archive that is one group.
     """
     is_archived = any(
-        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
+        parts_between(connection, selected.spacecraft, run, *pages.bounds_of(selected))
         for run in (selected.run, other)
     )
     if not is_archived:
@@ -158,13 +161,13 @@ def _side(row: Any, side: str) -> models.RunChangeSide:
     )
 
 
-def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Subquery:
+def _pairs(selected: pages.ResultFilter, other: str, latest: int | None = None) -> Subquery:
     """The ids and states of the two current results of each batch that is in both runs."""
     again, new = batches.alias("again"), results.alias("new")
     of_run = selected.conditions()
     if latest is not None:
         # The limit comes first: to look for partners of millions of batches takes minutes.
-        chosen = newest_first(select(results.c.id).where(*of_run))
+        chosen = pages.newest_first(select(results.c.id).where(*of_run))
         of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
         select(
@@ -225,7 +228,7 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
     """The angles between the attitudes that both have, in arrays."""
     old, new = tables.solutions.alias("old_solution"), tables.solutions.alias("new_solution")
     query = (
-        select(*(each.c[name] for each in (old, new) for name in QUATERNION))
+        select(*(each.c[name] for each in (old, new) for name in pages.QUATERNION))
         .select_from(pairs)
         .join(old, old.c.result_id == pairs.c.before)
         .join(new, new.c.result_id == pairs.c.after)
@@ -248,7 +251,11 @@ _AT_ONCE = 1_000
 
 
 def both_runs(
-    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
+    connection: Connection,
+    archive: Archive,
+    selected: pages.ResultFilter,
+    other: str,
+    latest: int | None,
 ) -> Iterator["Opened"]:
     """The selected batches with those of the same names in another run, latest first.
 
@@ -256,10 +263,12 @@ def both_runs(
     database, so that any of the two may be in either place.
     """
     named = (results.c.spacecraft, batches.c.batch)
-    query = select(*PLACE, *named).join_from(results, batches, results.c.batch_id == batches.c.id)
+    query = select(*pages.PLACE, *named).join_from(
+        results, batches, results.c.batch_id == batches.c.id
+    )
     query = query.where(*selected.conditions())
-    listing, left = Listing(archive, query, selected, newest_first=True), latest
-    beyond: Place | None = None
+    listing, left = pages.Listing(archive, query, selected, newest_first=True), latest
+    beyond: pages.Place | None = None
     while left is None or left > 0:
         limit = GROUP if left is None else min(GROUP, left)
         found = listing.first_rows(connection, limit, beyond).rows

@@ -17,8 +17,8 @@ from service.storage.models.base import Page
 from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries import pages
+from service.storage.queries.pages import MOST_OPENED, Listing
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive import MOST_OPENED, Listing
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import (

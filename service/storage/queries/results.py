@@ -18,9 +18,15 @@ from service.storage.archive.reading import Archive, PlacedPart, parts_with
 from service.storage.models import answers
 from service.storage.models.answers import Answer
 from service.storage.models.base import Page
-from service.storage.queries import with_archive
-from service.storage.queries.pages import PLACE, ResultFilter, newest
-from service.storage.queries.with_archive import bounds_of, count_of_part, parts_of
+from service.storage.queries import pages
+from service.storage.queries.pages import (
+    PLACE,
+    ResultFilter,
+    bounds_of,
+    count_of_part,
+    newest,
+    parts_of,
+)
 from service.storage.recording.unsaved_result import STARS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
@@ -56,12 +62,12 @@ def list_batches(
     parts = None
     if batch is not None:
         parts = parts_with(connection, selected.spacecraft, selected.run, batch)
-    listing = with_archive.Listing(
+    listing = pages.Listing(
         archive,
         summary_query().where(*chosen),
         selected,
         newest_first=True,
-        most_opened=with_archive.MOST_OPENED,
+        most_opened=pages.MOST_OPENED,
         parts=parts,
     )
     return listing.page(connection, limit, cursor, summary_of)
@@ -261,9 +267,9 @@ def _next(
     connection: Connection, archive: Archive, place: ResultPlace, *, newest_first: bool
 ) -> answers.Summary | None:
     selected = ResultFilter(place.run, place.spacecraft)
-    beyond = place.time_ns, with_archive.FIRST_ID if newest_first else with_archive.LAST_ID
+    beyond = place.time_ns, pages.FIRST_ID if newest_first else pages.LAST_ID
     query = summary_query().where(*selected.conditions())
-    listing = with_archive.Listing(archive, query, selected, newest_first)
+    listing = pages.Listing(archive, query, selected, newest_first)
     try:
         found = listing.first_rows(connection, 1, beyond)
     except Busy:
