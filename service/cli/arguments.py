@@ -187,7 +187,7 @@ def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
-    """Add `--run`, `--start` and `--end`; see `configuration.period_of`."""
+    """Add `--run`, `--start` and `--end`; see `period_of`."""
     parser.add_argument("--run", metavar="NAME", help=run_help)
     parser.add_argument("--start", metavar="UTC", help="start of the period (batch time), included")
     parser.add_argument("--end", metavar="UTC", help="end of the period (batch time), excluded")

@@ -144,7 +144,7 @@ class Archive:
         return [Block(part, k, each.min, each.max) for k, each in enumerate(times)]
 
     def open(self, block: Block, needs: Collection[str]) -> "Opened":
-        """The results of a row group, with what is needed of them; see `opened.columns_of`."""
+        """The results of a row group, with what is needed of them; see `rows.columns_of`."""
 
         def build() -> "Opened":
             from service.storage.archive.rows import Opened, columns_of

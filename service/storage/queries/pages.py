@@ -163,7 +163,7 @@ class Listing:
     newest_first: bool = False
     needs: Collection[str] = ()
     """What it needs of the archive beside the columns of results and batches: names of
-    `opened.WHOLE`."""
+    `rows.WHOLE`."""
     most_opened: int | None = None
     parts: Collection[int] | None = None
     """The ids of the only parts to look in."""
