@@ -22,9 +22,8 @@ from service.app.factory import App, open_app
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
-from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
 from service.web.app import create_app
 from tests.web.browser import CHROMIUM, Browser, chromium
 from tests.web.serving import Server

@@ -27,10 +27,9 @@ from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.resources import shipped
 from service.settings import PREFIX, Settings, require_free, url_of
-from service.simulate.gyro import GyroWanted, with_gyro
+from service.simulate import telemetry
 from service.simulate.score import Score, score, score_table, together
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass, read_objects, truth_path, write_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
@@ -41,7 +40,7 @@ START = "1999-03-01T00:00:00.000Z"
 """The start of every pass: a day on which all three were at work."""
 WIDTH_S = 20 * HOUR_S
 """How long a pass lasts: within the day that the console shows first."""
-GYRO = GyroWanted(step_s=10.0)
+GYRO = telemetry.GyroWanted(step_s=10.0)
 """The gyro beside a pass: coarse in time, so that 20 hours are 7,200 samples."""
 START_S = 300.0
 """The longest that the server may take to be ready once its kernels are compiled."""
@@ -102,7 +101,9 @@ def run_demo(
                     concurrency=CONCURRENCY,
                     watched_run=run,
                 )
-            scores[name] = score(_answers(results), read_objects(truth_path(file)))
+            scores[name] = score(
+                _answers(results), telemetry.read_objects(telemetry.truth_path(file))
+            )
         whole_s = time.perf_counter() - started
         if as_json:
             seconds = {"seconds": whole_s, "seconds_until_ready": ready_s}
@@ -202,14 +203,16 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
     sky, missions = SkyModel(load_embedded(), LruCache(64 << 20)), load_missions()
     files = [folder / f"{name.lower()}.ndjson" for name in MISSIONS]
     for name, file in zip(MISSIONS, files, strict=True):
-        drawn = draw_pass(missions[name], sky, wanted)
-        write_pass(with_gyro(drawn, missions[name], GYRO, WIDTH_S, wanted.seed), file)
+        drawn = telemetry.draw_pass(missions[name], sky, wanted)
+        telemetry.write_pass(
+            telemetry.with_gyro(drawn, missions[name], GYRO, WIDTH_S, wanted.seed), file
+        )
     return files
 
 
 def _answers(results: Path) -> Iterator[dict[str, Any]]:
     """The answers to the batches, without the records that answer gyro blocks."""
-    return (each for each in read_objects(results) if "block" not in each)
+    return (each for each in telemetry.read_objects(results) if "block" not in each)
 
 
 def _digest(files: Sequence[Path]) -> str:

@@ -13,8 +13,7 @@ from erfa import ufunc
 from pydantic import AfterValidator, Field, ValidationError, model_validator
 
 from service.errors import BadBatch, Conflict, Fault, shown_value
-from service.observations.faults import faults_of
-from service.observations.schema import Key, Number, RunName, Wire, is_time
+from service.observations.schema import Key, Number, RunName, Wire, faults_of, is_time
 from service.times import DAY_S, Utc, parse_utc, shifted
 from service.vectors import Vector, read_only
 

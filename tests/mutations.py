@@ -34,13 +34,12 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import FrameLimits
 from service.missions.mission import SHIPPED_FOLDER, load_missions, read_mission
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.decompress import MAX_LINE_BYTES, unpacked_lines
-from service.observations.readers.telemetry import read_lines
+from service.observations.csv_rows import write_batches_csv
+from service.observations.decompress import MAX_LINE_BYTES, unpacked_lines
 from service.observations.schema import BatchIn, submission_from_json
+from service.observations.telemetry import read_lines
 from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketReader
-from service.packets.upload import PacketLines, archive_of
+from service.packets.reader import PacketLines, PacketReader, archive_of
 from service.products.reading.aem import read_aem
 from service.products.reading.oem import read_oem
 from service.products.reading.tle import read_tle

@@ -8,9 +8,8 @@ import pytest
 
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json
-from service.replay.from_file import AttitudeCarrier, turned
 from service.replay.in_process import replay_in_process
-from service.replay.items import LineOutcome, items_of
+from service.replay.items import AttitudeCarrier, LineOutcome, items_of, turned
 from service.replay.over_http import replay_over_http
 from service.replay.summary import ReplaySummary
 from service.settings import Settings

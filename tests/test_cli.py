@@ -20,7 +20,7 @@ from service import __version__
 from service.acquire import kernel_build
 from service.cli import build_parser
 from service.missions.mission import SHIPPED_FOLDER
-from service.observations.readers.csv_columns import COLUMNS
+from service.observations.csv_rows import COLUMNS
 from service.simulate.telemetry import read_objects
 from service.times import parse_utc
 from tests.fresh_databases import sqlite_at

@@ -13,7 +13,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadFile, BadInput, Busy, Forbidden, NotFound, Unauthenticated
-from service.observations.readers.csv_rows import write_batches_csv
+from service.observations.csv_rows import write_batches_csv
 from service.observations.schema import BatchIn
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of, run_name

@@ -25,9 +25,8 @@ from benchmarks.speed.load import Driven, drive, request
 from benchmarks.speed.posts import API, CONNECTIONS, read_json
 from benchmarks.speed.serving import Served, service
 from service.missions.mission import SHIPPED_FOLDER, Mission, read_mission
-from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import NO_TROUBLES, Pass
-from service.simulate.telemetry import DrawnBatch, draw_pass
+from service.simulate.telemetry import DrawnBatch, GyroWanted, draw_pass, with_gyro
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel

@@ -45,8 +45,7 @@ from service.sky.model import SkyModel
 from service.storage.sql.migrations import upgrade
 from service.storage.sql.tables import batches, results
 from service.storage.store import Store
-from service.storage.upkeep.archiving import archive
-from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
+from service.storage.upkeep.archiving import PartFilter, archive, restore, verify_archive
 from service.times import Utc, parse_utc
 
 BATCHES, QUICK_BATCHES = 1_000_000, 20_000

@@ -37,7 +37,7 @@ from benchmarks.validation.frames import (
 from service.imaging.centroids.centroid import METHODS
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
-from service.imaging.detection.star_image import psf_of
+from service.imaging.detection.star_images import psf_of
 from service.imaging.frames.frame import Frame
 from service.missions.camera import CentroidMethod, PsfKind
 from service.missions.mission import Mission, load_missions

@@ -22,9 +22,15 @@ from studies.paper_1994.command import measured as measured_times
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.plots import draw
 from studies.paper_1994.printed import Run, the_paper
-from studies.paper_1994.region import differences, is_inside
 from studies.paper_1994.tables import TITLES
-from studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
+from studies.paper_1994.tally import (
+    AMBIGUOUS,
+    MISIDENTIFIED,
+    UNMATCHED,
+    Tally,
+    differences,
+    is_inside,
+)
 
 STARS, QUICK_STARS = 20_000, 400
 SEEDS = 3

@@ -19,7 +19,7 @@ from tqdm import tqdm
 from benchmarks.bounds import at_least, between
 from benchmarks.report import Report
 from service.calibration.estimate import calibrate
-from service.calibration.unknowns import Model
+from service.calibration.linearise import Model
 from tests.calibration import drawn as simulated
 from tests.calibration.drawn import MISALIGNED, Truth
 

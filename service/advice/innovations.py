@@ -31,7 +31,8 @@ from service.advice.intervals import Interval
 from service.advice.statements import FileChange, Statement
 from service.advice.trackers import NoiseFinding
 from service.filtering.result import Outcome
-from service.grades.innovations import MeasuredInnovations, full_matrices
+from service.grades.day import MeasuredInnovations
+from service.grades.stretches import full_matrices
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings
 from service.vectors import Vector

@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from service.advice.advice import Findings
+from service.advice.advice import ALL_RECOMMENDED, PRESENT, Findings, VariantOutcome
 from service.advice.intervals import Interval
 from service.advice.tolerances import KEPT, LEAST_BATCHES, LEAST_DIFFERENCES, ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding
-from service.advice.trials import ALL_RECOMMENDED, PRESENT, VariantOutcome
 from service.advice.zone_size import LEAST_BATCHES as LEAST_BATCHES_OF_ZONES
 from service.advice.zone_size import ZoneCost, ZoneSize
 from service.missions.mission import Band, Mission

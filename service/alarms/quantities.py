@@ -22,8 +22,7 @@ import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from service.alarms.limits import LimitSettings, about_zero, above
-from service.alarms.window import Sample
+from service.alarms.limits import LimitSettings, Sample, about_zero, above
 from service.missions.mission import Band, Mission
 from service.vectors import separation_deg
 

@@ -17,8 +17,7 @@ note; nothing is changed in place.
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from service.alarms.limits import LimitSettings, Severity
-from service.alarms.window import Point
+from service.alarms.limits import LimitSettings, Point, Severity
 from service.errors import WrongState
 
 AlarmState = Literal["open", "acknowledged", "shelved", "cleared"]

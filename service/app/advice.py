@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from service.acquire.choices import idle_reason
-from service.advice.advice import Findings, WorkLimit, advise
+from service.advice.advice import Findings, VariantOutcome, WorkLimit, advise
 from service.advice.innovations import InnovationFinding, innovation_findings, innovation_noise
 from service.advice.intervals import Interval
 from service.advice.statements import (
@@ -21,7 +21,6 @@ from service.advice.statements import (
 )
 from service.advice.tolerances import ToleranceFinding
 from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
-from service.advice.trials import VariantOutcome
 from service.app.context import Context
 from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
@@ -30,7 +29,7 @@ from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.models import advice as records
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import BatchSample, sample_batches
+from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 

@@ -7,12 +7,11 @@ from typing import cast
 import msgspec
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.alarms import state_machine
-from service.alarms.limits import LimitSettings
+from service.alarms.limits import LimitSettings, Preview, Sample, preview_of, preview_of_gaps
 from service.alarms.quantities import REJECTED, SILENCE, QuantityName, tracker_names
 from service.alarms.subjects import limited_trackers, subject_of
-from service.alarms.window import Preview, Sample, preview_of, preview_of_gaps
 from service.app.context import ALL_RUNS, Context, known_id
 from service.errors import BadBatch, Fault, shown_value
 from service.ingest.solver_pool import mission_in_input
@@ -21,7 +20,7 @@ from service.storage.grades.period import rejected_samples
 from service.storage.models import alarms as records
 from service.storage.models.base import Page
 from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
-from service.storage.queries import alarms, limits
+from service.storage.queries import alarms
 from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
 from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.recording import events
@@ -180,7 +179,7 @@ class Limits:
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker)
         with self._context.reading() as connection:
-            return limits.list_limits(connection, mission, own)
+            return alarms.list_limits(connection, mission, own)
 
     def get(
         self, name: str, quantity: QuantityName, tracker: str | None = None
@@ -189,7 +188,7 @@ class Limits:
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
         with self._context.reading() as connection:
-            return limits.limit_history(connection, mission, quantity, own)
+            return alarms.limit_history(connection, mission, quantity, own)
 
     def set(
         self,
@@ -209,7 +208,7 @@ class Limits:
         mission, moment = mission_named(self._context.missions, name), utc_now().text
         own = _checked_tracker(mission, tracker, quantity)
         return self._context.change_audited(
-            lambda connection: limits.set_limit(
+            lambda connection: alarms.set_limit(
                 connection,
                 mission,
                 quantity,
@@ -241,7 +240,7 @@ class Limits:
         own = _checked_tracker(mission, tracker, quantity)
         subject = subject_of(quantity, own)
         with self._context.reading() as connection:
-            in_force = limits.limits_of(connection, mission)[subject]
+            in_force = alarms.limits_of(connection, mission)[subject]
             last = latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
             time_ns: list[int] = []
             samples: list[Sample] = []
@@ -253,7 +252,7 @@ class Limits:
                     samples = rejected_samples(connection, period)[-MOST_PREVIEWED:]
                     time_ns = [at_ns for at_ns, _, _ in samples]
                 else:
-                    time_ns, samples = limits.latest_samples(
+                    time_ns, samples = alarms.latest_samples(
                         connection, period, subject, MOST_PREVIEWED
                     )
 

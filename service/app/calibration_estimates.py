@@ -23,6 +23,7 @@ from service.calibration.estimate import (
     calibrate_with_chosen_degree,
 )
 from service.calibration.evidence import identified_magnitudes, identified_stars
+from service.calibration.linearise import LARGEST_DEGREE, Model
 from service.calibration.magnitudes import (
     UNITS,
     MagnitudeCalibration,
@@ -33,7 +34,6 @@ from service.calibration.magnitudes import (
 from service.calibration.magnitudes import joined as joined_magnitudes
 from service.calibration.mission_file import Lines, magnitude_lines, tracker_lines
 from service.calibration.stars import IdentifiedStars, joined
-from service.calibration.unknowns import LARGEST_DEGREE, Model
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
 from service.ingest.submit import SubmissionService
 from service.missions.mission import AS_MEASURED, Magnitudes, Mission, Tracker
@@ -41,7 +41,7 @@ from service.missions.mission import Calibration as FocalPlaneSettings
 from service.observations.batch import ObservationBatch
 from service.storage import calibrations
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import sample_batches
+from service.storage.queries.results import sample_batches
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector

@@ -12,7 +12,7 @@ import msgspec
 from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.app.calibration_estimates import (
     CalibrationRequest,
     CalibrationRun,
@@ -36,7 +36,7 @@ from service.storage.calibrations import (
     TrackerGeometry,
 )
 from service.storage.models.base import Page
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.storage.recording import events
 from service.storage.recording.ids import Ulids
 from service.storage.recording.results import register

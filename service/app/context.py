@@ -5,21 +5,24 @@ from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TypeVar
+from typing import TypedDict, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.alarms.subjects import limited_trackers
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
 from service.settings import Settings
 from service.sky.model import SkyModel
+from service.storage.models.base import Page
 from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
+from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
+from service.times import Utc
 
 ALL_RUNS = "*"
 """Stands for every run, the live one included, where the name of a run is expected."""
@@ -27,6 +30,16 @@ ALL_RUNS = "*"
 _RUN_NAME = TypeAdapter(RunName)
 
 T = TypeVar("T")
+
+
+class PageOfPeriod(TypedDict, total=False):
+    """Which page of a list, of which period and run; without a run of the live one."""
+
+    run: str | None
+    start: Utc | None
+    end: Utc | None
+    limit: int
+    cursor: str | None
 
 
 @dataclass(frozen=True)
@@ -63,6 +76,28 @@ class Context:
     def reading_batch(self, id: str) -> AbstractContextManager[tuple[Connection, bool]]:
         """A connection that has the batch of a result; see `Store.reading_batch`."""
         return self.store.reading_batch(id)
+
+    def page(
+        self,
+        listing: Callable[..., Page[T]],
+        selection: Callable[..., object],
+        name: str,
+        asked: PageOfPeriod,
+    ) -> Page[T]:
+        """A page of what is recorded of a spacecraft; raises `NotFound` for an unknown one.
+
+        `listing` reads it, of what `selection` makes of run, spacecraft, start and end.
+        """
+        self.mission(name)
+        selected = selection(
+            run=asked.get("run") or LIVE,
+            spacecraft=name,
+            start=asked.get("start"),
+            end=asked.get("end"),
+        )
+        limit, cursor = asked.get("limit", 100), asked.get("cursor")
+        with self.reading() as connection:
+            return listing(connection, selected, limit=limit, cursor=cursor)
 
     def change(self, change: Callable[[Connection], T]) -> T:
         """Change the database in one transaction, and wait until it is committed."""

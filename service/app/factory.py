@@ -1,22 +1,20 @@
 """The app: every part of the service, put together in one place."""
 
-from service.access.tokens import Access, Tokens
+from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits
 from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
 from service.app.frames import Frames
-from service.app.grades import DefinitiveAttitudes, Grades
-from service.app.gyro import Gyro
-from service.app.live_filter import LiveFilter
+from service.app.grades import DefinitiveAttitudes, Grades, LiveFilter
 from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
 from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
-from service.app.spacecraft import Spacecraft
+from service.app.spacecraft import Gyro, Spacecraft
 from service.app.tracks import Tracks
 from service.app.webhooks import Webhooks
 from service.app.zones import Zones

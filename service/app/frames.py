@@ -9,7 +9,7 @@ from typing import IO
 
 from msgspec.structs import replace
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.context import Context, known_id
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame

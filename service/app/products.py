@@ -17,12 +17,11 @@ from service.products import attitudes as attitude_series
 from service.products.moment import AtMethod, AttitudeAt, attitude_at
 from service.products.tables import Table
 from service.settings import Settings
-from service.storage.grades.rows import count_samples_of, graded_pages
+from service.storage.grades.days import count_samples_of, graded_pages
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.queries.histories import retired
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, count
 from service.storage.queries.result_tables import attitude_pages, batch_table, star_table
-from service.storage.queries.with_archive import count
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.times import Utc, shifted, utc_now

@@ -11,8 +11,7 @@ from typing import IO, TypedDict, Unpack
 
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
-from service.access.tokens import Caller
+from service.access import Caller, Entry
 from service.app.context import Context, checked_run_name, known_id
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.gyro import GyroBlock
@@ -21,8 +20,8 @@ from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
-from service.observations.readers.decompress import Coding, unpacked_lines
-from service.packets.upload import PacketLines
+from service.observations.decompress import Coding, unpacked_lines
+from service.packets.reader import PacketLines
 from service.storage.gyro import Recorded
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries import replays

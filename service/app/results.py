@@ -9,7 +9,7 @@ from functools import cache, partial
 
 from msgspec import structs
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
 from service.app.context import ALL_RUNS, Context, known_id
 from service.errors import Busy, NotFound
@@ -20,18 +20,21 @@ from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.models.answers import Answer, Neighbours, Result, Summary
 from service.storage.models.base import Page
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.storage.queries import results
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period
-from service.storage.queries.recorded_batch import (
+from service.storage.queries.results import (
+    OutcomeName,
+    StatusName,
     batch_with_options,
     merged_options,
+    neighbours,
+    place_of,
     recorded_batch,
     recorded_mission,
     sample_batches,
 )
-from service.storage.queries.results import OutcomeName, StatusName, neighbours, place_of
 from service.storage.queries.star_field import StarField, star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid

@@ -7,15 +7,14 @@ from pathlib import Path
 
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
+from service.access import Entry
 from service.app.context import Context, checked_run_name
 from service.errors import BadBatch, Fault
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
-from service.storage.models.compare import RatesOfRuns, RunChange, RunComparison
-from service.storage.models.runs import Forgotten, Run, RunState
+from service.storage.models import runs
 from service.storage.queries import fleet, histories
 from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter
@@ -36,7 +35,7 @@ class Runs:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def all(self, spacecraft: Collection[str] | None = None) -> list[Run]:
+    def all(self, spacecraft: Collection[str] | None = None) -> list[runs.Run]:
         """Every run with batches; with `spacecraft`, of these, as if there were no others."""
         with self._context.reading() as connection:
             return histories.list_runs(connection, spacecraft)
@@ -46,7 +45,7 @@ class Runs:
         with self._context.reading() as connection:
             return fleet.default_run(connection)
 
-    def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> RunState:
+    def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> runs.RunState:
         """Turn the evaluation of limits on or off for the batches that a run gets from now on."""
         name = checked_run_name(run)
         if name == LIVE and not alarms:
@@ -54,13 +53,13 @@ class Runs:
         self._context.change_audited(
             lambda connection: set_run_alarms(connection, name, alarms, utc_now().text), entry
         )
-        return RunState(run=name, alarms=alarms)
+        return runs.RunState(run=name, alarms=alarms)
 
-    def forget(self, selected: ForgetFilter, entry: Entry | None = None) -> Forgotten:
+    def forget(self, selected: ForgetFilter, entry: Entry | None = None) -> runs.Forgotten:
         """Remove a run, or some of its batches and gyro blocks; see `upkeep.forget`."""
         checked_run_name(selected.run)
 
-        def note(connection: Connection, total: Forgotten) -> None:
+        def note(connection: Connection, total: runs.Forgotten) -> None:
             if entry is not None:
                 entry.add_to(connection)
 
@@ -68,7 +67,7 @@ class Runs:
             self._context.store, selected, self._context.settings.archive_folder, note=note
         )
 
-    def would_forget(self, selected: ForgetFilter) -> Forgotten:
+    def would_forget(self, selected: ForgetFilter) -> runs.Forgotten:
         """The data that `forget` would remove."""
         checked_run_name(selected.run)
         with self._context.reading() as connection:
@@ -81,7 +80,7 @@ class Runs:
         spacecraft: str | None = None,
         start: Utc | None = None,
         end: Utc | None = None,
-    ) -> RunComparison:
+    ) -> runs.RunComparison:
         """The outcomes of the same stars in two runs, and the angles between their attitudes."""
         with self._context.reading() as connection:
             return compare_runs(
@@ -98,7 +97,7 @@ class Runs:
         spacecraft: str,
         start: Utc | None = None,
         end: Utc | None = None,
-    ) -> tuple[RunComparison, list[RunChange]]:
+    ) -> tuple[runs.RunComparison, list[runs.RunChange]]:
         """The same of a spacecraft's latest batches of a period alone, and those that differ."""
         self._context.mission(spacecraft)
         place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
@@ -116,7 +115,7 @@ class Runs:
         spacecraft: str,
         start: Utc | None = None,
         end: Utc | None = None,
-    ) -> RatesOfRuns | None:
+    ) -> runs.RatesOfRuns | None:
         """The rates of all batches of a spacecraft in both runs; None without a common period."""
         with self._context.reading() as connection:
             return run_rates(connection, spacecraft, (run, other), start, end)
@@ -182,8 +181,8 @@ class Runs:
 
         Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
         """
-        from service.ingest.partitions.coordinator import reprocess_partitions
-        from service.ingest.partitions.tasks import LocalProcesses, OwnProcess, Workers
+        from service.ingest.partition_coordinator import reprocess_partitions
+        from service.ingest.partition_tasks import LocalProcesses, OwnProcess, Workers
 
         plan = self._plan(run, source, spacecraft, start, end, processes)
         if plan.run == LIVE:
@@ -193,7 +192,7 @@ class Runs:
 
         def workers() -> Workers:
             if scheduler is not None:
-                from service.ingest.partitions.dask_workers import DaskWorkers
+                from service.ingest.dask_workers import DaskWorkers
 
                 return DaskWorkers(scheduler, config, folder)
             count = processes or os.cpu_count() or 1

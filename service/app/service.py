@@ -19,7 +19,7 @@ from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.models.overview import About, CatalogAbout, MissionAbout
+from service.storage.models.spacecraft import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording import events
 from service.storage.recording.events import Event

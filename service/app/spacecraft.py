@@ -1,24 +1,33 @@
-"""Spacecraft: state, attitudes, star rates, worst batches, histories and these as tables."""
+"""Spacecraft: state, attitudes, star rates, worst batches, histories and these as tables.
 
-from collections.abc import Collection, Iterator, Sequence
+Also their gyro blocks: recorded once, however often they are sent, and read back.
+"""
+
+from collections.abc import Callable, Collection, Iterator, Sequence
+from functools import partial
 from itertools import chain
-from typing import Any
+from typing import Any, Unpack
 
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
 from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
-from service.app.context import Context
+from service.app.context import Context, PageOfPeriod, known_id
 from service.errors import BadBatch, Fault, shown_value
-from service.missions.mission import Mission
+from service.gyro import GyroBlock, block_from_json, require_rates_within
+from service.ingest.solver_pool import mission_in_input
+from service.missions.mission import Mission, mission_named
+from service.missions.motion import largest_rate_deg_per_s
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
+from service.storage import gyro as blocks
 from service.storage.models import spacecraft as records
 from service.storage.models.base import Page
-from service.storage.models.overview import Overview
+from service.storage.models.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches
+from service.storage.recording.ids import Ulids
 from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now, utc_of_unix
@@ -71,23 +80,10 @@ class Spacecraft:
                 history=histories.mission_history(connection, name),
             )
 
-    def attitudes(
-        self,
-        name: str,
-        *,
-        run: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        limit: int = 100,
-        cursor: str | None = None,
-    ) -> Page[records.AttitudeRow]:
+    def attitudes(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.AttitudeRow]:
         """The attitudes of current results, oldest batch time first."""
-        self._context.mission(name)
-        stretch = ResultFilter(run or LIVE, name, start, end)
-        with self._context.reading() as connection:
-            return histories.list_attitudes(
-                connection, self._context.store.archive, stretch, limit=limit, cursor=cursor
-            )
+        listing = partial(histories.list_attitudes, archive=self._context.store.archive)
+        return self._context.page(listing, ResultFilter, name, asked)
 
     def rates(
         self,
@@ -274,3 +270,54 @@ def _about(history: records.History) -> dict[str, str]:
         "start": history.start or "",
         "end": history.end or "",
     }
+
+
+class Gyro:
+    """Takes and reads gyro blocks."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._ids = Ulids()
+
+    def submit(self, name: str, sent: bytes) -> blocks.Recorded:
+        """Record the block of a JSON body; see `record`."""
+        mission_named(self._context.missions, name)
+        return self.record(block_from_json(sent, name))
+
+    def record(self, block: GyroBlock) -> blocks.Recorded:
+        """Record a block, and wait for that; a repeat of the same body gets the recorded one.
+
+        See `begin` for what is refused.
+        """
+        return self.begin(block)()
+
+    def begin(self, block: GyroBlock) -> Callable[[], blocks.Recorded]:
+        """Queue a block for the writer; to call what it gives waits until it is recorded.
+
+        Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
+        mission, `Busy` where too much is waiting.  Both raise `Conflict` where another body has
+        its name, and `SampleTaken` where another block of the spacecraft and the run holds one
+        of its times.
+        """
+        mission = mission_in_input(self._context.missions, block.spacecraft)
+        require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
+        row = blocks.row_of(block, self._ids.new(), utc_now())
+        store = self._context.store
+        # Looked up here as well: an error in the writer's transaction would make it begin anew.
+        with store.reading_record() as connection:
+            found = blocks.find_block(connection, block, row)
+        if found is not None:
+            recorded = blocks.Recorded(found, replayed=True)
+            return lambda: recorded
+        return store.writer.change(
+            lambda connection: blocks.record_block(connection, block, row)
+        ).result
+
+    def page(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[GyroBlockRow]:
+        """The blocks of a period without their samples, the earliest first."""
+        return self._context.page(blocks.list_blocks, blocks.BlockFilter, name, asked)
+
+    def get(self, name: str, id: str) -> GyroSamples:
+        """A block of a spacecraft with its samples."""
+        with self._context.reading() as connection:
+            return blocks.read_block(connection, name, known_id(id, "gyro block"))

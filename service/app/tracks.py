@@ -7,14 +7,14 @@ import numpy as np
 from service import __version__
 from service.app.context import Context, known_id
 from service.errors import NotFound
-from service.products.tdm import TrackedObject, write_tdm
+from service.products.ccsds import TrackedObject, write_tdm
 from service.storage import tracks
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now
 from service.tracks.finding import Track as FoundTrack
 from service.tracks.finding import figures, find_tracks
-from service.tracks.gathering import Batches, Points
+from service.tracks.linking import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
-from service.access.tokens import Access, Caller
+from service.access import Access, Caller, Entry
 from service.app.context import Context, known_id
 from service.errors import WrongState
 from service.ingest.solver_pool import mission_in_input

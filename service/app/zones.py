@@ -13,8 +13,8 @@ from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
 from service.storage.models.answers import ZoneSummary
-from service.storage.models.overview import CachedRunCatalog, CachedZone, ZoneCache
-from service.storage.queries.limits import latest_samples
+from service.storage.models.spacecraft import CachedRunCatalog, CachedZone, ZoneCache
+from service.storage.queries.alarms import latest_samples
 from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now

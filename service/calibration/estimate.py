@@ -22,8 +22,8 @@ from service.calibration.elimination import (
     not_observable,
     observable,
 )
+from service.calibration.linearise import Model, Unknown, unknowns_of
 from service.calibration.stars import IdentifiedStars, Indices
-from service.calibration.unknowns import Model, Unknown, unknowns_of
 from service.errors import BadInput, Fault
 from service.vectors import Matrix, Vector
 

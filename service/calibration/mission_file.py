@@ -8,7 +8,7 @@ import numpy as np
 from numpy.polynomial.legendre import leg2poly
 
 from service.calibration.estimate import Calibration
-from service.calibration.unknowns import SKEW, STRETCH, Unknown
+from service.calibration.linearise import SKEW, STRETCH, Unknown
 from service.errors import BadConfiguration
 from service.missions.mission import Magnitudes, Mission, Tracker, parse_mission
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, rotate_about

@@ -11,6 +11,7 @@ from service.cli.arguments import (
     add_json,
     add_json_file,
     count,
+    mission_of_file_or_name,
     print_json,
     table,
 )
@@ -141,23 +142,22 @@ def _run_mission(parsed: Namespace) -> int:
     acquire simulate mission SOHO --sweep separation_deg=.0066,.02 --at-most-ambiguous 0.01
     acquire simulate mission XTE --direction 265.6,-28.9 --within 5 --json
     """
-    from service.cli.configuration import mission_of_file_or_name
     from service.settings import Settings
-    from studies.mission_rates import plot
+    from studies.mission_rates import report
     from studies.mission_rates.report import report_json, report_text
     from studies.mission_rates.simulation import simulate
 
     plan = _plan(parsed, mission_of_file_or_name(parsed.mission))
     if parsed.plot is not None:
-        plot.checked_plot(plan, parsed.plot)
+        report.checked_plot(plan, parsed.plot)
     if parsed.page is not None:
-        plot.checked(plan, "--page", parsed.page, ".html")
+        report.checked(plan, "--page", parsed.page, ".html")
     catalog = Settings.from_environment().catalog
     rates = simulate(plan, catalog, parsed.processes, parsed.quiet)
     if parsed.plot is not None:
-        plot.draw(plan, rates, parsed.plot)
+        report.draw(plan, rates, parsed.plot)
     if parsed.page is not None:
-        plot.write_page(plan, rates, parsed.at_most_ambiguous, parsed.page)
+        report.write_page(plan, rates, parsed.at_most_ambiguous, parsed.page)
     if parsed.json:
         print_json(report_json(plan, rates, parsed.at_most_ambiguous))
     else:
@@ -170,14 +170,14 @@ def _run_mission(parsed: Namespace) -> int:
 
 
 def _plan(parsed: Namespace, mission: Any) -> Any:
-    from studies.mission_rates.settings import (
+    from studies.mission_rates.simulation import (
+        Plan,
         Sweep,
         one_tracker,
         options_of_settings,
         refuse_idle,
         settings_of,
     )
-    from studies.mission_rates.simulation import Plan
 
     if parsed.seed < 0:
         raise BadInput(Fault("--seed", "must not be negative", str(parsed.seed)))

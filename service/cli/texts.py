@@ -11,7 +11,7 @@ from service.app import calibration_estimates
 from service.app.advice import no_changes_text
 from service.ingest.reprocess import ReprocessProgress
 from service.storage.models.advice import Advice, Trial
-from service.storage.models.compare import RunComparison, RunTransition
+from service.storage.models.runs import RunComparison, RunTransition
 from service.storage.tracks import Track, TrackList
 
 if TYPE_CHECKING:

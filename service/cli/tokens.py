@@ -12,13 +12,10 @@ import msgspec
 from sqlalchemy import Connection
 
 from service import errors
-from service.access.audit import Entry
-from service.access.tokens import MAX_DAYS, Tokens
-from service.cli.arguments import print_json
-from service.cli.configuration import http_client, refusal_of, service_url, settings_of
+from service.access import MAX_DAYS, Entry, NewToken, Token, Tokens
+from service.cli.arguments import http_client, print_json, refusal_of, service_url, settings_of
 from service.missions.mission import load_missions
 from service.settings import Settings
-from service.storage.models.access import NewToken, Token
 from service.storage.recording.ids import Ulids
 from service.storage.sql.database_file import is_written
 from service.storage.sql.engines import database_file, database_url

@@ -17,15 +17,15 @@ import numpy.typing as npt
 from pydantic import AfterValidator, Field, ValidationError
 
 from service.errors import BadBatch, Fault
-from service.imaging.centroids.record import Flag
+from service.imaging.centroids.window import Flag
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
-from service.observations.faults import faults_of
 from service.observations.frame_record import FrameRecord
+from service.observations.schema import faults_of
 from service.times import utc_now
 from service.vectors import Vector
 
@@ -106,7 +106,7 @@ def submission_of_frame(
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
     from service.imaging.detection.measure import measure
-    from service.imaging.detection.star_image import psf_of
+    from service.imaging.detection.star_images import psf_of
 
     rates_deg_per_s = np.array(known.body_rates_deg_per_s)
     exposure_s = frame.exposure_s or camera.exposure_s

@@ -22,7 +22,7 @@ from service.alarms.quantities import (
     residual_rms_arcsec,
 )
 from service.observations.batch import ObservationBatch
-from service.storage.models import compare as records
+from service.storage.models import runs as records
 from service.storage.models.answers import StarCounts
 from service.storage.queries.compare_runs import cell_width_s
 from service.storage.recording.answer import StarRow, star_rows

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import IO
 
 from service.errors import Busy
-from service.observations.readers.decompress import Coding
+from service.observations.decompress import Coding
 from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 
 PART, LINES, ABOUT = ".part", ".lines", ".json"

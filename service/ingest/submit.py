@@ -16,8 +16,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from pydantic_core import to_json
 from sqlalchemy import Connection
 
-from service.access.audit import Entry
-from service.access.tokens import Caller
+from service.access import Caller, Entry
 from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.acquire.kernel_build import KernelBuild
@@ -27,11 +26,9 @@ from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.faults import faults_of
-from service.observations.schema import OptionsIn, Submission, submission_from_json
+from service.observations.schema import OptionsIn, Submission, faults_of, submission_from_json
 from service.sky.model import SkyModel
-from service.storage.queries.recorded_batch import batch_with_options
-from service.storage.queries.results import read_parent
+from service.storage.queries.results import batch_with_options, read_parent
 from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,

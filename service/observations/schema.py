@@ -1,7 +1,8 @@
 """A batch as JSON: the object that pipelines send, checked field by field.
 
 Every entrance reads batches here, so that all refuse the same things with the
-same words.  The pydantic models are also what `openapi.yaml` shows.
+same words: the faults that pydantic finds are put into those of the service.  The pydantic
+models are also what `openapi.yaml` shows.
 """
 
 import codecs
@@ -36,9 +37,52 @@ from service.observations.batch import (
     Options,
 )
 from service.observations.decode import batch_from_canonical, prior_from_canonical
-from service.observations.faults import PRIOR_KINDS, faults_of
 from service.observations.frame_record import FrameRecord
 from service.times import parse_utc
+
+MAX_FAULTS_SHOWN = 20
+MAX_NAME_SHOWN = 80
+
+PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
+    "from_last": "from"
+}
+"""The kinds of a priori knowledge, and the field that tells each."""
+
+
+def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
+    """Faults that pydantic found, in the service's words: a dotted field, a message, the value."""
+    return [
+        Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
+        for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
+    ]
+
+
+def _field(location: tuple[str | int, ...]) -> str:
+    tags = tuple(PRIOR_KINDS)
+    parts = [
+        # A client's own key may be of any length.
+        str(part)[:MAX_NAME_SHOWN]
+        for index, part in enumerate(location)
+        # The tag of the kind of prior is pydantic's, not a field of the body.
+        if not (
+            part in tags
+            and index
+            and location[index - 1] == "a_priori"
+            and index + 1 < len(location)
+        )
+    ]
+    return ".".join(parts) or "body"
+
+
+def _message(fault: Any) -> str:
+    if fault["type"] == "extra_forbidden":
+        return "there is no such field"
+    return str(fault["msg"]).removeprefix("Value error, ")
+
+
+def _value(fault: Any) -> str | None:
+    # A missing field or a fault of the whole has nothing to show but its surroundings.
+    return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])
 
 
 def is_time(text: str) -> str:

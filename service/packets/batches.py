@@ -9,8 +9,7 @@ from pydantic import ValidationError
 
 from service.errors import Fault
 from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
-from service.observations.faults import faults_of
-from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
+from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model, faults_of
 from service.packets import clock
 from service.packets.definition import PacketFault
 from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns

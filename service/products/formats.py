@@ -80,7 +80,7 @@ def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
     series = replace(series, blocks=blocks)
     if written.write_attitudes is not None:
         return written.write_attitudes(series)
-    from service.products.attitude_table import attitude_table
+    from service.products.attitudes import attitude_table
 
     assert written.write_table is not None
     return written.write_table(attitude_table(series))
@@ -111,7 +111,7 @@ def _later(name: str) -> Callable[[Any], Iterator[bytes]]:
 
 
 JSON_FORMAT = "json"
-JSON = OutputFormat("JSON", "application/json", write_attitudes=_later("attitude_table:write_json"))
+JSON = OutputFormat("JSON", "application/json", write_attitudes=_later("attitudes:write_json"))
 """The API's own form; a history as JSON is no table."""
 
 
@@ -145,14 +145,14 @@ OUTPUT_FORMATS: dict[str, OutputFormat] = {
         package="astropy",
         most_batches=MOST_BATCHES,
     ),
-    "aem": _message("CCSDS AEM", "text/plain", "adm:write_aem_kvn"),
+    "aem": _message("CCSDS AEM", "text/plain", "ccsds:write_aem_kvn"),
     "aem-xml": _message(
-        "CCSDS AEM (XML)", "application/xml", "adm:write_aem_xml", suffix="aem.xml"
+        "CCSDS AEM (XML)", "application/xml", "ccsds:write_aem_xml", suffix="aem.xml"
     ),
     "apm": _message(
-        "CCSDS APM (the last attitude)", "text/plain", "adm:write_apm", most_batches=None
+        "CCSDS APM (the last attitude)", "text/plain", "ccsds:write_apm", most_batches=None
     ),
-    "acm": _message("CCSDS ACM", "text/plain", "adm:write_acm"),
+    "acm": _message("CCSDS ACM", "text/plain", "ccsds:write_acm"),
     "ck": _message(
         "SPICE CK",
         "application/zip",

@@ -7,13 +7,7 @@ from typing import Literal
 import numpy as np
 
 from service.errors import NotFound
-from service.products.attitudes import (
-    AttitudeBlock,
-    AttitudeRows,
-    SeriesInfo,
-    full_matrices,
-    series_of,
-)
+from service.products import attitudes
 from service.products.reading.known import between
 from service.times import Utc
 
@@ -41,14 +35,17 @@ class AttitudeAt:
 
 
 def attitude_at(
-    about: SeriesInfo, pages: Iterable[AttitudeRows], moment: Utc, method: AtMethod
+    about: attitudes.SeriesInfo,
+    pages: Iterable[attitudes.AttitudeRows],
+    moment: Utc,
+    method: AtMethod,
 ) -> AttitudeAt:
     """The attitude at a moment, from the rows around it in order of time.
 
     Raises `NotFound` where none is within the largest gap, or where the moment lies between two
     stretches and is to be interpolated.
     """
-    blocks = list(series_of(about, pages).blocks)
+    blocks = list(attitudes.series_of(about, pages).blocks)
     if not blocks:
         raise _not_found(about, moment, "none is within the largest gap")
     rows = blocks[0]
@@ -66,11 +63,13 @@ def attitude_at(
     return _interpolated(rows, after, moment)
 
 
-def _not_found(about: SeriesInfo, moment: Utc, why: str) -> NotFound:
+def _not_found(about: attitudes.SeriesInfo, moment: Utc, why: str) -> NotFound:
     return NotFound(f"{about.described()} at {moment.text}: {why} ({about.largest_gap_s:g} s)")
 
 
-def _nearest(rows: AttitudeBlock, place: int, moment: Utc, method: AtMethod) -> AttitudeAt:
+def _nearest(
+    rows: attitudes.AttitudeBlock, place: int, moment: Utc, method: AtMethod
+) -> AttitudeAt:
     offset_s = float(rows.time_ns[place] - moment.tai_ns) * 1e-9
     rate = float(np.linalg.norm(rows.rate_deg_per_s[place])) * 3600.0
     motion = None if np.isnan(rate) else rate * abs(offset_s)
@@ -78,14 +77,14 @@ def _nearest(rows: AttitudeBlock, place: int, moment: Utc, method: AtMethod) -> 
         moment.text,
         method,
         rows.quaternion[place].tolist(),
-        full_matrices(rows.covariance_arcsec2[place]).tolist(),
+        attitudes.full_matrices(rows.covariance_arcsec2[place]).tolist(),
         0.0 if offset_s == 0.0 else motion,
         offset_s,
         [str(rows.id[place])],
     )
 
 
-def _interpolated(rows: AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
+def _interpolated(rows: attitudes.AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
     pair = [after - 1, after]
     first_ns, second_ns = rows.time_ns[pair].tolist()
     share = (moment.tai_ns - first_ns) / (second_ns - first_ns)
@@ -101,7 +100,7 @@ def _interpolated(rows: AttitudeBlock, after: int, moment: Utc) -> AttitudeAt:
         moment.text,
         "interpolated",
         q.tolist(),
-        full_matrices(weights[0] * one + weights[1] * other).tolist(),
+        attitudes.full_matrices(weights[0] * one + weights[1] * other).tolist(),
         None if np.isnan(change) else change * step_s / 8.0,
         offset_s * 1e-9,
         list(dict.fromkeys(str(each) for each in rows.id[pair])),

@@ -8,8 +8,14 @@ import msgspec
 from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
 from service.gyro import GyroBlock
-from service.replay.from_file import AttitudeCarrier, reporting_to_carrier
-from service.replay.items import Item, LineOutcome, Pace, Report
+from service.replay.items import (
+    AttitudeCarrier,
+    Item,
+    LineOutcome,
+    Pace,
+    Report,
+    reporting_to_carrier,
+)
 
 CHUNK = 500
 """Batches of one transaction: enough to share its cost, few enough to see progress."""

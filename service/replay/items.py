@@ -1,18 +1,28 @@
-"""The lines of telemetry files to replay, and the outcome of each."""
+"""The lines of telemetry files to replay, what is added to their batches, and the outcome of each.
 
+Added are attitudes that are carried along, or data of a file.
+"""
+
+import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import msgspec
+import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
+from service import vectors
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
-from service.observations.readers.decompress import Line
-from service.observations.readers.telemetry import read_lines
+from service.observations.batch import ObservationBatch
+from service.observations.decompress import Line
 from service.observations.schema import RunName, Submission, submission_from_json
+from service.observations.telemetry import read_lines
 from service.packets.reader import PacketReader, file_lines
+from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.times import Utc
 
 Problem = dict[str, Any]
@@ -109,3 +119,176 @@ class Pace:
             self._first = (time.tai_ns, now_s)
         first_ns, start_s = self._first
         return max(0.0, start_s + (time.tai_ns - first_ns) * 1e-9 / self.factor - now_s)
+
+
+class FromFile(ABC):
+    """Writes what a file says of a batch's time into the batch, before it is sent.
+
+    The recorded batch then holds it.  `supplied` counts the batches that got something.
+    """
+
+    option: str
+    """The option of the command that names the file."""
+    key: str
+    """The name of the count in the command's JSON."""
+    title: str
+    """The name of the count for people."""
+
+    def __init__(self) -> None:
+        self._spacecraft: str | None = None
+        self.supplied = 0
+
+    def prepared(self, item: Item) -> Item:
+        """The item with what the file says, unchanged where that is nothing.
+
+        Raises `BadInput` for a batch of another spacecraft than the one before.
+        """
+        if item.submission is None:
+            return item
+        batch = item.submission.batch
+        if self._spacecraft not in (None, batch.spacecraft):
+            message = f"is of one spacecraft, but the batches are of {self._spacecraft} and others"
+            raise BadInput(Fault(self.option, message, shown_value(batch.spacecraft)))
+        self._spacecraft = batch.spacecraft
+        added = self.added_to(batch)
+        if not added:
+            return item
+        self.supplied += 1
+        body = json.loads(item.submission.text) | added
+        return replace(item, submission=submission_from_json(json.dumps(body)))
+
+    @abstractmethod
+    def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
+        """The fields of the batch that the file fills."""
+
+
+class FilePrior(FromFile):
+    """The attitude of an AEM or C-kernel, as `a_priori`.
+
+    A batch outside the segments of the file keeps its own.
+    """
+
+    option, key, title = "--a-priori", "a_priori_from_file", "a priori of file"
+
+    def __init__(self, known: KnownAttitudes) -> None:
+        super().__init__()
+        self._known = known
+
+    def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
+        """The a priori attitude."""
+        (quaternion,) = self._known.at(np.array([batch.time.tai_ns]))
+        if np.isnan(quaternion[0]):
+            return {}
+        if quaternion[3] < 0:
+            quaternion = -quaternion
+        return {"a_priori": {"quaternion": quaternion.tolist(), "frame": "EME2000"}}
+
+
+class FileEphemeris(FromFile):
+    """Position and velocity of an OEM or TLE, for batches that carry none.
+
+    A batch outside the span of the file gets nothing.
+    """
+
+    option, key, title = "--ephemeris", "state_from_file", "velocity of file"
+
+    def __init__(self, known: Ephemeris) -> None:
+        super().__init__()
+        self._known = known
+
+    def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
+        """The velocity and the position, each where the batch has none."""
+        wanted = {
+            name: part
+            for name, own, part in (
+                ("velocity_km_per_s", batch.velocity_km_per_s, slice(3, 6)),
+                ("position_km", batch.position_km, slice(0, 3)),
+            )
+            if own is None
+        }
+        state = self._known.at(batch.time) if wanted else None
+        if state is None:
+            return {}
+        return {name: state[part].tolist() for name, part in wanted.items()}
+
+
+# Carry attitudes along a replay: the attitude of one batch is the a priori of the next.
+#
+# It goes into the next batch's `a_priori` before that is sent, so the recorded
+# batch explains its answer.
+
+CARRIED_WITHIN_S = 3600.0
+"""The age of the last attitude above which a batch keeps its own a priori knowledge."""
+
+
+@dataclass(frozen=True)
+class _KnownAttitude:
+    """The attitude (3, 3), inertial to body, found for a batch."""
+
+    attitude: vectors.Matrix
+    time: Utc
+    rates_deg_per_s: vectors.Vector
+
+
+class AttitudeCarrier:
+    """Remembers the last good attitude of every spacecraft and writes it into its next batch.
+
+    Between the two batches the body turns with the mean of their rates where both
+    give rates, else with the given ones.  A suspect or missing attitude is not
+    carried: the last good one is.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, _KnownAttitude] = {}
+
+    def prepared(self, item: Item) -> Item:
+        """The item with the attitude in its `a_priori`, unchanged where none is known."""
+        if item.submission is None or item.submission.batch.measurement is not None:
+            return item
+        batch = item.submission.batch
+        known = self._known.get(batch.spacecraft)
+        if known is None:
+            return item
+        passed_s = (batch.time.tai_ns - known.time.tai_ns) * 1e-9
+        if abs(passed_s) > CARRIED_WITHIN_S:
+            return item
+        rates = [each for each in (known.rates_deg_per_s, batch.body_rates_deg_per_s) if each.any()]
+        rates_deg_per_s = np.mean(rates, axis=0) if rates else np.zeros(3)
+        body = json.loads(item.submission.text)
+        quaternion = vectors.quaternion_from_matrix(
+            turned(known.attitude, rates_deg_per_s, passed_s)
+        )
+        body["a_priori"] = {"quaternion": quaternion.tolist(), "frame": "EME2000"}
+        return replace(item, submission=submission_from_json(json.dumps(body)))
+
+    def note(self, outcome: LineOutcome) -> None:
+        """Remember the attitude of an answer, if it is a good one."""
+        if outcome.answer is None or outcome.item.submission is None:
+            return
+        attitude = msgspec.json.decode(outcome.answer)["attitude"]
+        if attitude is None or attitude["status"] != "good":
+            return
+        batch = outcome.item.submission.batch
+        self._known[batch.spacecraft] = _KnownAttitude(
+            vectors.matrix_from_quaternion(attitude["quaternion"]),
+            batch.time,
+            batch.body_rates_deg_per_s,
+        )
+
+
+def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
+    """A report that passes every outcome to the carrier too."""
+
+    def both(outcome: LineOutcome) -> None:
+        carrier.note(outcome)
+        report(outcome)
+
+    return both
+
+
+def turned(
+    attitude: vectors.Matrix, rates_deg_per_s: vectors.Vector, seconds: float
+) -> vectors.Matrix:
+    """The attitude after the body has turned with constant rates, in body axes, for a time."""
+    # A direction fixed in inertial space turns the other way in the body.
+    return vectors.rotate_about(-np.radians(rates_deg_per_s) * seconds, attitude.T).T

@@ -19,10 +19,17 @@ from msgspec import to_builtins
 
 from service import errors
 from service.gyro import json_of_block
-from service.observations.readers.telemetry import read_lines
-from service.packets.upload import archive_of
-from service.replay.from_file import AttitudeCarrier, reporting_to_carrier
-from service.replay.items import Item, LineOutcome, Pace, Problem, Report
+from service.observations.telemetry import read_lines
+from service.packets.reader import archive_of
+from service.replay.items import (
+    AttitudeCarrier,
+    Item,
+    LineOutcome,
+    Pace,
+    Problem,
+    Report,
+    reporting_to_carrier,
+)
 
 GIVE_UP_AFTER_S = 30.0
 

@@ -15,7 +15,7 @@ from acquire_client.models import Replay
 from tqdm import tqdm
 
 from service.errors import BadFile, Fault
-from service.observations.readers.telemetry import telemetry_format
+from service.observations.telemetry import telemetry_format
 from service.replay.items import LineOutcome
 
 MAX_PROBLEMS_SHOWN = 20

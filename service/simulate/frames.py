@@ -19,13 +19,7 @@ import numpy as np
 
 from service.errors import BadFile, BadInput, Fault, shown_value
 from service.imaging.centroids.psf import ColouredPsf, Psf
-from service.imaging.detection.star_image import (
-    TrailPsf,
-    psfs_of_colours,
-    reach_px,
-    still_psf,
-    trails_px,
-)
+from service.imaging.detection import star_images
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import CountArray
 from service.missions.camera import Camera, PsfKind
@@ -210,7 +204,7 @@ def _stars(
 ) -> _FrameStars:
     run = everything.run
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
-    margin = float(max(MARGIN_PX, reach_px(camera)))
+    margin = float(max(MARGIN_PX, star_images.reach_px(camera)))
     beyond_deg = max(0.5, math.degrees(1.5 * margin / camera.focal_length_px))
     near = math.cos(math.radians(min(camera.corner_radius_deg + beyond_deg, 89.0)))
     row = np.flatnonzero(run.direction @ boresight >= near)
@@ -222,7 +216,9 @@ def _stars(
     rows, columns = camera.shape
     inside = (u > -margin) & (u < columns + margin) & (v > -margin) & (v < rows + margin)
     row, u, v = row[inside], u[inside], v[inside]
-    trails = trails_px(camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s)
+    trails = star_images.trails_px(
+        camera, tracker.body_from_tracker, rates_deg_per_s, u, v, camera.exposure_s
+    )
     bv_mag = everything.catalog.color_bv_mag[run.catalog_row[row]]
     bv_mag = np.where(np.isfinite(bv_mag), bv_mag, TYPICAL_BV_MAG)
     return _FrameStars(row, u, v, everything.magnitude_mag[row], bv_mag, *trails)
@@ -238,14 +234,16 @@ def _exposed(
     """The counts of one exposure, and how many cosmic rays hit."""
     light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
     flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
-    half = reach_px(camera)
+    half = star_images.reach_px(camera)
     for u, v, along_u, along_v, flux, psf in zip(
         *(stars.u_px, stars.v_px, stars.trail_u_px, stars.trail_v_px),
         *(flux_e, _psfs(camera, stars.bv_mag)),
         strict=True,
     ):
         near = [reach for most_e, reach in FAINT_REACHES if flux < most_e]
-        add_star(light_e, TrailPsf(psf, along_u, along_v), u, v, flux, min([half, *near]))
+        add_star(
+            light_e, star_images.TrailPsf(psf, along_u, along_v), u, v, flux, min([half, *near])
+        )
     light_e *= chip.response
     light_e += camera.dark_e_per_s * camera.exposure_s
     light_e.reshape(-1)[chip.hot] += chip.hot_e_per_s * camera.exposure_s
@@ -261,8 +259,8 @@ def _exposed(
 def _psfs(camera: Camera, bv_mag: Vector) -> list[Psf]:
     """The still image of each star; in a band, of its own colour."""
     if camera.psf == "gaussian" or camera.band_nm is None:
-        return [still_psf(camera)] * len(bv_mag)
-    images, known = psfs_of_colours(camera, DRAWN_BV_MAG), np.array(DRAWN_BV_MAG)
+        return [star_images.still_psf(camera)] * len(bv_mag)
+    images, known = star_images.psfs_of_colours(camera, DRAWN_BV_MAG), np.array(DRAWN_BV_MAG)
     bv_mag = np.clip(bv_mag, known[0], known[-1])
     redder = np.clip(np.searchsorted(known, bv_mag), 1, len(known) - 1)
     share = (bv_mag - known[redder - 1]) / (known[redder] - known[redder - 1])
@@ -273,7 +271,12 @@ def _psfs(camera: Camera, bv_mag: Vector) -> list[Psf]:
 
 
 def add_star(
-    light: CountArray, psf: TrailPsf, u_px: float, v_px: float, flux: float, half_px: int
+    light: CountArray,
+    psf: star_images.TrailPsf,
+    u_px: float,
+    v_px: float,
+    flux: float,
+    half_px: int,
 ) -> None:
     """Add a star's image to an array of light, where it falls on it."""
     rows, columns = light.shape

@@ -14,8 +14,8 @@ from service.storage.archive.reading import Archive
 from service.storage.recording.events import HeardEvents
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, may_pass, remove_probe
 from service.storage.sql import engines
-from service.storage.sql.connections import PersistentConnection
 from service.storage.sql.database_file import DatabaseFile, FileLock
+from service.storage.sql.engines import PersistentConnection
 from service.storage.sql.migrations import bring_up_to_date, disposed, require_up_to_date
 from service.storage.sql.projector_lock import ProjectorLock
 

@@ -15,11 +15,10 @@ from service.observations.scans.reduce import reduced
 from service.storage.models.answers import Answer
 from service.storage.models.base import Count, Id, Moment, Record, doc
 from service.storage.queries.pages import PLACE, ResultFilter
-from service.storage.queries.recorded_batch import recorded_mission
-from service.storage.queries.results import answer_from_json, read_result
+from service.storage.queries.results import answer_from_json, read_result, recorded_mission
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results
-from service.tracks.gathering import Gathering
+from service.tracks.linking import Gathering
 from service.vectors import matrix_from_quaternion
 
 _ROWS: Select[Any] = select(

@@ -26,14 +26,9 @@ from service.storage.models.base import (
     page_record,
 )
 from service.storage.recording.events import EventKind
-from service.storage.sql.access_tables import (
-    access_tokens,
-    webhook_deliveries,
-    webhook_sender,
-    webhooks,
-)
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
+from service.storage.sql.tables import access_tokens, webhook_deliveries, webhook_sender, webhooks
 
 _row = webhook_deliveries.c
 _SHOWN = (

@@ -12,8 +12,7 @@ import numpy as np
 
 from service.sky.ephemeris import PLANETS, Planet, planet_place
 from service.tracks.extending import GATE
-from service.tracks.gathering import Batches, Indices, Points
-from service.tracks.linking import Link, Motion, fit_motion, link
+from service.tracks.linking import Batches, Indices, Link, Motion, Points, fit_motion, link
 from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, to_ra_dec
 
 TrackKind = Literal["moving", "planet", "fixed_on_sky", "fixed_on_detector", "fixed"]

@@ -18,18 +18,17 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service import logs
-from service.access.tokens import Access
+from service.access import Access
 from service.errors import Busy
 from service.settings import is_loopback
+from service.web.requests import problems
 from service.web.requests.access import authorize, entry_of, is_open
 from service.web.requests.metrics import Metrics
-from service.web.requests.problem_types import WRONG_HOST, ProblemType
-from service.web.requests.problems import error_response, internal_error, problem_response
 from service.web.requests.request_body import BodyBudget
 
 log = logging.getLogger(__name__)
 
-NOT_FOUND = ProblemType(404, "Not Found")
+NOT_FOUND = problems.ProblemType(404, "Not Found")
 
 requests = logging.getLogger("service.requests")
 
@@ -106,7 +105,9 @@ class AroundRequests:
             is_other = host is not None and not is_loopback(host)
             if is_other and await self._is_open(inner["path"]):
                 details = {"detail": f"the host must be a name of this machine, not {host!r}"}
-                await problem_response(Request(inner), WRONG_HOST, details)(inner, receive, sent)
+                await problems.problem_response(Request(inner), problems.WRONG_HOST, details)(
+                    inner, receive, sent
+                )
                 return
             route = self.direct.get((inner["method"], inner["path"]))
             if route is None:
@@ -119,17 +120,17 @@ class AroundRequests:
                     await authorize(request)
                     response = await route.endpoint(request)
                 except Exception as error:
-                    response = await error_response(request, error)
+                    response = await problems.error_response(request, error)
                 await response(inner, receive, sent)
         except Busy as error:
             # The database did not tell whether access is open.
             if status:
                 raise
-            await (await error_response(Request(inner), error))(inner, receive, sent)
+            await (await problems.error_response(Request(inner), error))(inner, receive, sent)
         except Exception as error:
             if status:
                 raise
-            await internal_error(Request(inner), error)(inner, receive, sent)
+            await problems.internal_error(Request(inner), error)(inner, receive, sent)
         finally:
             self.body_budget.remove(inner)
             if WARM_REQUEST not in inner:
@@ -232,7 +233,7 @@ class ProbesOnly:
             await self.app(scope, receive, send)
             return
         details = {"detail": f"this port answers only probes: {', '.join(PROBES)}"}
-        await problem_response(Request(scope), NOT_FOUND, details)(scope, receive, send)
+        await problems.problem_response(Request(scope), NOT_FOUND, details)(scope, receive, send)
 
 
 def _header(scope: Scope, name: bytes) -> bytes | None:

@@ -21,7 +21,7 @@ from starlette.responses import Response
 from service import __version__
 from service.products.formats import attitude_formats, table_formats
 from service.storage.models.base import Record, component_name, described
-from service.storage.models.events import EVENT_DATA
+from service.web.event_stream import EVENT_DATA
 from service.web.middleware import API
 from service.web.requests.access import POLICIES
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON

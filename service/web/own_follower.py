@@ -12,23 +12,14 @@ from typing import TYPE_CHECKING
 
 import anyio.to_thread
 
+from service import errors
 from service.app.factory import App
-from service.errors import (
-    AcquisitionError,
-    BadBatch,
-    BadConfiguration,
-    BadInput,
-    Busy,
-    Fault,
-    problem_of,
-)
 from service.extras import require_extra
 from service.follow.source import EXPECTED, Source, refusals_of, server_and_stream
 from service.settings import Settings
-from service.web.requests.dependencies import json_response
+from service.web.requests.access import json_response
 from service.web.requests.metrics import Metrics
-from service.web.requests.problem_types import INTERNAL_ERROR, problem_type_of
-from service.web.requests.problems import FAILED
+from service.web.requests.problems import FAILED, INTERNAL_ERROR, problem_type_of
 from service.web.requests.request_body import MAX_JSON_BYTES, refused
 
 if TYPE_CHECKING:
@@ -51,14 +42,14 @@ def source_of(settings: Settings) -> Source | None:
         servers, stream = server_and_stream(settings.follow)
     except ValueError:
         # The address may hold a password: it is not shown.
-        raise BadConfiguration(f"ACQUIRE_FOLLOW: {EXPECTED}") from None
+        raise errors.BadConfiguration(f"ACQUIRE_FOLLOW: {EXPECTED}") from None
     files = {
         "ACQUIRE_FOLLOW_CREDENTIALS": settings.follow_credentials,
         "ACQUIRE_FOLLOW_AUTHORITY": settings.follow_authority,
     }
     for name, file in files.items():
         if file is not None and not file.is_file():
-            raise BadConfiguration(f"{name}: {file} is not there, or is no file")
+            raise errors.BadConfiguration(f"{name}: {file} is not there, or is no file")
     return Source(
         servers,
         stream,
@@ -95,7 +86,7 @@ def _submit_to(app: App, metrics: Metrics) -> "Submit":
 
     async def recorded(message: bytes) -> Answer:
         if len(message) > MAX_JSON_BYTES:
-            raise BadBatch(Fault("body", f"may have at most {MAX_JSON_BYTES} bytes"))
+            raise errors.BadBatch(errors.Fault("body", f"may have at most {MAX_JSON_BYTES} bytes"))
         if (block := gyro_block_in(message)) is None:
             answered = await app.submissions.answered(message)
             return Answer(answered.body, answered.replayed)
@@ -105,14 +96,14 @@ def _submit_to(app: App, metrics: Metrics) -> "Submit":
     async def submit(message: bytes) -> Answer:
         try:
             answer = await recorded(message)
-        except Busy as error:
+        except errors.Busy as error:
             raise NotNow(str(error)) from None
         except Exception as error:
-            if isinstance(error, BadInput):
+            if isinstance(error, errors.BadInput):
                 error = refused(message, error)
             kind, details = INTERNAL_ERROR, FAILED
-            if isinstance(error, AcquisitionError):
-                kind, details = problem_type_of(error), problem_of(error)
+            if isinstance(error, errors.AcquisitionError):
+                kind, details = problem_type_of(error), errors.problem_of(error)
             if kind is INTERNAL_ERROR:
                 log.error("a message of the stream failed", exc_info=error)
                 details = FAILED

@@ -19,10 +19,9 @@ from service.errors import BadConfiguration
 from service.settings import Settings, is_loopback, networks
 from service.storage.sql.database_file import warn_of_readers
 from service.web.app import create_app
-from service.web.connection_limits import Admission
 from service.web.middleware import ProbesOnly
 from service.web.own_follower import source_of
-from service.web.slow_clients import Connection, SharedState
+from service.web.slow_clients import Admission, Connection, SharedState
 
 MAX_FILES = 4096
 

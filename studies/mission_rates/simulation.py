@@ -1,48 +1,268 @@
-"""The views of a sweep through the pipeline, zone by zone, on all cores.
+"""The settings that a sweep varies, and its views through the pipeline, zone by zone, on all cores.
 
+A setting of the mission (tolerances and zone) has the name of its key in the mission file; the
+others are the simulated errors.
 Every setting sees the same zones, views, stars and draws, as every run of the paper did: the
 difference between two settings is theirs, not that of the draw.  They depend on the seed and the
 zone's number alone, not on how the work is shared out.
 """
 
+import itertools
 import math
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from functools import cache, partial
 from pathlib import Path
+from typing import Any, Self
 
 import numpy as np
+from pydantic import ValidationError
 from tqdm import tqdm
 
 from service.acquire import BatchColumns, acquire_many
+from service.acquire.choices import idle_reason
 from service.advice.intervals import Interval, share_of
-from service.missions.mission import Identifier
+from service.errors import BadInput, Fault, shown_value
+from service.missions.mission import Band, Identifier, Mission, Tolerances
 from service.simulate.motion import random_axis, tilted
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
 from service.vectors import Vector, from_ra_dec, to_ra_dec
-from studies.mission_rates.settings import Errors, Setting, sigobs_arcsec
+from studies.paper_1994 import tally
 from studies.paper_1994.printed import PrintedCounts, Reference, Run, World
-from studies.paper_1994.tally import (
-    AMBIGUOUS,
-    CORRECT,
-    MISIDENTIFIED,
-    UNMATCHED,
-    Integers,
-    counts_of,
-)
 from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone
 from studies.workers import mapping, number_of
+
+MOST_SETTINGS = 400
+MOST_DIGITS = 12
+"""The digits of a value in a range: .3 + 3 * .2 is to be 0.9."""
+BOUND_SIGMAS = 6.0
+"""The bound of magnitude errors: RCMAG of the paper's Table 1 is six times its SIGMAG."""
+
+
+@dataclass(frozen=True)
+class Errors:
+    """The errors that are simulated, with the paper's names.
+
+    `phi_deg`, `theta_deg`, `psi_deg` (LIBROT) turn the observed vectors about the body axes Z,
+    then Y, then X.  `off_axis_deg` (RCVIEW) bounds the angle from the zone's axis to the
+    boresight, of a band from the pole to the body axis that it is about.
+    `position_error_arcsec` is a standard deviation per tangent axis: SIGOBS, that of the paper's
+    radial error, is the root of two times it.  `magnitude_error_mag` is SIGMAG, and
+    `magnitude_bound_mag` RCMAG.
+    """
+
+    phi_deg: float
+    theta_deg: float
+    psi_deg: float
+    off_axis_deg: float
+    position_error_arcsec: float
+    magnitude_error_mag: float
+    magnitude_bound_mag: float
+
+
+LIMITS = {
+    "phi_deg": (-360.0, 360.0),
+    "theta_deg": (-360.0, 360.0),
+    "psi_deg": (-360.0, 360.0),
+    "off_axis_deg": (0.0, 180.0),
+    "position_error_arcsec": (0.0, 3600.0),
+    "magnitude_error_mag": (0.0, 10.0),
+    "magnitude_bound_mag": (0.001, 100.0),
+}
+SIZES = ("radius_deg", "half_width_deg")
+"""The sizes of a cap and of a band, in the table `zone` of the mission file."""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One point of a sweep: the swept values by name, and what they make of mission and errors."""
+
+    values: Mapping[str, float]
+    mission: Mission
+    errors: Errors
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """The values that one setting takes in turn."""
+
+    name: str
+    values: tuple[float, ...]
+
+    @classmethod
+    def parsed(cls, text: str) -> Self:
+        """Parse NAME=V1,V2,... or NAME=FIRST:LAST:STEP; raises `BadInput`.
+
+        The unit at the end of a name may be left out.
+        """
+        name, equals, written = text.partition("=")
+        named = _full_name(name.strip())
+        if not equals or named is None:
+            known = ", ".join(_names())
+            message = f"must be NAME=VALUES with one of {known}"
+            raise BadInput(Fault("--sweep", message, shown_value(text)))
+        try:
+            values = _values(written)
+        except ValueError:
+            message = "must be values such as .01,.02,.05 or a range such as .3:.9:.2"
+            raise BadInput(Fault(f"--sweep {named}", message, shown_value(written))) from None
+        if not 1 <= len(values) <= MOST_SETTINGS:
+            message = f"must have 1 to {MOST_SETTINGS} values"
+            raise BadInput(Fault(f"--sweep {named}", message, shown_value(written)))
+        return cls(named, tuple(dict.fromkeys(values)))
+
+
+def _names() -> list[str]:
+    return [*Tolerances.model_fields, *SIZES, *LIMITS]
+
+
+def _full_name(name: str) -> str | None:
+    return next((full for full in _names() if name in (full, full.rpartition("_")[0])), None)
+
+
+def _values(text: str) -> list[float]:
+    if ":" not in text:
+        values = [float(part) for part in text.split(",")]
+    else:
+        first, last, step = map(float, text.split(":"))
+        if not (step > 0.0 and math.isfinite(first) and math.isfinite(last)):
+            raise ValueError
+        # A hair more, so that rounding does not lose the last value.
+        count = int((last - first) / step + 1e-9) + 1 if last >= first else 0
+        values = [
+            float(f"{first + k * step:.{MOST_DIGITS}g}")
+            for k in range(min(count, MOST_SETTINGS + 1))
+        ]
+    if not all(map(math.isfinite, values)):
+        raise ValueError
+    return values
+
+
+def one_tracker(mission: Mission, tracker: str | None) -> Mission:
+    """The mission with one tracker, by default its first, and with no search of the whole sky.
+
+    A cap lies about a tracker's boresight, so that the boresight becomes the zone's axis.
+    Raises `BadInput` for a tracker that the mission has not.
+    """
+    chosen = mission.trackers[0] if tracker is None else mission.tracker(tracker, "--tracker")
+    zone = mission.zone
+    if not isinstance(zone, Band):
+        zone = zone.model_copy(update={"axis_body": tuple(chosen.boresight_body.tolist())})
+    update = {"trackers": (chosen,), "zone": zone, "packets": None, "lost_in_space_fallback": False}
+    return mission.model_copy(update=update)
+
+
+def usual_errors(mission: Mission) -> Errors:
+    """The errors that a mission of one tracker allows for, with a perfect a priori attitude.
+
+    The boresight is as far from the zone's axis as the field of view has room in the zone.
+    """
+    tracker, zone = mission.trackers[0], mission.zone
+    size_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
+    return Errors(
+        phi_deg=0.0,
+        theta_deg=0.0,
+        psi_deg=0.0,
+        off_axis_deg=max(0.0, size_deg - tracker.field_of_view_radius_deg),
+        position_error_arcsec=tracker.sigma_arcsec,
+        magnitude_error_mag=tracker.magnitude_sigma_mag,
+        magnitude_bound_mag=BOUND_SIGMAS * tracker.magnitude_sigma_mag,
+    )
+
+
+def settings_of(mission: Mission, sweeps: Sequence[Sweep]) -> list[Setting]:
+    """Every combination of the swept values; the last sweep varies fastest.
+
+    A swept magnitude error takes its bound along, unless that is swept itself.  Raises
+    `BadInput` naming a value that the mission file could not have, or too many combinations.
+    """
+    names = [sweep.name for sweep in sweeps]
+    for name in names:
+        if names.count(name) > 1:
+            raise BadInput(Fault("--sweep", "must name a setting once", name))
+    count = math.prod(len(sweep.values) for sweep in sweeps)
+    if count > MOST_SETTINGS:
+        message = f"must make at most {MOST_SETTINGS} combinations"
+        raise BadInput(Fault("--sweep", message, str(count)))
+    errors = usual_errors(mission)
+    return [
+        _setting(mission, errors, dict(zip(names, values, strict=True)))
+        for values in itertools.product(*(sweep.values for sweep in sweeps))
+    ]
+
+
+def _setting(mission: Mission, errors: Errors, values: Mapping[str, float]) -> Setting:
+    own = {name: value for name, value in values.items() if name in LIMITS}
+    for name, value in own.items():
+        least, most = LIMITS[name]
+        if not least <= value <= most:
+            message = f"must be from {least:g} to {most:g}"
+            raise BadInput(Fault(f"--sweep {name}", message, shown_value(value)))
+    if "magnitude_error_mag" in own and "magnitude_bound_mag" not in own:
+        own["magnitude_bound_mag"] = max(
+            BOUND_SIGMAS * own["magnitude_error_mag"], LIMITS["magnitude_bound_mag"][0]
+        )
+    of_mission = {name: value for name, value in values.items() if name not in LIMITS}
+    changed = _with(mission, of_mission) if of_mission else mission
+    return Setting(values, changed, replace(errors, **own))
+
+
+def _with(mission: Mission, values: Mapping[str, float]) -> Mission:
+    """The mission with other tolerances or another size of its zone."""
+    tables: dict[str, Any] = {
+        "zone": mission.zone.model_dump(),
+        "tolerances": mission.tolerances.model_dump(),
+    }
+    for name, value in values.items():
+        if name in SIZES and name not in tables["zone"]:
+            kind = mission.zone.kind
+            message = f"{mission.name} has a {kind}, which has no such size"
+            raise BadInput(Fault(f"--sweep {name}", message, shown_value(value)))
+        tables["zone" if name in SIZES else "tolerances"][name] = value
+    try:
+        zone = type(mission.zone).model_validate(tables["zone"])
+        tolerances = Tolerances.model_validate(tables["tolerances"])
+    except ValidationError as error:
+        first = error.errors()[0]
+        field = f"--sweep {'.'.join(map(str, first['loc']))}"
+        raise BadInput(Fault(field, first["msg"], shown_value(first["input"]))) from None
+    return mission.model_copy(update={"zone": zone, "tolerances": tolerances})
+
+
+def options_of_settings(sweeps: Sequence[Sweep], tests: Mapping[str, bool]) -> dict[str, str]:
+    """The tests and tolerances that are asked for, each with the option that does so."""
+    switches = {True: "--with", False: "--without"}
+    options = {name: switches[is_on] for name, is_on in tests.items()}
+    swept = [each.name for each in sweeps if each.name in Tolerances.model_fields]
+    return options | dict.fromkeys(swept, "--sweep")
+
+
+def refuse_idle(options: Mapping[str, str], mission: Mission, identifier: str) -> None:
+    """Raise `BadInput` naming an option whose test or tolerance changes nothing."""
+    for name, option in options.items():
+        reason = idle_reason(name, identifier, mission.tests, mission.zone)
+        if reason is not None:
+            raise BadInput(Fault(f"{option} {name}", f"{reason} and would change nothing"))
+
+
+def sigobs_arcsec(errors: Errors) -> float:
+    """SIGOBS, the standard deviation of the paper's radial error of position."""
+    return float(np.sqrt(2.0)) * errors.position_error_arcsec
+
+
+assert {each.name for each in fields(Errors)} == set(LIMITS)
+
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
 """The sigma in place of no error at all, by which the bound could not be divided."""
 OUTCOMES = {
-    "unique_right": CORRECT,
-    "ambiguous": AMBIGUOUS,
-    "unmatched": UNMATCHED,
-    "wrong": MISIDENTIFIED,
+    "unique_right": tally.CORRECT,
+    "ambiguous": tally.AMBIGUOUS,
+    "unmatched": tally.UNMATCHED,
+    "wrong": tally.MISIDENTIFIED,
 }
 
 
@@ -103,7 +323,7 @@ def simulate(
     return [_rates(*each) for each in zip(plan.settings, by_setting, strict=True)]
 
 
-def _rates(setting: Setting, counts: Integers) -> Rates:
+def _rates(setting: Setting, counts: tally.Integers) -> Rates:
     """The rates of counts (zones, 4)."""
     total = counts.sum(axis=1)
     zone = np.repeat(np.arange(len(total)), total)
@@ -112,7 +332,7 @@ def _rates(setting: Setting, counts: Integers) -> Rates:
     return Rates(setting=setting, stars=int(total.sum()), **shares)
 
 
-def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
+def zone_counts(plan: Plan, number: int, sky: SkyModel) -> tally.Integers:
     """The outcome of one zone's stars: counts (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
@@ -124,7 +344,7 @@ def zone_counts(plan: Plan, number: int, sky: SkyModel) -> Integers:
                 found = acquire_many(BatchColumns.of(batches), mission, sky)
                 for row, view in enumerate(views):
                     identified = found.acquisition(row).trackers[0].identification
-                    counts[place] += counts_of(identified, view.star)
+                    counts[place] += tally.counts_of(identified, view.star)
     return counts
 
 
@@ -170,7 +390,7 @@ def _run(errors: Errors) -> Run:
     )
 
 
-def _zone_counts(plan: Plan, catalog: Path | None, number: int) -> Integers:
+def _zone_counts(plan: Plan, catalog: Path | None, number: int) -> tally.Integers:
     return zone_counts(plan, number, _sky(catalog))
 
 

@@ -9,12 +9,12 @@ from service.errors import BadInput, Fault
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Identifier
 from studies.documents import json_rows, links
-from studies.paper_1994 import tables, time_tables
+from studies.paper_1994 import tables
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.plots import PICTURES, PLACES, draw
 from studies.paper_1994.printed import the_paper
+from studies.paper_1994.tables import Row, measure
 from studies.paper_1994.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHED, Tally
-from studies.paper_1994.time_tables import Row, measure
 
 ZONE_IDENTIFIERS: tuple[Identifier, ...] = tuple(
     name for name, entry in IDENTIFIERS.items() if entry.searches_zone
@@ -123,9 +123,9 @@ def measured(wanted: Sequence[int], seed: int, identifier: Identifier) -> list[R
         cases = [each for each in the_paper().times if each.table == str(number)]
         zones = [(case, measure(case, seed, identifier)) for case in cases]
         if number in wanted:
-            rows += [time_tables.time_row(*each, identifier) for each in zones]
+            rows += [tables.time_row(*each, identifier) for each in zones]
         if shares in wanted:
-            rows += [row for each in zones for row in time_tables.proportion_rows(shares, *each)]
+            rows += [row for each in zones for row in tables.proportion_rows(shares, *each)]
     return rows
 
 
@@ -154,11 +154,11 @@ def report(
     for number in wanted:
         rows = [row for row in time_rows if row["table"] == number]
         if rows and number in TIMES:
-            limit = f"{time_tables.limit(rows)} {time_tables.ABOUT_TIMES}"
-            parts += [tables.heading(number), time_tables.times(rows), limit]
+            limit = f"{tables.limit(rows)} {tables.ABOUT_TIMES}"
+            parts += [tables.heading(number), tables.times(rows), limit]
         elif rows:
             note = "`!`: the zone holds more pairs than the approximation bounds."
-            parts += [tables.heading(number), time_tables.proportions(rows), note]
+            parts += [tables.heading(number), tables.proportions(rows), note]
     return "\n\n".join(parts) + "\n"
 
 
@@ -246,7 +246,7 @@ def document(
     parts = ["# The tables of Fink & Shoup 1994", written, _INTRODUCTION, *shown, without_heading]
     for number in TIMES:
         rows = [row for row in time_rows if row["table"] == number]
-        parts += [f"Table {number}. {time_tables.limit(rows)}"] if rows else []
+        parts += [f"Table {number}. {tables.limit(rows)}"] if rows else []
     if mine:
         parts.append(_OUTSIDE)
     parts += [report(tallies, name, _RATE_TABLES) for name in _others(tallies)]

@@ -9,8 +9,7 @@ import numpy as np
 
 from studies.documents import pictures_in
 from studies.paper_1994.printed import Run
-from studies.paper_1994.region import spread
-from studies.paper_1994.tally import Tally
+from studies.paper_1994.tally import Tally, spread
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

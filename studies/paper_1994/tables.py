@@ -1,17 +1,39 @@
-"""The tables as Markdown that reads well in a terminal too: the paper's numbers beside ours."""
+"""The tables as Markdown that reads well in a terminal too: the paper's numbers beside ours.
 
-from collections.abc import Mapping, Sequence
+Tables 11 to 14 are the times of 1994 beside ours, k_g and the memory that it bounds.
+"""
 
+import math
+import statistics
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from service.acquire import acquire
+from service.acquire.prewarm import prewarm_kernels
+from service.identify.prior_attitude import prior_attitude, search_region
+from service.missions.mission import Band, Identifier, Mission
+from service.sky.geometry.pairs import PAIRS_PER_BIN, build_pairs
+from service.sky.model import SkyModel
+from service.sky.zones import build_zone
 from studies.documents import markdown
-from studies.paper_1994.printed import Run
-from studies.paper_1994.region import (
+from studies.paper_1994.experiments import open_sky
+from studies.paper_1994.printed import Run, Times, World, the_paper
+from studies.paper_1994.tally import (
+    AMBIGUOUS,
+    MISIDENTIFIED,
+    UNMATCHED,
     Difference,
+    Tally,
     differences,
     distance_squared,
     is_inside,
     spread,
 )
-from studies.paper_1994.tally import AMBIGUOUS, MISIDENTIFIED, UNMATCHED, Tally
+from studies.paper_1994.views import EPOCH, View, batch_of, draw_zone, paper_mission
 
 TITLES: Mapping[int, str] = {
     2: "Increasing attitude error, cap",
@@ -141,3 +163,240 @@ def summary(tallies: Sequence[Tally]) -> str:
     if differ:
         lines.append(f"Other than the reference: {'; '.join(differ)}.")
     return "\n".join(lines)
+
+
+BYTES_PER_PAIR = 8 + 4 + 4 + 4 / PAIRS_PER_BIN
+"""A separation, two rows and a share of a bin."""
+
+
+LIMITS_S = {11: 4.0, 12: 600.0}
+"""The times that the missions allow for an update (XTE, SWAS), and for a pass's result (SOHO)."""
+
+Row = dict[str, Any]
+
+
+# A zone with no pairs worth mentioning: its time is that of choosing the stars.
+_NO_PAIRS_DEG = 1e-9
+
+
+@dataclass(frozen=True)
+class ZoneTime:
+    """One zone and the identifications of its views, in seconds.
+
+    `first_s` is the pair index and the first identification, `later_s` the
+    identifications after it, `batch_s` those with all that the pipeline does
+    to a batch.
+    """
+
+    stars: int
+    pairs: int
+    pairs_bytes: int
+    generate_s: float
+    first_s: float
+    later_s: tuple[float, ...]
+    batch_s: tuple[float, ...]
+
+
+def measure(case: Times, seed: int, identifier: Identifier = "starid") -> list[ZoneTime]:
+    """The times of a row's zones, ten views each, nominal errors, in this process."""
+    world = the_paper().worlds[case.world]
+    sky = open_sky()
+    mission = paper_mission(world.mission)
+    prewarm_kernels(sky, {mission.name: mission}, [identifier])
+    catalog = sky.run_catalog(mission, EPOCH)
+    rng = np.random.default_rng([seed, int(case.table)])
+    return [
+        _measure_zone(world, list(draw_zone(world, number, mission, catalog, rng)), sky, identifier)
+        for number in range(case.zones)
+    ]
+
+
+def _measure_zone(
+    world: World, views: list[View], sky: SkyModel, identifier: Identifier
+) -> ZoneTime:
+    mission = paper_mission(world.mission)
+    catalog = sky.run_catalog(mission, EPOCH)
+    nominal = next(run for run in the_paper().runs if run.world == world.name)
+    batches = [batch_of(view, nominal, mission, identifier) for view in views if len(view.star)]
+    prior = batches[0].a_priori
+    assert prior is not None
+    presumed = prior_attitude(prior, EPOCH, mission)
+    region = search_region(mission.trackers[0], presumed, mission, "a_priori")
+
+    clock = [time.perf_counter()]
+    zone = build_zone(mission.name, catalog, region, _NO_PAIRS_DEG)
+    clock.append(time.perf_counter())
+    pairs = build_pairs(zone.direction, mission.tolerances.pair_separation_max_deg)
+    clock.append(time.perf_counter())
+
+    # The pipeline builds the zone for itself once; only its identification counts here.
+    first, *later = [
+        acquire(batch, mission, sky).timings_us["identify"] * 1e-6 for batch in batches
+    ]
+    whole = []
+    for batch in batches[1:]:
+        started = time.perf_counter()
+        acquire(batch, mission, sky)
+        whole.append(time.perf_counter() - started)
+    return ZoneTime(
+        stars=len(zone.star),
+        pairs=pairs.count,
+        pairs_bytes=pairs.nbytes,
+        generate_s=clock[1] - clock[0],
+        first_s=clock[2] - clock[1] + first,
+        later_s=tuple(later),
+        batch_s=tuple(whole),
+    )
+
+
+def proportion(stars: int, pairs: int) -> float:
+    """k_g: the share of all pairs of a zone's stars that are near enough to be seen together."""
+    return pairs / (stars * (stars - 1) / 2.0)
+
+
+def time_row(case: Times, zones: Sequence[ZoneTime], identifier: str) -> Row:
+    """A case of Table 11 or 12, times in ms: the least, the median and the greatest.
+
+    `stars` and `pairs` are those of the zones that were made and searched first the fastest and
+    the slowest, as the paper prints them.
+    """
+    ordered = sorted(zones, key=lambda zone: zone.generate_s + zone.first_s)
+    ends = ordered[0], ordered[-1]
+    total_s = sum(zone.generate_s + zone.first_s + sum(zone.later_s) for zone in zones)
+    return {
+        "table": int(case.table),
+        "case": case.case,
+        "identifier": identifier,
+        "zones": len(zones),
+        "stars": [zone.stars for zone in ends],
+        "pairs": [zone.pairs for zone in ends],
+        "generate_ms": _spread_ms(zone.generate_s for zone in zones),
+        "first_ms": _spread_ms(zone.first_s for zone in zones),
+        "later_ms": _spread_ms(second for zone in zones for second in zone.later_s),
+        "batch_ms": _spread_ms(second for zone in zones for second in zone.batch_s),
+        "slowest_ms": 1e3 * (ends[1].generate_s + ends[1].first_s),
+        "all_ms": 1e3 * total_s,
+    }
+
+
+def times(rows: Sequence[Row]) -> str:
+    """Tables 11 and 12: seconds of 1994, least to greatest, beside our milliseconds."""
+    header = (
+        *("case", "step", "1994 (s)", "ours: least, median, most (ms)"),
+        *("NCAP 1994", "ours", "NTOT 1994", "ours"),
+    )
+    lines: list[tuple[str, ...]] = []
+    for row in rows:
+        case = _case(row)
+        sizes = (case.stars, row["stars"], case.pairs, row["pairs"])
+        none, count = ("", "", "", ""), row["zones"]
+        each_s, each_ms = case.total_s / count, row["all_ms"] / count
+        steps: tuple[tuple[str, str, str], ...] = (
+            ("SIDS and first", _seconds(case.first_s), _ms(row["first_ms"])),
+            ("later ones", _seconds(case.later_s), _ms(row["later_ms"])),
+            ("later, whole batch", "", _ms(row["batch_ms"])),
+            (f"all {count} zones", f"{case.total_s:.2f}", _ms([row["all_ms"]])),
+            ("mean of a zone", f"{each_s:.2f}", _ms([each_ms])),
+        )
+        first = (row["case"], "zone", _seconds(case.generate_s), _ms(row["generate_ms"]))
+        lines += [(*first, *map(_range, sizes)), *(("", *step, *none) for step in steps)]
+    return markdown(header, lines)
+
+
+ABOUT_TIMES = (
+    "NCAP and NTOT are those of the fastest and of the slowest zone; the greatest times include "
+    "other work of the machine."
+)
+
+
+def limit(rows: Sequence[Row]) -> str:
+    """The time that the missions allow, beside the slowest zone of a table."""
+    slowest = max(rows, key=lambda row: float(row["slowest_ms"]))
+    allowed = LIMITS_S[slowest["table"]]
+    return (
+        f"The mission allows {allowed:g} s; the slowest zone ({slowest['case']}), its pairs and "
+        f"the first identification took {slowest['slowest_ms']:.3f} ms together."
+    )
+
+
+def _case(row: Row) -> Times:
+    return next(
+        each
+        for each in the_paper().times
+        if (each.table, each.case) == (str(row["table"]), row["case"])
+    )
+
+
+def _range(values: Sequence[int]) -> str:
+    return "..".join(map(str, dict.fromkeys(values)))
+
+
+def _seconds(values: tuple[float, float]) -> str:
+    return f"{values[0]:.2f}..{values[1]:.2f}"
+
+
+def _spread_ms(seconds: Iterable[float]) -> list[float]:
+    values = [1e3 * value for value in seconds]
+    return [min(values), statistics.median(values), max(values)]
+
+
+def _ms(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.3f}" for value in values)
+
+
+def proportion_rows(table: int, case: Times, zones: Sequence[ZoneTime]) -> list[Row]:
+    """A case of Table 13 or 14: one zone where all are alike, else those of fewest and most stars.
+
+    The bound is that of equations 1 and 2.
+    """
+    ordered = sorted(zones, key=lambda zone: (zone.stars, zone.pairs))
+    share = geometric_share(paper_mission(the_paper().worlds[case.world].mission))
+    found = []
+    for k in sorted({0, -1} if case.stars[0] != case.stars[1] else {0}, reverse=True):
+        zone, place = ordered[k], 1 if k else 0
+        found.append(
+            {
+                "table": table,
+                "case": case.case,
+                "stars_1994": case.stars[place],
+                "pairs_1994": case.pairs[place],
+                "k_g_1994": proportion(case.stars[place], case.pairs[place]),
+                "stars": zone.stars,
+                "pairs": zone.pairs,
+                "k_g": proportion(zone.stars, zone.pairs),
+                "k_g_areas": share,
+                "pairs_bound": share * zone.stars * (zone.stars - 1) / 2.0,
+                "index_bytes": zone.pairs_bytes,
+            }
+        )
+    return found
+
+
+def proportions(rows: Sequence[Row]) -> str:
+    """Tables 13 and 14: k_g, the bound it sets on NTOT, and the bytes of a pair index."""
+    header = (
+        *("case", "NCAP 1994", "NTOT 1994", "k_g 1994", "NCAP", "NTOT", "k_g"),
+        *("k_g of the areas", "bound on NTOT", "bound (kB)", "index (kB)"),
+    )
+    lines = [
+        (
+            row["case"],
+            *(str(row[name]) for name in ("stars_1994", "pairs_1994")),
+            f"{row['k_g_1994']:.4f}",
+            *(str(row[name]) for name in ("stars", "pairs")),
+            *(f"{row[name]:.4f}" for name in ("k_g", "k_g_areas")),
+            f"{row['pairs_bound']:.0f}{'' if row['pairs'] <= row['pairs_bound'] else ' !'}",
+            f"{row['pairs_bound'] * BYTES_PER_PAIR / 1e3:.0f}",
+            f"{row['index_bytes'] / 1e3:.0f}",
+        )
+        for row in rows
+    ]
+    return markdown(header, lines)
+
+
+def geometric_share(mission: Mission) -> float:
+    """The paper's approximation of k_g: thrice the field of view's area over the zone's, flat."""
+    radius = mission.trackers[0].field_of_view_radius_deg
+    if isinstance(mission.zone, Band):
+        return 3.0 * math.pi * radius**2 / (360.0 * 2.0 * mission.zone.half_width_deg)
+    return 3.0 * (radius / mission.zone.radius_deg) ** 2

@@ -1,5 +1,12 @@
-"""The outcome of a run's stars, zone by zone."""
+"""The outcome of a run's stars, zone by zone, and tests if two sets of counts agree.
 
+Compared are the printed run with ours, and our rates with the reference's.
+An experiment is many independent zones, so that the covariance of its counts
+is that of one zone's counts times their number: as good from few experiments
+as from many.
+"""
+
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -7,7 +14,8 @@ import numpy.typing as npt
 
 from service.identify.identification import Identification, Outcome
 from service.missions.mission import Identifier
-from studies.paper_1994.printed import Run, World, the_paper
+from service.vectors import Matrix, Vector
+from studies.paper_1994.printed import REFERENCE_EXPERIMENTS, PrintedCounts, Run, World, the_paper
 
 AMBIGUOUS, UNMATCHED, CORRECT, MISIDENTIFIED = range(4)
 
@@ -46,3 +54,106 @@ def counts_of(found: Identification, truth: npt.NDArray[np.intp]) -> Integers:
     counts[CORRECT] = np.count_nonzero(found.unique & is_right)
     counts[MISIDENTIFIED] = np.count_nonzero(found.unique & ~is_right)
     return counts
+
+
+CHI_SQUARE_95 = 5.99
+"""The 95 % point of chi-square with two degrees of freedom."""
+ALLOWED_SIGMAS = 3.0
+ALLOWED_PCT = 0.05
+
+
+@dataclass(frozen=True)
+class Spread:
+    """One experiment of the paper's size, over `experiments`: mean (2,) and covariance (2, 2).
+
+    The two counts are the stars not identified (ambiguous or unmatched) and
+    those misidentified.
+    """
+
+    experiments: float
+    stars: float
+    mean: Vector
+    covariance: Matrix
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Our rate beside the reference's, in percent, and how far apart they may be."""
+
+    ours_pct: float
+    ours_sigma_pct: float
+    reference_pct: float
+    allowed_pct: float
+
+    @property
+    def agrees(self) -> bool:
+        """True if the rates differ by no more than may be."""
+        return abs(self.ours_pct - self.reference_pct) <= self.allowed_pct
+
+
+def unidentified_and_wrong(counts: Integers) -> Integers:
+    """Stars ambiguous or unmatched, and stars misidentified: (zones, 2)."""
+    return np.stack([counts[:, AMBIGUOUS] + counts[:, UNMATCHED], counts[:, MISIDENTIFIED]], axis=1)
+
+
+def spread(tally: Tally) -> Spread:
+    """The mean and the covariance of an experiment's counts."""
+    world = tally.world
+    counts = unidentified_and_wrong(tally.counts).astype(np.float64)
+    zones = len(counts)
+    kind = np.arange(zones) % world.strata
+    # What differs from date to date of the Sun is the same in every experiment.
+    means = np.stack([counts[kind == k].mean(axis=0) for k in range(world.strata)])
+    apart = counts - means[kind]
+    covariance = apart.T @ apart / (zones - world.strata)
+    experiments = zones / world.zones
+    return Spread(
+        experiments=experiments,
+        stars=tally.stars / experiments,
+        mean=counts.sum(axis=0) / experiments,
+        covariance=covariance * world.zones,
+    )
+
+
+def distance_squared(printed: PrintedCounts, ours: Spread) -> float:
+    """How far printed counts lie from ours: at most 5.99 in 95 of 100 experiments.
+
+    d^T C^-1 d with C = (1 + 1/n) the covariance of an experiment's counts, n
+    being the number of experiments that gave the mean, and 1/2 for counts
+    being whole.
+    """
+    apart = np.array([printed.ambiguous, printed.misidentified]) - ours.mean
+    covariance = (1.0 + 1.0 / ours.experiments) * ours.covariance + 0.5 * np.eye(2)
+    return float(apart @ np.linalg.solve(covariance, apart))
+
+
+def is_inside(tally: Tally) -> bool:
+    """True if the printed counts lie in the 95 % region of experiments of their size."""
+    return distance_squared(tally.run.printed, spread(tally)) <= CHI_SQUARE_95
+
+
+def differences(tally: Tally) -> tuple[Difference, Difference]:
+    """Our rates of stars not identified and of stars misidentified beside the reference's.
+
+    They may differ by three combined standard errors, or by 0.05 percentage points.
+    """
+    ours, reference = spread(tally), tally.run.reference
+    theirs = (
+        (reference.unidentified_pct, reference.sd_unidentified_pct),
+        (reference.misidentified_pct, reference.sd_misidentified_pct),
+    )
+    first, second = (
+        _difference(
+            100.0 * ours.mean[k] / ours.stars,
+            100.0 * math.sqrt(ours.covariance[k, k] / ours.experiments) / ours.stars,
+            rate_pct,
+            sd_pct / math.sqrt(REFERENCE_EXPERIMENTS),
+        )
+        for k, (rate_pct, sd_pct) in enumerate(theirs)
+    )
+    return first, second
+
+
+def _difference(ours: float, sigma: float, theirs: float, their_sigma: float) -> Difference:
+    allowed = max(ALLOWED_SIGMAS * math.hypot(sigma, their_sigma), ALLOWED_PCT)
+    return Difference(float(ours), float(sigma), theirs, allowed)

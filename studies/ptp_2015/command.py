@@ -14,10 +14,10 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles
 from studies.documents import json_rows, links, markdown
 from studies.ptp_2015 import comparison, tables
+from studies.ptp_2015.comparison import Case
 from studies.ptp_2015.plots import draw
 from studies.ptp_2015.printed import the_ptp_paper
 from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, Measurements, section
-from studies.ptp_2015.tally import Case
 
 DEFAULT_SCENES = 10_000
 SLAVES = ("PTP, 3 slaves", "PTP", "PTP, 5 slaves", "PTP, 6 slaves")

@@ -8,9 +8,9 @@ import numpy as np
 import numpy.typing as npt
 
 from studies.documents import pictures_in
+from studies.ptp_2015.comparison import FieldShare, Tally
 from studies.ptp_2015.printed import Ends, the_ptp_paper
 from studies.ptp_2015.projections import Projections, draw_figure_6, draw_figure_7
-from studies.ptp_2015.tally import FieldShare, Tally
 
 COLORS = {
     "PTP": "#0b5394",

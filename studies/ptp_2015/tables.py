@@ -8,11 +8,10 @@ import numpy.typing as npt
 
 from studies.documents import markdown
 from studies.ptp_2015 import projections
-from studies.ptp_2015.comparison import Database
+from studies.ptp_2015.comparison import Database, Tally
 from studies.ptp_2015.plots import PlottedSeries
 from studies.ptp_2015.printed import Ends, the_ptp_paper
 from studies.ptp_2015.projections import Projections
-from studies.ptp_2015.tally import Tally
 
 TITLES: Mapping[str, str] = {
     "ptp-1": "Table 1. Projections of nine triangles",

@@ -7,10 +7,10 @@ import numpy as np
 
 from service.imaging.centroids.psf import GaussianPsf, airy_psf, wired_psf
 from service.imaging.centroids.window import Array
-from service.imaging.detection.star_image import AIRY_OVER_SIGMA
+from service.imaging.detection.star_images import AIRY_OVER_SIGMA
 from service.imaging.optics import behind_wires, disc, image_by_fft
 from service.vectors import ARCSEC_PER_RADIAN
-from studies.star_image_report import correlate, rotation, sun_acquisition
+from studies.star_image_report import correlate, sun_tracker
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 from studies.star_image_report.mesh import THICK_M, THIN_M
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
@@ -98,7 +98,7 @@ def correlation(study: Study) -> Row:
                 abs(scatter / bound - 1.0) < study.slack(study.trials(2000), 0.15),
                 {"scatter (px)": scatter, "bound (px)": bound, "bias (px)": bias},
             ),
-            *rotation.claims(study),
+            *correlate.claims(study),
         ),
         {
             "imaging-search": Picture(
@@ -108,7 +108,7 @@ def correlation(study: Study) -> Row:
                 _draw_search,
             )
         }
-        | rotation.pictures(),
+        | correlate.pictures(),
     )
 
 
@@ -226,10 +226,10 @@ def sun(study: Study) -> Row:
                 abs(width - 27.0) < 0.5,
                 {"tail width (arcmin)": width},
             ),
-            *sun_acquisition.claims(study),
+            *sun_tracker.claims(study),
         ),
         {"imaging-sun": Picture("Signals of the sun tracker.", (5.6, 3.2), draw)}
-        | sun_acquisition.pictures(),
+        | sun_tracker.pictures(),
     )
 
 

@@ -16,7 +16,7 @@ from service.app.advice import advice_record
 from service.cli.texts import advice_text
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
-from service.storage.queries.recorded_batch import BatchSample
+from service.storage.queries.results import BatchSample
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     angle_between_deg,

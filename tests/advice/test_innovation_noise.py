@@ -12,7 +12,7 @@ from service.advice.trackers import NoiseFinding
 from service.filtering.filter import filter_attitude
 from service.filtering.inputs import AttitudeMeasurements, GyroModel
 from service.filtering.smoother import smooth
-from service.grades.innovations import innovations_of
+from service.grades.day import innovations_of
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.grades.passes import GYRO, mission_with
 from tests.missions.without_gyro import mission_without_gyro

@@ -5,9 +5,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.alarms.limits import LimitSettings, Severity
+from service.alarms.limits import LimitSettings, SampleWindow, Severity
 from service.alarms.quantities import default_limits, limited_names
-from service.alarms.window import SampleWindow
 
 S = 10**9
 

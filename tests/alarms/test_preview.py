@@ -4,8 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.alarms.limits import LimitSettings, Severity
-from service.alarms.window import SampleWindow, preview_of, preview_of_gaps
+from service.alarms.limits import LimitSettings, SampleWindow, Severity, preview_of, preview_of_gaps
 from service.errors import BadInput
 from tests.storage.twin import SECOND, submission, twin
 

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from service.alarms import state_machine
-from service.alarms.limits import LimitSettings, Severity
-from service.alarms.window import Point
+from service.alarms.limits import LimitSettings, Point, Severity
 from service.errors import WrongState
 
 LIMITS = LimitSettings.model_validate(

@@ -9,7 +9,7 @@ from contextlib import ExitStack, closing
 import pytest
 from sqlalchemy import select
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.calibration_estimates import CalibrationRequest
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json

@@ -5,8 +5,14 @@ import pytest
 
 from service.calibration.elimination import eliminate
 from service.calibration.estimate import calibrate, calibrate_with_chosen_degree
-from service.calibration.linearise import linearised, prepared, residuals, turned_attitudes
-from service.calibration.unknowns import Model, unknowns_of
+from service.calibration.linearise import (
+    Model,
+    linearised,
+    prepared,
+    residuals,
+    turned_attitudes,
+    unknowns_of,
+)
 from service.errors import BadInput
 from tests import scale
 from tests.calibration.drawn import (

@@ -9,6 +9,7 @@ import pytest
 from service.acquire import acquire
 from service.calibration.estimate import calibrate
 from service.calibration.evidence import identified_magnitudes, identified_stars
+from service.calibration.linearise import Model
 from service.calibration.magnitudes import (
     COLOR,
     SCALE,
@@ -21,7 +22,6 @@ from service.calibration.magnitudes import (
 )
 from service.calibration.mission_file import calibrated_mission_text
 from service.calibration.stars import joined as joined_stars
-from service.calibration.unknowns import Model
 from service.missions.mission import Magnitudes, parse_mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from service.calibration.estimate import calibrate
+from service.calibration.linearise import Model
 from service.calibration.mission_file import calibrated_mission_text, tracker_lines
-from service.calibration.unknowns import Model
 from service.errors import BadConfiguration
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
 from service.observations.focal_plane import tracker_vectors

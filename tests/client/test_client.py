@@ -35,13 +35,13 @@ from acquire_client import (
     operations,
     spacecraft,
 )
-from acquire_client._sync import batches, connection, replays
 from acquire_client._sync import client as whole
+from acquire_client._sync import connection
 from acquire_client.encoding import json_of
 from acquire_client.errors import problem_of
 from sqlalchemy import update
 
-from service.access import tokens
+from service import access
 from service.app.factory import open_app
 from service.missions.mission import load_missions
 from service.storage.recording import events as records
@@ -68,7 +68,7 @@ def test_the_examples_of_the_methods_give_what_they_show(client, example, tmp_pa
     (tmp_path / "pass.ndjson").write_text(json.dumps(example) + '\n{"cut": \n', "utf-8")
     monkeypatch.chdir(tmp_path)
     tried = 0
-    for module in (batches, spacecraft, operations, replays, whole):
+    for module in (whole, spacecraft, operations):
         found = doctest.testmod(
             module, extraglobs={"client": client, "batch": example, "block": GYRO}
         )
@@ -288,10 +288,10 @@ def test_a_missing_thing_is_named(client):
 
 def test_a_token_is_needed_and_sent(chosen_database):
     app = open_app(in_process_settings(chosen_database()))
-    secret, now = tokens.new_secret(), utc_now()
+    secret, now = access.new_secret(), utc_now()
     reading = {"name": "reader", "scopes": ["read"], "spacecraft": None, "rate_per_s": None}
     app.store.writer.change(
-        lambda connection: tokens.add_token(
+        lambda connection: access.add_token(
             connection,
             id=Ulids().new(),
             secret=secret,

@@ -7,8 +7,7 @@ from scipy.stats import chi2
 from service.errors import BadBatch
 from service.filtering.inputs import AttitudeMeasurements
 from service.filtering.result import Outcome
-from service.grades.day import packed, unpacked_innovations
-from service.grades.innovations import MeasuredInnovations
+from service.grades.day import MeasuredInnovations, packed, unpacked_innovations
 from service.storage.grades.period import latest_innovations
 from service.storage.queries.pages import ResultFilter
 from service.times import shifted

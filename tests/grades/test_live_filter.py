@@ -12,7 +12,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.app.live_filter import LiveFilter
+from service.app.grades import LiveFilter
 from service.errors import NotFound
 from service.filtering.inputs import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
@@ -20,8 +20,7 @@ from service.grades.day import grade_day, window_of
 from service.grades.stretches import attitudes_where
 from service.observations.schema import submission_from_json
 from service.storage.grades.inputs import recorded_in
-from service.storage.upkeep.archiving import archive
-from service.storage.upkeep.restoring import PartFilter, restore
+from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.verify import verify
 from service.times import DAY_S, parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion

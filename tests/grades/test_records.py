@@ -11,9 +11,8 @@ from service.errors import NotFound
 from service.filtering.inputs import AttitudeMeasurements
 from service.grades.day import packed, unpacked
 from service.storage.sql.grade_tables import graded_blocks, graded_days
-from service.storage.upkeep.archiving import archive
+from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.prune import prune
-from service.storage.upkeep.restoring import PartFilter, restore
 from service.storage.upkeep.verify import verify
 from service.times import parse_utc
 from tests.grades.passes import NOON_NS, later

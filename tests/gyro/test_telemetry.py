@@ -6,11 +6,11 @@ import time
 import pytest
 from acquire_client import Client
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.factory import open_app
 from service.errors import BadFile
 from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
-from service.observations.readers.telemetry import read_lines
+from service.observations.telemetry import read_lines
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of
 from service.replay.over_http import replay_in_bulk, replay_over_http

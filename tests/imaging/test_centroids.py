@@ -6,8 +6,7 @@ import pytest
 from service.errors import BadInput
 from service.imaging.centroids.centroid import METHODS, centroid
 from service.imaging.centroids.psf import GaussianPsf
-from service.imaging.centroids.record import Flag
-from service.imaging.centroids.window import Detector, Window, cutout
+from service.imaging.centroids.window import Detector, Flag, Window, cutout
 from tests.reference.star_windows import draw_stars, draw_window, flux_of_peak
 
 DETECTOR = Detector(gain_e_per_count=2.0, read_noise_e=10.0, saturation_counts=2e7)

@@ -11,8 +11,7 @@ from service.imaging.centroids.centroid import METHODS
 from service.imaging.centroids.psf import airy_psf, wired_psf
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
-from service.imaging.detection.star_image import psf_of, still_psf
-from service.imaging.detection.star_images import MOST_IMAGES
+from service.imaging.detection.star_images import MOST_IMAGES, psf_of, still_psf
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera
 from service.simulate.frames import FrameSettings, draw_frames

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from service.imaging.centroids.sequential import batch, diffuse, least_norm
-from studies.star_image_report.quadratic_peak import Hump, StopRule, hump_of, recentred
+from studies.star_image_report.measurements import Hump, StopRule, hump_of, recentred
 
 ROUND = Hump(peak=1.0, M=-1.0, L=-1.3, J=0.2)
 QUARTIC = Hump(peak=1.0, M=-0.9, L=-1.2, J=0.15, Q=0.35, R=0.3, T=0.4)

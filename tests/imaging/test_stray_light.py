@@ -5,7 +5,7 @@ import pytest
 
 from service.imaging.detection.detect import detect
 from service.imaging.detection.measure import measure
-from service.imaging.detection.star_image import psf_of
+from service.imaging.detection.star_images import psf_of
 from service.imaging.frames.frame import Frame
 from service.simulate.frames import FrameSettings, draw_frames
 from tests.scale import draws

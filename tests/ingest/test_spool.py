@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import asdict
 from sqlalchemy import func, select
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app import replays as app_replays
 from service.errors import Busy, Forbidden
 from service.ingest.spool import UNLOCKED_S, Spool

@@ -47,7 +47,7 @@ from tests.torture import digest_of
 ROOT = Path(__file__).parents[2]
 AREAS = {
     "alarms": ("service/alarms",),
-    "access": ("service/access",),
+    "access": ("service/access.py",),
     "webhooks": ("service/webhooks",),
     "recording": ("service/storage/recording",),
     "ingest": ("service/ingest",),
@@ -55,9 +55,12 @@ AREAS = {
     "products": ("service/products",),
     "requests": (
         "service/web/requests",
-        "service/observations/readers",
+        "service/observations/csv_rows.py",
+        "service/observations/csv_table.py",
         "service/observations/decode.py",
+        "service/observations/decompress.py",
         "service/observations/schema.py",
+        "service/observations/telemetry.py",
     ),
 }
 SUITES: dict[str, list[str]] = {"sitting": [], "full": ["--full"]}

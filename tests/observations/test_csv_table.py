@@ -12,11 +12,11 @@ import pytest
 
 from service.csv_cells import neutralised, original
 from service.errors import BadFile
-from service.observations.readers import csv_table
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.decompress import Line
-from service.observations.readers.telemetry import read_lines, require_telemetry
+from service.observations import csv_table
+from service.observations.csv_rows import write_batches_csv
+from service.observations.decompress import Line
 from service.observations.schema import BatchIn, submission_from_json
+from service.observations.telemetry import read_lines, require_telemetry
 
 HEADER = "spacecraft,batch,time,tracker,x,y,z,magnitude"
 GYRO = "spacecraft,run,block,time,rate_1_rad_per_s,rate_2_rad_per_s,rate_3_rad_per_s"

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from service.errors import BadBatch
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.telemetry import read_lines
+from service.observations.csv_rows import write_batches_csv
 from service.observations.schema import BatchIn, submission_from_json
+from service.observations.telemetry import read_lines
 
 MEASURED = {
     "spacecraft": "XTE",

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import BadBatch, BadFile
-from service.observations.readers.csv_columns import COLUMNS
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.decompress import MAX_LINE_BYTES, Line
-from service.observations.readers.telemetry import read_lines
+from service.observations.csv_rows import COLUMNS, write_batches_csv
+from service.observations.decompress import MAX_LINE_BYTES, Line
 from service.observations.schema import BatchIn, submission_from_json
+from service.observations.telemetry import read_lines
 from tests.scale import draws
 
 HEADER = "spacecraft,batch,time,q1,q2,q3,qc,tracker,x,y,z,magnitude"

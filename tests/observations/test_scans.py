@@ -15,10 +15,10 @@ from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
 from service.observations.batch import SunPointedPrior
 from service.observations.calibrate import correct
-from service.observations.readers.csv_rows import write_batches_csv
-from service.observations.readers.telemetry import read_lines
+from service.observations.csv_rows import write_batches_csv
 from service.observations.scans.reduce import reduced, sun_body
 from service.observations.schema import BatchIn, submission_from_json
+from service.observations.telemetry import read_lines
 from service.simulate.sightings import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass

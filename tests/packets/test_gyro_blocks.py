@@ -15,9 +15,8 @@ from service.missions.mission import SHIPPED_FOLDER
 from service.packets.definition import PacketDefinition
 from service.packets.reader import PacketReader
 from service.settings import Settings
-from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import Pass
-from service.simulate.telemetry import draw_pass
+from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
 from service.times import parse_utc, shifted
 from tests.packets.packing import (
     APID,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from service.errors import NotFound
-from service.products.adm import kvn
+from service.products.ccsds import kvn
 from service.times import parse_utc
 from tests import scale
 from tests.products.series import GOLDEN, START, random_quaternions, rows, slew, written

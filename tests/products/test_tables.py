@@ -16,7 +16,7 @@ import pytest
 from service.alarms.quantities import QUANTITIES
 from service.app import spacecraft
 from service.errors import NotAvailable
-from service.products.attitude_table import COLUMNS, ESTIMATED_COLUMNS
+from service.products.attitudes import COLUMNS, ESTIMATED_COLUMNS
 from service.products.formats import OUTPUT_FORMATS
 from service.products.table_files import write_fits, write_parquet
 from service.products.tables import Column, Table, write_csv

@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.products.tdm import TrackedObject, write_tdm
+from service.products.ccsds import TrackedObject, write_tdm
 from service.times import parse_utc
 
 TIMES = ("2016-12-31T23:59:59.500Z", "2016-12-31T23:59:60.250Z", "2017-01-01T00:00:01.125Z")

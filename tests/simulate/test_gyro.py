@@ -9,9 +9,8 @@ import pytest
 from service.cli import main
 from service.errors import BadInput
 from service.gyro import block_from_line
-from service.simulate.gyro import GyroWanted, with_gyro
 from service.simulate.stretches import NO_TROUBLES, Pass
-from service.simulate.telemetry import draw_pass, read_objects, write_pass
+from service.simulate.telemetry import GyroWanted, draw_pass, read_objects, with_gyro, write_pass
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, rotation_vectors, turned_quaternion
 from tests.grades.passes import mission_with

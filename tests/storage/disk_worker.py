@@ -26,7 +26,7 @@ from service.app.factory import open_app
 from service.errors import Busy
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.storage.sql.connections import driver_of
+from service.storage.sql.engines import driver_of
 
 PATIENCE_S = 60.0
 WITHIN = (60, 40, 6)

@@ -17,7 +17,7 @@ from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.storage.archive.reading import Archive
 from service.storage.queries.pages import ResultFilter
-from service.storage.queries.recorded_batch import sample_batches
+from service.storage.queries.results import sample_batches
 from service.storage.sql.tables import results, star_results
 from service.times import parse_utc
 from tests.scale import draws

@@ -13,8 +13,8 @@ from service.errors import BadConfiguration, Busy, Conflict
 from service.ingest import submit
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder, rows
-from service.storage.archive.opened import WHOLE, Opened, columns_of
 from service.storage.archive.reading import Archive
+from service.storage.archive.rows import WHOLE, Opened, columns_of
 from service.storage.projections import rollups
 from service.storage.sql.columns import metadata
 from service.storage.sql.tables import (
@@ -30,8 +30,8 @@ from service.storage.sql.tables import (
 )
 from service.storage.store import Store
 from service.storage.upkeep import archiving
+from service.storage.upkeep.archiving import PartFilter, restore, verify_archive
 from service.storage.upkeep.prune import prune
-from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.fresh_databases import sqlite_at

@@ -13,7 +13,7 @@ from sqlalchemy import select
 from service.storage.archive import folder
 from service.storage.sql.tables import archived_batches, batches, results
 from service.storage.upkeep import archiving
-from service.storage.upkeep.restoring import PartFilter, restore, verify_archive
+from service.storage.upkeep.archiving import PartFilter, restore, verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.scale import size

@@ -10,11 +10,10 @@ from service.errors import Busy, NotAvailable, WrongState
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder
 from service.storage.queries import compare_runs
-from service.storage.queries.pages import ResultFilter
-from service.storage.queries.with_archive import count
+from service.storage.queries.pages import ResultFilter, count
 from service.storage.sql.tables import batches, results
 from service.storage.upkeep import archiving
-from service.storage.upkeep.restoring import PartFilter, restore
+from service.storage.upkeep.archiving import PartFilter, restore
 from service.times import shifted
 from tests.storage.samples import START
 
@@ -114,7 +113,7 @@ def test_lists_are_the_same_before_and_after_archiving(filled, place, monkeypatc
     assert state.nbytes <= 200_000
     assert state.evictions > 0
     # A page that looks into few row groups is short, and goes on at its cursor.
-    monkeypatch.setattr("service.storage.queries.with_archive.MOST_OPENED", 1)
+    monkeypatch.setattr("service.storage.queries.pages.MOST_OPENED", 1)
     after = [pages_of(filled, 3, **selected) for selected in FILTERS]
     assert [without_mark(each) for each in after] == before
 

@@ -9,9 +9,8 @@ import pytest
 from service.app.factory import open_app
 from service.observations.schema import submission_from_json
 from service.settings import Settings
-from service.storage.queries.pages import ResultFilter
+from service.storage.queries.pages import ResultFilter, count
 from service.storage.queries.result_tables import attitude_pages
-from service.storage.queries.with_archive import count
 from tests.storage.samples import KINDS, batch
 
 pytestmark = pytest.mark.both_databases

@@ -19,7 +19,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import MetaData, create_engine, inspect, select, text
 from sqlalchemy.pool import NullPool
 
-from service.access.tokens import add_token, new_secret
+from service.access import add_token, new_secret
 from service.alarms.quantities import trend_names
 from service.app.factory import open_app
 from service.settings import Settings
@@ -27,7 +27,7 @@ from service.storage.sql import migrations
 from service.storage.sql.engines import database_url
 from service.storage.upkeep.verify import earlier_results, verify
 from service.web.app import create_app
-from service.web.requests.problem_types import types_with_pages
+from service.web.requests.problems import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite
 from tests.scale import some_in_a_sitting
 from tests.waiting import wait_until

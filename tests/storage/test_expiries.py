@@ -3,7 +3,7 @@
 import erfa
 import pytest
 
-from service.access.tokens import add_token, new_secret, revoke_token
+from service.access import add_token, new_secret, revoke_token
 from service.app.factory import open_app
 from service.settings import Settings
 from service.storage.upkeep.expiries import ExpiryDates, leap_seconds_end

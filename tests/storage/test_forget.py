@@ -4,19 +4,19 @@ import pytest
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, NotFound
-from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import metadata
 from service.storage.sql.grade_tables import graded_days, gyro_blocks
 from service.storage.sql.tables import (
     archived_batches,
     archived_parts,
+    audit,
     batches,
     rollups_hourly,
     runs,
 )
 from service.storage.upkeep import archiving
+from service.storage.upkeep.archiving import verify_archive
 from service.storage.upkeep.forget import ForgetFilter, forget, found
-from service.storage.upkeep.restoring import verify_archive
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.storage.recount import assert_equal_to_a_recount

@@ -8,7 +8,7 @@ import pytest
 from sqlalchemy import create_engine, delete, func, select
 from sqlalchemy.exc import IntegrityError
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.errors import BadBatch, BadInput, Conflict, KeyReused
 from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.sql.columns import metadata

@@ -5,7 +5,7 @@ from alembic import command
 from alembic.script import ScriptDirectory
 from sqlalchemy import MetaData, create_engine, inspect, select
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.errors import KeyReused
 from service.observations.schema import OptionsIn
 from service.storage.sql import migrations

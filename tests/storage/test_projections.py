@@ -29,10 +29,9 @@ from service.storage.sql.tables import (
     tracker_values,
 )
 from service.storage.store import Store
-from service.storage.upkeep.archiving import archive
+from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.forget import ForgetFilter, forget
 from service.storage.upkeep.prune import prune
-from service.storage.upkeep.restoring import PartFilter, restore
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.fresh_databases import sqlite_at

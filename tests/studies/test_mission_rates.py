@@ -10,8 +10,15 @@ from service.errors import BadInput
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
 from service.vectors import angle_between_deg
 from studies.mission_rates.report import meeting
-from studies.mission_rates.settings import Sweep, one_tracker, settings_of, usual_errors
-from studies.mission_rates.simulation import Plan, simulate, zone_counts
+from studies.mission_rates.simulation import (
+    Plan,
+    Sweep,
+    one_tracker,
+    settings_of,
+    simulate,
+    usual_errors,
+    zone_counts,
+)
 from studies.paper_1994.printed import the_paper
 from tests.scale import draws
 

@@ -13,7 +13,7 @@ from service.observations.batch import QuaternionPrior
 from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.simulate.motion import turned_by
-from service.storage.queries.recorded_batch import recorded_batch
+from service.storage.queries.results import recorded_batch
 from service.vectors import quaternion_from_matrix
 from tests import scale
 from tests.tracking.conftest import send

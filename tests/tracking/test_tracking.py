@@ -14,7 +14,7 @@ from service.errors import BadBatch
 from service.gyro import block_from_json
 from service.missions.mission import load_missions
 from service.missions.motion import GyroSettings
-from service.observations.readers.csv_columns import batch_cells, batch_fields
+from service.observations.csv_rows import batch_cells, batch_fields
 from service.observations.schema import (
     BatchIn,
     OptionsIn,

@@ -14,7 +14,7 @@ from service.simulate.sightings import BatchScene, anywhere, real_sky, shaken
 from service.simulate.stretches import Stretch
 from service.sky.ephemeris import PLANETS, apparent, observer_velocity, planet_place
 from service.times import parse_utc, shifted
-from service.tracks.gathering import Gathering
+from service.tracks.linking import Gathering
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     matrix_from_quaternion,

@@ -7,7 +7,7 @@ import pytest
 
 from service.times import parse_utc, shifted
 from service.tracks.finding import figures, find_tracks
-from service.tracks.gathering import Batches, Points
+from service.tracks.linking import Batches, Points
 from service.vectors import ARCSEC_PER_RADIAN, to_ra_dec, unit
 from tests.chance import at_least, at_most
 from tests.scale import size

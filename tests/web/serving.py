@@ -24,9 +24,9 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.web.app import create_app
-from service.web.connection_limits import Admission
 from service.web.server import Server as StreamingServer
 from service.web.server import configuration
+from service.web.slow_clients import Admission
 from tests.waiting import wait_until
 
 

@@ -12,8 +12,8 @@ import pytest
 from fastapi.routing import APIRoute
 from sqlalchemy import text
 
-from service.access import tokens
-from service.access import tokens as sessions
+from service import access
+from service import access as sessions
 from service.app.factory import open_app
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
@@ -48,9 +48,9 @@ class Guarded:
         self._ids = Ulids()
 
     def token(self, name, *scopes, days=1, **more):
-        secret, created = tokens.new_secret(), utc_now()
+        secret, created = access.new_secret(), utc_now()
         self.app.store.writer.change(
-            lambda connection: tokens.add_token(
+            lambda connection: access.add_token(
                 connection,
                 id=self._ids.new(),
                 name=name,
@@ -65,7 +65,7 @@ class Guarded:
 
     def revoke(self, name):
         self.app.store.writer.change(
-            lambda connection: tokens.revoke_token(connection, name, utc_now().text)
+            lambda connection: access.revoke_token(connection, name, utc_now().text)
         ).result()
 
 
@@ -76,7 +76,7 @@ def guarded(chosen_database):
     service.expired = service.token("expired", "read", "submit", "operate", days=-1)
     service.revoked = service.token("revoked", "read", "submit", "operate")
     service.revoke("revoked")
-    service.of_scope = {each: service.token(each, each) for each in tokens.SCOPES}
+    service.of_scope = {each: service.token(each, each) for each in access.SCOPES}
     service.swas = service.token("swas", "read", "submit", "operate", spacecraft=["SWAS"])
     web_app = create_app(service.app)
     service.routes = web_app.state.routes
@@ -596,8 +596,8 @@ def test_the_database_holds_nothing_that_could_be_used(guarded):
             for table in ("access_tokens", "access_sessions", "audit")
             for row in connection.exec_driver_sql(f"SELECT * FROM {table}")
         )
-    assert tokens.secret_digest(guarded.all) in kept
-    assert tokens.PREFIX not in kept
+    assert access.secret_digest(guarded.all) in kept
+    assert access.PREFIX not in kept
 
 
 def test_access_is_open_on_loopback_until_the_first_token_is_made(chosen_database):

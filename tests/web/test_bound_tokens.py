@@ -8,7 +8,7 @@ from itertools import islice
 import httpx
 import pytest
 
-from service.access import tokens
+from service import access
 from service.app.factory import open_app
 from service.settings import Settings
 from service.storage.recording.ids import Ulids
@@ -42,11 +42,11 @@ def served(chosen_database):
     ids, now = Ulids(), utc_now()
 
     def token(name, spacecraft):
-        secret = tokens.new_secret()
+        secret = access.new_secret()
         more = {"rate_per_s": None, "created": now.text, "expires": shifted(now, 86400).text}
-        add = partial(tokens.add_token, id=ids.new(), name=name, secret=secret, **more)
+        add = partial(access.add_token, id=ids.new(), name=name, secret=secret, **more)
         app.context.change(
-            lambda connection: add(connection, scopes=tokens.SCOPES, spacecraft=spacecraft)
+            lambda connection: add(connection, scopes=access.SCOPES, spacecraft=spacecraft)
         )
         return {"Authorization": f"Bearer {secret}"}
 

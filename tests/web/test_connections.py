@@ -9,7 +9,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.web.app import create_app
-from service.web.connection_limits import Admission
+from service.web.slow_clients import Admission
 from tests.waiting import wait_until
 from tests.web.serving import Server, free_port, in_process_settings
 

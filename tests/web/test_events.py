@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import httpx
 import pytest
 
-from service.access.tokens import OPEN_CALLER
+from service.access import OPEN_CALLER
 from service.app.factory import open_app
 from service.storage.recording import events as records
 from service.times import parse_utc

@@ -5,7 +5,7 @@ import json
 import httpx
 import pytest
 
-from service.access.tokens import LEAST_BURST, Access, Caller
+from service.access import LEAST_BURST, Access, Caller
 from service.errors import RateLimited
 
 URL = "/api/v1/batches"

@@ -3,7 +3,7 @@
 import httpx
 import pytest
 
-from service.access import tokens as sessions
+from service import access as sessions
 from service.app.factory import open_app
 from service.settings import Settings
 from service.web.app import create_app

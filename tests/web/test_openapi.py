@@ -9,10 +9,10 @@ from sqlalchemy import select
 
 from service.observations.schema import submission_from_json
 from service.storage.models.base import component_name
-from service.storage.models.events import EVENT_DATA
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml
+from service.web.event_stream import EVENT_DATA
 from service.web.openapi import examples
 from tests.web.conformance import FILE, reference, validator
 from tests.web.examples import fresh_walk

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from service.web.requests.problem_types import types_with_pages
+from service.web.requests.problems import types_with_pages
 from tests.web.test_console import text_of
 
 GUIDE = Path(__file__).parents[2] / "docs" / "api.md"

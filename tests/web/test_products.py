@@ -12,7 +12,7 @@ import httpx
 import pyarrow.parquet
 import pytest
 
-from service.access.tokens import add_token, new_secret
+from service.access import add_token, new_secret
 from service.app.factory import open_app
 from service.cli import main
 from service.products import formats

@@ -116,7 +116,7 @@ def test_every_link_leads_to_a_file():
 
 
 def test_the_guide_knows_every_kind_of_problem():
-    from service.web.requests.problem_types import PROBLEM_TYPES
+    from service.web.requests.problems import PROBLEM_TYPES
 
     guide = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
     for kind in PROBLEM_TYPES.values():

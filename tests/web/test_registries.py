@@ -13,7 +13,7 @@ from service.products.formats import OUTPUT_FORMATS, OutputFormat, table_formats
 from service.web.app import bare_app, create_app
 from service.web.console.page import PAGES, ContextDep, PageQuery, console_page
 from service.web.requests.access import POLICIES, Policy
-from service.web.requests.problem_types import ProblemType
+from service.web.requests.problems import ProblemType
 from tests.fresh_databases import sqlite_at
 from tests.web.console_pages import console_addresses
 from tests.web.serving import Server, in_process_settings

@@ -16,7 +16,7 @@ import zstandard
 from service.app.factory import open_app
 from service.ingest import replays as replays_module
 from service.ingest.replays import RunningReplay
-from service.observations.readers import decompress
+from service.observations import decompress
 from service.web.app import create_app
 from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM

@@ -7,9 +7,9 @@ import time
 import pytest
 from sqlalchemy import select
 
-from service.access import tokens as sessions
+from service import access as sessions
 from service.storage.recording.ids import Ulids
-from service.storage.sql.access_tables import audit, webhooks
+from service.storage.sql.tables import audit, webhooks
 from service.storage.webhooks import read_sender
 from tests.waiting import wait_until
 from tests.web.conformance import check

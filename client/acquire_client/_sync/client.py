@@ -1,20 +1,159 @@
-"""The client: every part together, and its live events."""
+"""The client: batches, runs and replays, every part together, and its live events."""
 
-from collections.abc import Generator, Iterator
+import time
+from collections.abc import Callable, Generator, Iterator, Mapping
 from contextlib import closing
+from pathlib import Path
+from typing import Any, Literal, overload
 
 import httpx
 
-from ..encoding import Query, path_of
-from ..errors import Busy, EventsLost
+from .. import models
+from ..encoding import Batch, Query, decoded, path_of, pieces_of
+from ..errors import Busy, EventsLost, Problem, ReplayEnded
 from ..event_lines import Block, BlockReader, Event
-from ..operations import Access, Alarms, Calibrations, Runs
-from ..retrying import Patience
+from ..operations import Access, Alarms, BatchOutcome, Calibrations, Results, Runs
+from ..retrying import Patience, Repeat
 from ..spacecraft import Gyro, Spacecraft
-from .backend import sleep
-from .batches import Batches
+from .backend import Source, bounded_map, iterated, sleep
 from .connection import Connection
-from .replays import Replays
+
+
+class Batches(Results, Connection):
+    """The part of the client that is about many batches, and what-ifs."""
+
+    def submit_many(self, batches: Source[Batch], *, at_once: int = 8) -> Iterator[BatchOutcome]:
+        """Submit batches as they are taken from `batches`, at most `at_once` at a time.
+
+        The outcomes come in the same order: an answer, or the problem of a batch that was
+        refused.  Where batches come slowly, `submit` each: an outcome may wait for the next batch.
+        For whole files, `replay` is faster.
+
+        >>> [outcome.problem for outcome in client.submit_many([batch, batch])]
+        [None, None]
+        """
+        yield from bounded_map(self._outcome, batches, at_once)
+
+    def _outcome(self, batch: Batch) -> BatchOutcome:
+        try:
+            recorded = self.submit_json(batch)
+        except Problem as problem:
+            return BatchOutcome(batch, None, problem)
+        return BatchOutcome(batch, recorded, None)
+
+    @overload
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[True]
+    ) -> models.Answer: ...
+
+    @overload
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: Literal[False] = False
+    ) -> models.WhatIf: ...
+
+    @overload
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool
+    ) -> models.Answer | models.WhatIf: ...
+
+    def what_if(
+        self, id: str, options: Mapping[str, Any], *, record: bool = False
+    ) -> models.Answer | models.WhatIf:
+        """Process a recorded batch again with other options; `record` keeps the result beside it.
+
+        >>> latest = client.latest("XTE")
+        >>> votes = client.what_if(latest.answer.id, {"identifier": "starid"})
+        >>> votes.counts.ambiguous, votes.id
+        (1, None)
+        """
+        body = {"options": dict(options), "record": record}
+        path = path_of("batches", id, "what-if")
+        if record:
+            return self.post(models.Answer, path, body)
+        return self.post(models.WhatIf, path, body, Repeat.ALWAYS)
+
+
+NDJSON = "application/x-ndjson"
+PACKETS = "application/x-tar"
+POLL_S = 0.25
+INTERRUPTED_FOR_S = 20.0
+"""A service that starts marks every replay as interrupted; a process that still works on one
+corrects that with its next lines, which a busy machine may take a while for."""
+
+
+class Replays(Connection):
+    """The part of the client that is about runs and replays."""
+
+    def replay(
+        self,
+        lines: Path | bytes | Source[bytes],
+        run: str,
+        *,
+        alarms: bool = False,
+        packets: bool = False,
+        spacecraft: str | None = None,
+        progress: Callable[[models.Replay], object] = lambda replay: None,
+    ) -> models.Replay:
+        """Send a telemetry file as one replay and follow it to its end.
+
+        `progress` is called with each state.  A file that is sent twice is recorded once.  Raises
+        `ReplayEnded` where the replay fails or is cancelled.  For the other arguments see
+        `start_replay`.
+
+        >>> done = client.replay(Path("pass.ndjson"), "pass-1")
+        >>> done.lines.done, done.counts.new, [each.line for each in done.errors]
+        (2, 1, [2])
+        """
+        begun = self.start_replay(lines, run, alarms=alarms, packets=packets, spacecraft=spacecraft)
+        state = begun
+        for state in self.follow_replay(begun.id):
+            progress(state)
+        if state.state != "done":
+            raise ReplayEnded(state)
+        return state
+
+    def start_replay(
+        self,
+        lines: Path | bytes | Source[bytes],
+        run: str,
+        *,
+        alarms: bool = False,
+        packets: bool = False,
+        spacecraft: str | None = None,
+    ) -> models.Replay:
+        """Send a telemetry file as one replay, which the service works on in the background.
+
+        `lines` is a file, or its bytes in one or many pieces: NDJSON, or with `packets` a tar
+        archive of space packets and their XTCE file; `spacecraft` names their mission.  `run`
+        takes every batch; `alarms` raises alarms for it.
+        """
+        content = pieces_of(lines) if isinstance(lines, Path) else lines
+        response = self.request(
+            "POST",
+            path_of("replays"),
+            query={"run": run, "alarms": alarms or None, "spacecraft": spacecraft},
+            content=content if isinstance(content, bytes) else iterated(content),
+            headers={"Content-Type": PACKETS if packets else NDJSON},
+            # Pieces can be read once only, and a second replay would do the same work.
+            repeat=Repeat.NEVER,
+        )
+        return decoded(response, models.Replay)
+
+    def follow_replay(self, id: str, *, every_s: float = POLL_S) -> Iterator[models.Replay]:
+        """The states of a replay until it ends; the last one tells how.
+
+        A restart of the service in between is waited for.
+        """
+        running_s = time.monotonic()
+        while True:
+            state = self.get(models.Replay, path_of("replays", id))
+            yield state
+            if state.state in ("running", "waiting"):
+                running_s = time.monotonic()
+            elif state.state != "interrupted" or time.monotonic() - running_s > INTERRUPTED_FOR_S:
+                return
+            sleep(every_s)
+
 
 SILENCE_S = 45.0
 """The service sends something every 15 seconds; without it the connection is lost."""

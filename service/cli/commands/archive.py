@@ -6,12 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import (
-    period_of,
-    progress_bar,
-    settings_of,
-    settings_of_existing,
-)
+from service.cli.arguments import period_of, progress_bar, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
 FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
@@ -86,7 +81,7 @@ def verify(parsed: Namespace) -> int:
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.upkeep.restoring import verify_archive
+    from service.storage.upkeep.archiving import verify_archive
 
     needed = {} if parsed.database is None else _parts(parsed)
     with progress_bar("batches", "reading") as bar:
@@ -114,14 +109,14 @@ def restore(parsed: Namespace) -> int:
 
     folder = _folder(parsed.folder, "--archive")
     require_extra("tables", "pyarrow", "--archive", str(folder))
-    from service.storage.upkeep import restoring
+    from service.storage.upkeep import archiving
 
     start, end = period_of(parsed)
-    selected = restoring.PartFilter(parsed.spacecraft, parsed.run, start, end)
+    selected = archiving.PartFilter(parsed.spacecraft, parsed.run, start, end)
     with closing(Store(settings_of(parsed).database)) as store:
         store.require_writing()
         with progress_bar("batches", "restoring") as bar:
-            done = restoring.restore(
+            done = archiving.restore(
                 store, folder, selected, step=lambda done: bar(done.batches, done.total)
             )
     if parsed.json:

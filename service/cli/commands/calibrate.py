@@ -6,12 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import (
-    period_of,
-    progress_bar,
-    settings_of,
-    settings_of_existing,
-)
+from service.cli.arguments import period_of, progress_bar, settings_of, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:

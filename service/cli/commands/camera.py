@@ -5,8 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import add_command, add_group, degrees, positive
-from service.cli.configuration import settings_of
+from service.cli.arguments import add_command, add_group, degrees, positive, settings_of
 from service.errors import BadInput, Fault, printable, shown_value
 
 if TYPE_CHECKING:

@@ -5,8 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import MISSION, add_command, add_group
-from service.cli.configuration import mission_and_catalog
+from service.cli.arguments import MISSION, add_command, add_group, mission_and_catalog
 from service.errors import BadInput, Fault, NotAvailable, shown_value
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import progress_bar, settings_of, settings_of_existing
+from service.cli.arguments import progress_bar, settings_of, settings_of_existing
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -374,7 +374,7 @@ def _note(parsed: Namespace) -> Any:
 
 def note(connection: "Connection", action: str, about: str, asked: dict[str, Any]) -> None:
     """Add an entry to the audit list: the user of this command did this."""
-    from service.access.audit import Entry
+    from service.access import Entry
     from service.storage.recording.ids import Ulids
     from service.times import utc_now
 

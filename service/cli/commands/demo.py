@@ -4,8 +4,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import add_command, add_json, count
-from service.cli.configuration import settings_of
+from service.cli.arguments import add_command, add_json, count, settings_of
 
 
 def add(commands: Any) -> None:

@@ -5,7 +5,7 @@ from dataclasses import asdict
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of_existing
 from service.products.formats import attitude_formats, table_formats, write_attitudes, write_table
 
 TABLES = {

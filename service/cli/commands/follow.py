@@ -5,8 +5,7 @@ from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import SERVICE, add_command, add_json, count, print_json
-from service.cli.configuration import service_url, settings_of
+from service.cli import arguments
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
@@ -17,7 +16,7 @@ DEFAULT_CONCURRENCY = 16
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(commands, "follow", run)
+    parser = arguments.add_command(commands, "follow", run)
     parser.add_argument("source", metavar="nats://HOST/STREAM", help="or tls://HOST/STREAM")
     parser.add_argument(
         "--consumer",
@@ -25,7 +24,7 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="the durable consumer; made where the stream has none of that name",
     )
-    parser.add_argument("--url", help=SERVICE)
+    parser.add_argument("--url", help=arguments.SERVICE)
     parser.add_argument(
         "--refusals",
         metavar="SUBJECT",
@@ -43,18 +42,21 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--concurrency",
-        type=count,
+        type=arguments.count,
         default=DEFAULT_CONCURRENCY,
         metavar="N",
         help="messages at work together (default 16); 1 keeps their order",
     )
     parser.add_argument(
-        "--metrics-port", type=count, metavar="PORT", help="serve metrics on this loopback port"
+        "--metrics-port",
+        type=arguments.count,
+        metavar="PORT",
+        help="serve metrics on this loopback port",
     )
     parser.add_argument(
         "--until-empty", action="store_true", help="end when every message is settled"
     )
-    add_json(parser, "the counts")
+    arguments.add_json(parser, "the counts")
 
 
 def run(parsed: Namespace) -> int:
@@ -94,8 +96,8 @@ def run(parsed: Namespace) -> int:
         _existing_file(parsed.authority, "--authority"),
         parsed.concurrency,
     )
-    url, metrics = checked_url(service_url(parsed)), Metrics()
-    token = settings_of(parsed).token
+    url, metrics = checked_url(arguments.service_url(parsed)), Metrics()
+    token = arguments.settings_of(parsed).token
 
     async def follow() -> None:
         async with AsyncClient(url, token=token) as client:
@@ -116,7 +118,7 @@ def run(parsed: Namespace) -> int:
     with translated(url):
         asyncio.run(follow())
     if parsed.json:
-        print_json(metrics.counts)
+        arguments.print_json(metrics.counts)
     else:
         print(_text(metrics))
     return 1 if metrics.counts["refused"] else 0

@@ -9,15 +9,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, Protocol
 
-from service.cli.arguments import (
-    CAMERA_MISSION,
-    add_command,
-    add_database,
-    add_url_or_in_process,
-    degrees,
-    positive,
-)
-from service.cli.configuration import http_client, refusal_of, service_url, settings_of
+from service.cli import arguments
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
 
@@ -29,9 +21,11 @@ FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(commands, "frame", run, notes=SIDECAR)
+    parser = arguments.add_command(commands, "frame", run, notes=SIDECAR)
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
-    parser.add_argument("--spacecraft", metavar="NAME", help=f"{CAMERA_MISSION}; none: any camera")
+    parser.add_argument(
+        "--spacecraft", metavar="NAME", help=f"{arguments.CAMERA_MISSION}; none: any camera"
+    )
     _add_lens(parser)
     parser.add_argument(
         "--tracker", metavar="NAME", help="default: the first tracker with a camera"
@@ -61,7 +55,7 @@ def add(commands: Any) -> None:
         help="which image of a file with several: name or number of a FITS unit, :2 for the second "
         "plane of a cube, the number of a TIFF page",
     )
-    add_url_or_in_process(parser)
+    arguments.add_url_or_in_process(parser)
     parser.add_argument(
         "--overlay",
         type=Path,
@@ -70,7 +64,7 @@ def add(commands: Any) -> None:
         "a folder; without a spacecraft the default is FILE-stars.png",
     )
     parser.add_argument("--json", action="store_true", help="print the answers, one per line")
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def _add_lens(parser: ArgumentParser) -> None:
@@ -79,10 +73,16 @@ def _add_lens(parser: ArgumentParser) -> None:
         "without a spacecraft",
         "known data of the camera; values of its lens may be wrong by a quarter",
     )
-    lens.add_argument("--fov", type=degrees, metavar="DEG", help="field of view, the longer side")
-    lens.add_argument("--focal-px", type=positive, metavar="PX", help="focal length in pixels")
-    lens.add_argument("--focal-mm", type=positive, metavar="MM", help="with --pixel-um")
-    lens.add_argument("--pixel-um", type=positive, metavar="UM", help="the pitch of the pixels")
+    lens.add_argument(
+        "--fov", type=arguments.degrees, metavar="DEG", help="field of view, the longer side"
+    )
+    lens.add_argument(
+        "--focal-px", type=arguments.positive, metavar="PX", help="focal length in pixels"
+    )
+    lens.add_argument("--focal-mm", type=arguments.positive, metavar="MM", help="with --pixel-um")
+    lens.add_argument(
+        "--pixel-um", type=arguments.positive, metavar="UM", help="the pitch of the pixels"
+    )
     lens.add_argument(
         "--dark", type=Path, metavar="FILE", help="a frame of the same exposure without light"
     )
@@ -103,7 +103,7 @@ def run(parsed: Namespace) -> int:
     if parsed.spacecraft is None:
         from service.cli.pictures import solve_pictures
 
-        return solve_pictures(parsed, settings_of(parsed))
+        return solve_pictures(parsed, arguments.settings_of(parsed))
     for name in ("fov", "focal_px", "focal_mm", "pixel_um", "dark"):
         value = getattr(parsed, name)
         if value is not None:
@@ -116,7 +116,7 @@ def run(parsed: Namespace) -> int:
         message = "goes with --in-process; a running service has its own"
         raise BadInput(Fault("--database", message, shown_value(parsed.database)))
     refused = 0
-    with frame_submitter(parsed, settings_of(parsed)) as submitter:
+    with frame_submitter(parsed, arguments.settings_of(parsed)) as submitter:
         for file in parsed.files:
             try:
                 body = submitter.submit(parsed.spacecraft, _known(parsed, file), file)
@@ -214,7 +214,7 @@ def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubm
             app.service.ready()
             yield _InProcess(app)
     else:
-        with http_client(settings, service_url(parsed), TIMEOUT_S) as client:
+        with arguments.http_client(settings, arguments.service_url(parsed), TIMEOUT_S) as client:
             yield _OverHttp(client)
 
 
@@ -268,4 +268,4 @@ class _OverHttp:
             return bytes(response.content)
         if response.status_code == 401:
             raise Unauthenticated("the service asks for a token: set ACQUIRE_TOKEN")
-        raise FrameRefused(refusal_of(response))
+        raise FrameRefused(arguments.refusal_of(response))

@@ -7,7 +7,7 @@ from contextlib import closing
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of_existing
 from service.products.formats import table_formats, write_table
 from service.products.tables import Table
 

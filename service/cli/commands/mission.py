@@ -6,11 +6,11 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from service.cli.arguments import add_command, add_group, add_json, print_json
+from service.cli import arguments
 from service.errors import BadConfiguration, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.advice.zone_estimate import ZoneEstimate
+    from service.advice.zone_size import ZoneEstimate
     from service.missions.mission import Mission
 
 
@@ -21,13 +21,13 @@ Stars and pairs are counted for zones all over the sky; the map shows the pairs.
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "mission",
         "Mission files: check one before the service uses it, and estimate its zones.",
         "acquire mission check missions/mine.toml",
     )
-    parser = add_command(group, "check", check, notes=NOTES)
+    parser = arguments.add_command(group, "check", check, notes=NOTES)
     parser.add_argument("file", type=Path, metavar="FILE.toml")
     parser.add_argument(
         "--epoch", type=float, metavar="YEAR", help="of the run catalog; default: this year"
@@ -35,7 +35,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--picture", type=Path, metavar="OUT.svg", help="draw the zones and their pairs, as SVG"
     )
-    add_json(parser, "findings and counts")
+    arguments.add_json(parser, "findings and counts")
     add_estimate(group)
 
 
@@ -60,7 +60,7 @@ def check(parsed: Namespace) -> int:
     except BadConfiguration as error:
         found = refusals(error, parsed.file)
         if parsed.json:
-            print_json({"file": str(parsed.file), "findings": found})
+            arguments.print_json({"file": str(parsed.file), "findings": found})
         else:
             for each in found:
                 print(f"wrong     {each['key']}: {each['text']}")
@@ -70,7 +70,7 @@ def check(parsed: Namespace) -> int:
     if parsed.picture is not None and report.zones:
         parsed.picture.write_text(zones_picture(report), encoding="utf-8")
     if parsed.json:
-        print_json({"file": str(parsed.file), **report_json(report)})
+        arguments.print_json({"file": str(parsed.file), **report_json(report)})
     else:
         print(report_text(report))
         if parsed.picture is not None and report.zones:
@@ -88,7 +88,7 @@ Memory is that of the largest zone as the service caches it, grown by the zone's
 
 def add_estimate(group: Any) -> None:
     """Declare the command."""
-    parser = add_command(group, "estimate", estimate, notes=ESTIMATE_NOTES)
+    parser = arguments.add_command(group, "estimate", estimate, notes=ESTIMATE_NOTES)
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
     )
@@ -116,7 +116,7 @@ def add_estimate(group: Any) -> None:
     parser.add_argument(
         "--epoch", type=float, metavar="YEAR", help="of the run catalog; default: this year"
     )
-    add_json(parser, "the estimates")
+    arguments.add_json(parser, "the estimates")
 
 
 def estimate(parsed: Namespace) -> int:
@@ -127,14 +127,13 @@ def estimate(parsed: Namespace) -> int:
     acquire mission estimate XTE --size 6 8 10.66 15
     acquire mission estimate SOHO --magnitude-limit 7 8 --pair-separation-max 2 4 --json
     """
-    from service.advice.zone_estimate import neighbours_of, zone_estimates
-    from service.cli.configuration import mission_of_file_or_name
+    from service.advice.zone_size import neighbours_of, zone_estimates
     from service.cli.mission_report import epoch_of
     from service.settings import Settings
     from service.sky.catalog.run_catalog import build_run_catalog
     from service.sky.catalog.star_catalog import open_catalog
 
-    mission = mission_of_file_or_name(parsed.mission)
+    mission = arguments.mission_of_file_or_name(parsed.mission)
     epoch_year = mission.catalog.epoch_of(epoch_of(parsed.epoch))
     size_key = "half_width_deg" if mission.zone.kind == "band" else "radius_deg"
     # Everything is checked before anything is counted.
@@ -168,7 +167,7 @@ def estimate(parsed: Namespace) -> int:
                 found += zone_estimates(sized, run_catalog, near)
     if parsed.json:
         rows = [asdict(each) for each in found]
-        print_json({"mission": mission.name, "epoch_year": epoch_year, "zones": rows})
+        arguments.print_json({"mission": mission.name, "epoch_year": epoch_year, "zones": rows})
     else:
         print(_text(mission, epoch_year, found))
     return 0

@@ -7,12 +7,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import service_url, settings_of
+from service.cli.arguments import service_url, settings_of
 from service.errors import BadFile, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.packets.reader import PacketReader
-    from service.replay.from_file import FromFile
+    from service.replay.items import FromFile
     from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
@@ -135,8 +135,7 @@ def run(parsed: Namespace) -> int:
     """
     from msgspec import to_builtins
 
-    from service.replay.from_file import AttitudeCarrier
-    from service.replay.items import Pace, items_of, packet_items, run_name
+    from service.replay.items import AttitudeCarrier, Pace, items_of, packet_items, run_name
     from service.replay.summary import ReplaySummary
 
     files = _checked_files(parsed)
@@ -214,7 +213,7 @@ def _print_counts(
 
 def _sources(parsed: Namespace) -> list["FromFile"]:
     from service.products.reading.files import read_attitudes, read_ephemeris
-    from service.replay.from_file import FileEphemeris, FilePrior
+    from service.replay.items import FileEphemeris, FilePrior
 
     sources: list[FromFile] = []
     if parsed.a_priori is not None:
@@ -239,7 +238,7 @@ def _is_in_bulk(parsed: Namespace) -> bool:
 
 def _checked_files(parsed: Namespace) -> list[Path]:
     """The files to send; one that is missing or is no telemetry is refused before that."""
-    from service.observations.readers.telemetry import require_telemetry
+    from service.observations.telemetry import require_telemetry
 
     if bool(parsed.files) == bool(parsed.packets):
         raise BadInput(

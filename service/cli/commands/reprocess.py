@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
 if TYPE_CHECKING:
@@ -189,7 +189,7 @@ def _check_archive(parsed: Namespace) -> None:
     parsed.archive = parsed.archive.resolve()
     require_extra("tables", "pyarrow", "--archive", str(parsed.archive))
     if parsed.scheduler is not None:
-        from service.ingest.partitions.dask_workers import require_scheduler
+        from service.ingest.dask_workers import require_scheduler
 
         require_scheduler(parsed.scheduler)
         if parsed.scheduler.startswith("tcp://"):

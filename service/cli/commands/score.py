@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of_existing, written_to
 from service.errors import BadInput, Fault, shown_value
 
 _BAR = 48
@@ -40,7 +40,6 @@ def run(parsed: Namespace) -> int:
     acquire score truth.bc --spacecraft XTE --plot errors.svg --json
     """
     from service.app.factory import open_app
-    from service.cli.arguments import written_to
     from service.cli.charts import errors_picture
     from service.products.reading.files import read_attitudes
     from service.products.scoring import errors_of, statistics

@@ -5,8 +5,7 @@ import gc
 from argparse import Namespace
 from typing import Any
 
-from service.cli.arguments import add_command, add_database
-from service.cli.configuration import settings_of
+from service.cli.arguments import add_command, add_database, settings_of
 
 NOTES = """\
 The service does the same when it starts; several processes that need a part build it once. The

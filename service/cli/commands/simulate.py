@@ -6,14 +6,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from service.cli import arguments
-from service.cli.configuration import mission_and_catalog
+from service.cli.arguments import mission_and_catalog
 from service.cli.simulated_rates import add_mission, add_paper
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.observations.batch import Aberration
-    from service.simulate.gyro import GyroWanted
     from service.simulate.stretches import Pass
+    from service.simulate.telemetry import GyroWanted
 
 
 def add(commands: Any) -> None:
@@ -281,8 +281,7 @@ def _run_telemetry(parsed: Namespace) -> int:
     acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
     acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
     """
-    from service.simulate.gyro import with_gyro
-    from service.simulate.telemetry import draw_pass, truth_path, write_pass
+    from service.simulate.telemetry import draw_pass, truth_path, with_gyro, write_pass
     from service.sky.cache import LruCache
     from service.sky.model import SkyModel
 
@@ -301,8 +300,8 @@ def _run_telemetry(parsed: Namespace) -> int:
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
-    from service.observations.readers.telemetry import telemetry_format
-    from service.simulate.gyro import GyroWanted
+    from service.observations.telemetry import telemetry_format
+    from service.simulate.telemetry import GyroWanted
 
     flaws = parsed.gyro_quantum, parsed.gyro_gap, parsed.clock_step
     if parsed.gyro is None:

@@ -5,7 +5,7 @@ from contextlib import closing
 from typing import Any
 
 from service.cli import arguments
-from service.cli.configuration import period_of, progress_bar, settings_of_existing
+from service.cli.arguments import period_of, progress_bar, settings_of_existing
 
 
 def add(commands: Any) -> None:

@@ -6,13 +6,12 @@ The commands write into the database; where a service writes to its SQLite file,
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from service.cli.arguments import SERVICE, add_command, add_database, add_group, add_json, count
-from service.cli.configuration import service_url, settings_of_existing
+from service.cli import arguments
 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    group = add_group(
+    group = arguments.add_group(
         commands,
         "token",
         "Tokens for programs and people.  Until the first token is created, access is open on "
@@ -25,7 +24,7 @@ def add(commands: Any) -> None:
         acquire token revoke pipeline
         """,
     )
-    parser = add_command(group, "create", create)
+    parser = arguments.add_command(group, "create", create)
     parser.add_argument("name", metavar="NAME", help="name of a program or a person")
     parser.add_argument(
         "--scope",
@@ -43,7 +42,7 @@ def add(commands: Any) -> None:
     )
     parser.add_argument(
         "--days",
-        type=count,
+        type=arguments.count,
         default=365,
         metavar="N",
         help="days until the token expires; default 365",
@@ -55,10 +54,10 @@ def add(commands: Any) -> None:
         help="maximum number of requests per second; default: no limit",
     )
     add_service(parser)
-    parser = add_command(group, "list", show)
-    add_json(parser, "the tokens")
-    add_database(parser)
-    parser = add_command(group, "revoke", revoke)
+    parser = arguments.add_command(group, "list", show)
+    arguments.add_json(parser, "the tokens")
+    arguments.add_database(parser)
+    parser = arguments.add_command(group, "revoke", revoke)
     parser.add_argument("name", metavar="NAME")
     add_service(parser)
 
@@ -67,9 +66,9 @@ def add_service(parser: ArgumentParser) -> None:
     """Declare the database, and the service that may be writing to it."""
     parser.add_argument(
         "--url",
-        help=f"{SERVICE}.  Where it writes to the SQLite file, it makes the change",
+        help=f"{arguments.SERVICE}.  Where it writes to the SQLite file, it makes the change",
     )
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def create(parsed: Namespace) -> int:
@@ -92,7 +91,7 @@ def show(parsed: Namespace) -> int:
     """
     from service.cli.tokens import print_tokens
 
-    return print_tokens(settings_of_existing(parsed), parsed.json)
+    return print_tokens(arguments.settings_of_existing(parsed), parsed.json)
 
 
 def revoke(parsed: Namespace) -> int:
@@ -102,7 +101,9 @@ def revoke(parsed: Namespace) -> int:
     """
     from service.cli.tokens import opened_tokens
 
-    with opened_tokens(settings_of_existing(parsed), service_url(parsed)) as tokens:
+    with opened_tokens(
+        arguments.settings_of_existing(parsed), arguments.service_url(parsed)
+    ) as tokens:
         tokens.revoke(parsed.name)
     print(f"{parsed.name} is revoked; a running service heeds that within a second")
     return 0

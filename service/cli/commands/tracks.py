@@ -5,16 +5,15 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from service.cli.arguments import MISSION, add_command, add_database, add_period, print_json
-from service.cli.configuration import period_of, settings_of_existing
+from service.cli import arguments
 from service.errors import BadInput, Fault
 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = add_command(commands, "tracks", run)
-    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=MISSION)
-    add_period(parser, "the run to use; default live")
+    parser = arguments.add_command(commands, "tracks", run)
+    parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
+    arguments.add_period(parser, "the run to use; default live")
     parser.add_argument(
         "--format",
         choices=("text", "json", "tdm"),
@@ -24,7 +23,7 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "-o", "--output", type=Path, metavar="OUT", help="write the TDM to OUT; default: print it"
     )
-    add_database(parser)
+    arguments.add_database(parser)
 
 
 def run(parsed: Namespace) -> int:
@@ -35,18 +34,17 @@ def run(parsed: Namespace) -> int:
     acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
     """
     from service.app.factory import open_app
-    from service.cli.arguments import written_to
     from service.cli.texts import tracks_text
 
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))
-    start, end = period_of(parsed)
-    with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
+    start, end = arguments.period_of(parsed)
+    with closing(open_app(arguments.settings_of_existing(parsed), reads_only=True)) as app:
         found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
-            written_to(parsed.output, app.tracks.tdm(found))
+            arguments.written_to(parsed.output, app.tracks.tdm(found))
         elif parsed.format == "json":
-            print_json(found)
+            arguments.print_json(found)
         else:
             print(tracks_text(found))
     return 0

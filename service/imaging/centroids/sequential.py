@@ -2,7 +2,7 @@
 
 A measurement is r = c . A + k: a row c, a state A that stays the same, noise k.
 Everything the report derives for it is here; what the rows are for a star's image is
-in `studies.star_image_report.quadratic_peak`.
+in `studies.star_image_report.measurements`.
 """
 
 from collections.abc import Iterable

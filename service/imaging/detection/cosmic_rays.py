@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.centroids.psf import GaussianPsf, Psf
-from service.imaging.centroids.record import CentroidRecord
-from service.imaging.centroids.window import Mask, Window
+from service.imaging.centroids.window import CentroidRecord, Mask, Window
 from service.imaging.frames.frame import CountArray
 from service.vectors import Vector
 

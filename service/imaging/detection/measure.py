@@ -9,13 +9,11 @@ import numpy as np
 
 from service.imaging.centroids.centroid import centroid
 from service.imaging.centroids.psf import ColouredPsf, Psf
-from service.imaging.centroids.record import CentroidRecord
 from service.imaging.centroids.shape_fit import fit_in_its_colour
-from service.imaging.centroids.window import Window, cutout
-from service.imaging.detection.background import MESH_PX
+from service.imaging.centroids.window import CentroidRecord, Window, cutout
 from service.imaging.detection.cosmic_rays import hits_under
-from service.imaging.detection.detect import Detections, detector_of
-from service.imaging.detection.star_image import core_share, psf_of
+from service.imaging.detection.detect import MESH_PX, Detections, detector_of
+from service.imaging.detection.star_images import core_share, psf_of
 from service.imaging.frames.frame import Frame
 from service.missions.camera import Camera, CentroidMethod
 from service.missions.mission import Tracker

@@ -11,7 +11,7 @@ import numpy as np
 
 from service.errors import BadFile
 from service.imaging.frames import fits_header
-from service.imaging.frames.arrays import as_counts, decoding, exactly
+from service.imaging.frames.files import as_counts, decoding, exactly
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
 ABSENT = (

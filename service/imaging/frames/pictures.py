@@ -7,8 +7,8 @@ from typing import IO, Any
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.frames.arrays import as_counts, decoding, exactly, full_scale_of
 from service.imaging.frames.exif import TAG, as_shown, exif_of, exposure_of, require_small_exif
+from service.imaging.frames.files import as_counts, decoding, exactly, full_scale_of
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
 

@@ -15,7 +15,6 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.imaging.frames.arrays import as_counts, decoding, full_scale_of
 from service.imaging.frames.exif import (
     MAX_EXIF_BYTES,
     TAG,
@@ -25,6 +24,7 @@ from service.imaging.frames.exif import (
     directory,
     exif_exposure,
 )
+from service.imaging.frames.files import as_counts, decoding, full_scale_of
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
 

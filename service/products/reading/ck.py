@@ -17,12 +17,7 @@ import numpy as np
 from service.errors import BadFile, Fault
 from service.extras import require_extra
 from service.products.ck import leap_second_kernel
-from service.products.reading.known import (
-    MOST_RECORDS,
-    KnownAttitudes,
-    Segment,
-    known_attitudes,
-)
+from service.products.reading import known
 from service.products.spool import PIECE_BYTES, folder
 
 CHILD_S = 600.0
@@ -38,7 +33,7 @@ _KERNELS = (".tsc", ".tls")
 """Clocks and leap seconds, the kernels that reading takes."""
 
 
-def read_ck(file: Path, field: str = "file") -> KnownAttitudes:
+def read_ck(file: Path, field: str = "file") -> known.KnownAttitudes:
     """The attitudes of a C-kernel with its clock beside it, or of a zip file with both.
 
     Raises `BadFile` naming the file, and `NotAvailable` where spiceypy is missing.
@@ -91,8 +86,8 @@ def _unpacked(file: Path, place: Path) -> tuple[str, list[str]]:
     return found[".bc"][0], [name for suffix in _KERNELS for name in found[suffix]]
 
 
-def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitudes:
-    command = [sys.executable, "-P", str(_CHILD), ".", str(MOST_RECORDS), kernel, *others]
+def _read(name: str, place: Path, kernel: str, others: list[str]) -> known.KnownAttitudes:
+    command = [sys.executable, "-P", str(_CHILD), ".", str(known.MOST_RECORDS), kernel, *others]
     try:
         done = subprocess.run(command, cwd=place, capture_output=True, timeout=CHILD_S, check=False)
     except subprocess.TimeoutExpired:
@@ -117,5 +112,5 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> KnownAttitu
         if np.any(np.diff(times) <= 0):
             raise BadFile(Fault(f"{name}, {at}", "times must increase within an interval"))
         within = quaternion[first : first + count]
-        segments.append(Segment(at, times, int(times[0]), int(times[-1]), within))
-    return known_attitudes(name, answer["object"], segments)
+        segments.append(known.Segment(at, times, int(times[0]), int(times[-1]), within))
+    return known.known_attitudes(name, answer["object"], segments)

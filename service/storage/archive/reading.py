@@ -19,7 +19,7 @@ from service.times import Utc
 if TYPE_CHECKING:
     import pyarrow as pa
 
-    from service.storage.archive.opened import Opened
+    from service.storage.archive.rows import Opened
 
 log = logging.getLogger(__name__)
 
@@ -118,7 +118,7 @@ class Archive:
 
         def build() -> "Opened":
             from service.storage.archive.folder import read_settings
-            from service.storage.archive.opened import WHOLE, Opened, columns_of
+            from service.storage.archive.rows import WHOLE, Opened, columns_of
 
             own = [[("id", "=", batch_id)], [("batch_id", "=", batch_id)]]
             read = self.read(path, columns_of(WHOLE), own)
@@ -144,10 +144,10 @@ class Archive:
         return [Block(part, k, each.min, each.max) for k, each in enumerate(times)]
 
     def open(self, block: Block, needs: Collection[str]) -> "Opened":
-        """The results of a row group, with what is needed of them; see `opened.columns_of`."""
+        """The results of a row group, with what is needed of them; see `rows.columns_of`."""
 
         def build() -> "Opened":
-            from service.storage.archive.opened import Opened, columns_of
+            from service.storage.archive.rows import Opened, columns_of
 
             with self._readable(block.part.path) as file:
                 from pyarrow import parquet

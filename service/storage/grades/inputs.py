@@ -28,8 +28,8 @@ from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 from service.storage.gyro import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter, covariance_of
-from service.storage.queries.recorded_batch import recorded_mission
 from service.storage.queries.result_tables import RATES
+from service.storage.queries.results import recorded_mission
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.tables import batches, results, rollups_daily, solutions, star_results

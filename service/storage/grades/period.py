@@ -9,28 +9,27 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
+from service.alarms.limits import Point, Sample, preview_of
 from service.alarms.quantities import REJECTED
-from service.alarms.window import Point, Sample, preview_of
 from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers, Outcome, Status
 from service.grades.day import (
     GRADES,
     Grade,
     GradedSamples,
+    MeasuredInnovations,
     day_bounds,
     unpacked,
     unpacked_innovations,
 )
-from service.grades.innovations import MeasuredInnovations
 from service.gyro import texts_of
 from service.missions.mission import Mission
-from service.storage.grades.days import DayKey, GradedDayRow, shown
+from service.storage.grades.days import BLOCKS, PLACE, DayKey, GradedDayRow, block_conditions, shown
 from service.storage.grades.inputs import inside
-from service.storage.grades.rows import BLOCKS, PLACE, block_conditions
 from service.storage.models.base import Page
 from service.storage.models.products import Innovation
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
-from service.storage.queries.limits import limits_of
+from service.storage.queries.alarms import limits_of
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days

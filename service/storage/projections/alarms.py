@@ -12,15 +12,13 @@ import msgspec
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
-from service.alarms.limits import LimitSettings, Severity
+from service.alarms.limits import BatchRef, LimitSettings, Point, Sample, SampleWindow, Severity
 from service.alarms.quantities import SILENCE
 from service.alarms.subjects import Subject, quantity_and_tracker, sampler, subject_of
-from service.alarms.window import BatchRef, Point, Sample, SampleWindow
 from service.missions.mission import Mission
-from service.storage.projections.recorded import RecordedResult
-from service.storage.queries.alarms import change
-from service.storage.queries.limits import limits_of
-from service.storage.queries.recorded_batch import recorded_mission
+from service.storage.projections.rollups import RecordedResult
+from service.storage.queries.alarms import change, limits_of
+from service.storage.queries.results import recorded_mission
 from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.alarm_tables import alarms, watches

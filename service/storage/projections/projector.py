@@ -21,8 +21,7 @@ from sqlalchemy import Connection, select, update
 
 from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals
-from service.storage.projections.recorded import RecordedResult, recorded_after
-from service.storage.projections.rollups import lock_position
+from service.storage.projections.rollups import RecordedResult, lock_position, recorded_after
 from service.storage.queries.pages import newest_first
 from service.storage.recording import events
 from service.storage.recording.answer import state_in

@@ -4,28 +4,117 @@ Of spacecraft with several trackers also per tracker.
 
 They always equal a count of the current results whose `seq` is at most the position of the
 projector.
+
+Recorded results come as all projections take them, in the order of the record.
 """
 
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cached_property
 from typing import Any
 
-from sqlalchemy import ColumnElement, Connection, delete, func, insert, select
-
-from service.storage.projections.recorded import RecordedResult
-from service.storage.queries.time_buckets import TRENDS, Bucket, Trend
-from service.storage.recording.result_metrics import (
-    OF_TRACKERS,
-    SUMMED,
-    SUMMED_OF_TRACKERS,
-    merge,
-    rolled_up,
+from msgspec import Struct
+from sqlalchemy import (
+    ColumnElement,
+    Connection,
+    bindparam,
+    delete,
+    func,
+    insert,
+    literal_column,
+    select,
 )
+
+from service.storage.queries.time_buckets import TRENDS, Bucket, Trend
+from service.storage.recording import result_metrics
+from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
-from service.storage.sql.statements import add_rollups, insert_all
-from service.storage.sql.tables import COUNTS, batches, projector, results, tracker_values
+from service.storage.sql.statements import add_rollups, insert_all, prepared
+from service.storage.sql.tables import (
+    COUNTED,
+    COUNTS,
+    MEASURED,
+    batches,
+    projector,
+    results,
+    tracker_values,
+)
 from service.times import HOUR_S, bucket_start, parse_utc, recorded_utc
+
+_TAKEN = (
+    *("id", "batch_id", "current", "seq", "spacecraft", "run", "time_ns", "mission_digest"),
+    *COUNTED,
+    *("status", "reason", *MEASURED, "answer"),
+)
+_AFTER = prepared(
+    select(
+        *(results.c[name] for name in _TAKEN),
+        *(batches.c.batch, batches.c.time, batches.c.received),
+    )
+    .join_from(results, batches, results.c.batch_id == batches.c.id)
+    .where(results.c.seq > bindparam("position"))
+    .order_by(results.c.seq)
+    .limit(bindparam("count"))
+    .offset(literal_column("0"))
+)
+_TRACKERS = prepared(
+    select(tracker_values)
+    .join_from(tracker_values, results, tracker_values.c.batch_id == results.c.id)
+    .where(results.c.seq > bindparam("position"), results.c.seq <= bindparam("last"))
+)
+
+
+class RecordedResult(Struct, eq=False, dict=True):
+    """A result with its batch, and what each tracker contributed where there are several."""
+
+    result: Row
+    """The columns of `results`, and the name, time and moment of receipt of the batch."""
+    trackers: Sequence[Row] = ()
+
+    @property
+    def seq(self) -> int:
+        """The result's place in the record."""
+        return int(self.result["seq"])
+
+    @property
+    def is_first(self) -> bool:
+        """True for the first result of a batch, False for a what-if."""
+        return bool(self.result["id"] == self.result["batch_id"])
+
+    @property
+    def owner(self) -> tuple[str, str]:
+        """(run, spacecraft)."""
+        return self.result["run"], self.result["spacecraft"]
+
+    @property
+    def hour(self) -> tuple[str, str, int]:
+        """(spacecraft, run, number of the UTC hour of the batch)."""
+        row = self.result
+        return row["spacecraft"], row["run"], recorded_utc(row["time"]).bucket(HOUR_S)
+
+    @cached_property
+    def received_ns(self) -> int:
+        """When the batch came, as `Utc.tai_ns`."""
+        return recorded_utc(self.result["received"]).tai_ns
+
+    @property
+    def is_ahead(self) -> bool:
+        """True for a live batch dated so far ahead that its time cannot be believed."""
+        row = self.result
+        return bool(row["run"] == LIVE and row["time_ns"] > self.received_ns + AHEAD_NS)
+
+
+def recorded_after(connection: Connection, position: int, count: int) -> list[RecordedResult]:
+    """The results after a place in the record, in order, at most so many."""
+    rows = _AFTER.read(connection, {"position": position, "count": count})
+    if not rows:
+        return []
+    trackers: dict[str, list[Row]] = {}
+    for row in _TRACKERS.read(connection, {"position": position, "last": rows[-1]["seq"]}):
+        trackers.setdefault(row["batch_id"], []).append(row)
+    return [RecordedResult(row, trackers.get(row["id"], ())) for row in rows]
+
 
 BucketKey = tuple[str, str, int]
 """(spacecraft, run, bucket)."""
@@ -61,7 +150,7 @@ def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
     of_hour: dict[tuple[str, str, str, int], list[Row]] = {}
     for (spacecraft, run, hour), row in new:
         of_hour.setdefault((spacecraft, run, row.get("tracker", WHOLE), hour), []).append(row)
-    _add_hours(connection, {key: rolled_up(rows) for key, rows in of_hour.items()})
+    _add_hours(connection, {key: result_metrics.rolled_up(rows) for key, rows in of_hour.items()})
 
 
 def add_shares(
@@ -147,9 +236,13 @@ def _of_hour(connection: Connection, key: BucketKey) -> Rollups:
 
 def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
     """The rollups of some results by tracker, that of the `WHOLE` first."""
-    whole = connection.execute(select(*SUMMED.values()).where(*chosen)).mappings().one()
+    whole = (
+        connection.execute(select(*result_metrics.SUMMED.values()).where(*chosen)).mappings().one()
+    )
     tracker = tracker_values.c.tracker
-    query = select(tracker, *SUMMED_OF_TRACKERS.values()).select_from(OF_TRACKERS)
+    query = select(tracker, *result_metrics.SUMMED_OF_TRACKERS.values()).select_from(
+        result_metrics.OF_TRACKERS
+    )
     of_tracker: Rollups = {WHOLE: dict(whole)}
     for found in connection.execute(query.where(*chosen).group_by(tracker)).mappings():
         row = dict(found)
@@ -175,7 +268,7 @@ def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Roll
 
 def _put(found: Rollups, key: Any, row: Row) -> None:
     if key in found:
-        merge(found[key], row)
+        result_metrics.merge(found[key], row)
     else:
         # A copy: merging changes it in place.
         found[key] = dict(row)
@@ -201,7 +294,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         results, batches, results.c.batch_id == batches.c.id
     )
     if of_trackers:
-        source = OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
+        source = result_metrics.OF_TRACKERS.join(batches, batches.c.id == results.c.batch_id)
         query = select(tracker_values, *place).select_from(source)
     width_s = TRENDS[bucket].width_s
     found: Rollups = {}
@@ -213,7 +306,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         tracker = (row["tracker"],) if of_trackers else ()
         number = parse_utc(row["time"]).bucket(width_s)
         key = row["spacecraft"], row["run"], *tracker, number
-        _put(found, key, rolled_up([dict(row)]))
+        _put(found, key, result_metrics.rolled_up([dict(row)]))
     for spacecraft, run, name, hour, share in _shares(connection):
         if (name != WHOLE) == of_trackers:
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)

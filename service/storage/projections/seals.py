@@ -10,8 +10,7 @@ from collections.abc import Sequence
 from sqlalchemy import BigInteger, ColumnElement, Connection, delete, func, select
 from sqlalchemy.dialects import postgresql, sqlite
 
-from service.storage.projections.recorded import RecordedResult
-from service.storage.projections.rollups import lock_position
+from service.storage.projections.rollups import RecordedResult, lock_position
 from service.storage.sql.tables import projector, results, seals
 
 HOUR_NS = 3_600_000_000_000

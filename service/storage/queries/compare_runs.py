@@ -10,17 +10,16 @@ import numpy as np
 from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
 from service.storage.archive.reading import Archive, parts_between, places
-from service.storage.models import compare
-from service.storage.queries.pages import PLACE, QUATERNION, Place, ResultFilter, newest_first
+from service.storage.models import runs as models
+from service.storage.queries import pages
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
-from service.storage.queries.with_archive import Listing, bounds_of
 from service.storage.sql import tables
 from service.storage.sql.tables import batches, results
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, unix_seconds
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 if TYPE_CHECKING:
-    from service.storage.archive.opened import Opened
+    from service.storage.archive.rows import Opened
 
 _READ_AT_ONCE = 10_000
 
@@ -28,10 +27,10 @@ _READ_AT_ONCE = 10_000
 def compare_runs(
     connection: Connection,
     archive: Archive,
-    selected: ResultFilter,
+    selected: pages.ResultFilter,
     other: str,
     latest: int | None = None,
-) -> compare.RunComparison:
+) -> models.RunComparison:
     """The current results of a period beside those of the same batches in another run.
 
     `stars` counts what became of each, from the one run (`before`) to the other
@@ -50,7 +49,7 @@ def compare_runs(
             after[new or "none"] += int(count)
         angles_arcsec += _angles_arcsec(of_group, pairs)
     transitions = [
-        compare.RunTransition(before=old, after=new, same_star=alike, stars=number)
+        models.RunTransition(before=old, after=new, same_star=alike, stars=number)
         for (old, new, alike), number in stars.items()
     ]
     # The most frequent first.
@@ -59,20 +58,20 @@ def compare_runs(
     statistics = None
     if len(angles):
         median, p95 = np.quantile(angles, (0.5, 0.95)).tolist()
-        statistics = compare.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
-    return compare.RunComparison(
+        statistics = models.AngleStatistics(median=median, p95=p95, max=float(angles.max()))
+    return models.RunComparison(
         run=selected.run,
         other=other,
         batches=before.total(),
-        stars=compare.RunStars(
+        stars=models.RunStars(
             observed=stars.total(),
             before=_sums((each.before, each.stars) for each in transitions),
             after=_sums((each.after, each.stars) for each in transitions),
             transitions=transitions,
         ),
-        attitudes=compare.RunAttitudes(
-            before=compare.StatusCounts(**before),
-            after=compare.StatusCounts(**after),
+        attitudes=models.RunAttitudes(
+            before=models.StatusCounts(**before),
+            after=models.StatusCounts(**after),
             in_both=len(angles),
             angle_arcsec=statistics,
         ),
@@ -82,16 +81,16 @@ def compare_runs(
 def changed_batches(
     connection: Connection,
     archive: Archive,
-    selected: ResultFilter,
+    selected: pages.ResultFilter,
     other: str,
     latest: int,
     limit: int,
-) -> list[compare.RunChange]:
+) -> list[models.RunChange]:
     """The batches whose counts of stars or whose status differ in the other run, latest first.
 
     At most `limit` of the period's `latest` batches.
     """
-    found: list[compare.RunChange] = []
+    found: list[models.RunChange] = []
     for of_group, pairs in _groups(connection, archive, selected, other, latest):
         found += _changed(of_group, pairs, limit)
         if len(found) >= limit:
@@ -100,14 +99,18 @@ def changed_batches(
 
 
 def _groups(
-    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
+    connection: Connection,
+    archive: Archive,
+    selected: pages.ResultFilter,
+    other: str,
+    latest: int | None,
 ) -> Iterator[tuple[Connection, Subquery]]:
     """The pairs of results of both runs with the database that they are in, latest first.
 
     Without an archive that is one group.
     """
     is_archived = any(
-        parts_between(connection, selected.spacecraft, run, *bounds_of(selected))
+        parts_between(connection, selected.spacecraft, run, *pages.bounds_of(selected))
         for run in (selected.run, other)
     )
     if not is_archived:
@@ -118,7 +121,7 @@ def _groups(
             yield of_group, _pairs(selected, other)
 
 
-def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compare.RunChange]:
+def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[models.RunChange]:
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
         *(old.c[name] != new.c[name] for name in (*tables.COUNTED, "status")),
@@ -141,7 +144,7 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compar
         .limit(limit)
     )
     return [
-        compare.RunChange(
+        models.RunChange(
             batch=row["batch"],
             time=row["time"],
             before=_side(row, "before"),
@@ -151,20 +154,20 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[compar
     ]
 
 
-def _side(row: Any, side: str) -> compare.RunChangeSide:
+def _side(row: Any, side: str) -> models.RunChangeSide:
     counts = {name: row[f"{side}_{name}"] for name in ("unique", "ambiguous", "unmatched")}
-    return compare.RunChangeSide(
-        id=row[f"{side}_id"], counts=compare.OutcomeCounts(**counts), status=row[f"{side}_status"]
+    return models.RunChangeSide(
+        id=row[f"{side}_id"], counts=models.OutcomeCounts(**counts), status=row[f"{side}_status"]
     )
 
 
-def _pairs(selected: ResultFilter, other: str, latest: int | None = None) -> Subquery:
+def _pairs(selected: pages.ResultFilter, other: str, latest: int | None = None) -> Subquery:
     """The ids and states of the two current results of each batch that is in both runs."""
     again, new = batches.alias("again"), results.alias("new")
     of_run = selected.conditions()
     if latest is not None:
         # The limit comes first: to look for partners of millions of batches takes minutes.
-        chosen = newest_first(select(results.c.id).where(*of_run))
+        chosen = pages.newest_first(select(results.c.id).where(*of_run))
         of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
         select(
@@ -212,12 +215,12 @@ def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str
     }
 
 
-def _sums(stars: Iterable[tuple[str, int]]) -> compare.OutcomeCounts:
+def _sums(stars: Iterable[tuple[str, int]]) -> models.OutcomeCounts:
     counts: Counter[str] = Counter()
     for outcome, number in stars:
         counts[outcome] += number
-    return compare.OutcomeCounts(
-        **{name: counts[name] for name in compare.OutcomeCounts.__struct_fields__}
+    return models.OutcomeCounts(
+        **{name: counts[name] for name in models.OutcomeCounts.__struct_fields__}
     )
 
 
@@ -225,7 +228,7 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
     """The angles between the attitudes that both have, in arrays."""
     old, new = tables.solutions.alias("old_solution"), tables.solutions.alias("new_solution")
     query = (
-        select(*(each.c[name] for each in (old, new) for name in QUATERNION))
+        select(*(each.c[name] for each in (old, new) for name in pages.QUATERNION))
         .select_from(pairs)
         .join(old, old.c.result_id == pairs.c.before)
         .join(new, new.c.result_id == pairs.c.after)
@@ -248,7 +251,11 @@ _AT_ONCE = 1_000
 
 
 def both_runs(
-    connection: Connection, archive: Archive, selected: ResultFilter, other: str, latest: int | None
+    connection: Connection,
+    archive: Archive,
+    selected: pages.ResultFilter,
+    other: str,
+    latest: int | None,
 ) -> Iterator["Opened"]:
     """The selected batches with those of the same names in another run, latest first.
 
@@ -256,10 +263,12 @@ def both_runs(
     database, so that any of the two may be in either place.
     """
     named = (results.c.spacecraft, batches.c.batch)
-    query = select(*PLACE, *named).join_from(results, batches, results.c.batch_id == batches.c.id)
+    query = select(*pages.PLACE, *named).join_from(
+        results, batches, results.c.batch_id == batches.c.id
+    )
     query = query.where(*selected.conditions())
-    listing, left = Listing(archive, query, selected, newest_first=True), latest
-    beyond: Place | None = None
+    listing, left = pages.Listing(archive, query, selected, newest_first=True), latest
+    beyond: pages.Place | None = None
     while left is None or left > 0:
         limit = GROUP if left is None else min(GROUP, left)
         found = listing.first_rows(connection, limit, beyond).rows
@@ -295,8 +304,7 @@ def _opened(
     connection: Connection, archive: Archive, recorded: Sequence[str], archived: Sequence[str]
 ) -> "Opened":
     """Recorded and archived batches in one database."""
-    from service.storage.archive.opened import Opened, columns_of
-    from service.storage.archive.rows import read_rows
+    from service.storage.archive.rows import Opened, columns_of, read_rows
 
     opened = Opened()
     if recorded:
@@ -328,7 +336,7 @@ def cell_width_s(period_s: float) -> int:
 
 def run_rates(
     connection: Connection, spacecraft: str, runs: Sequence[str], start: Utc | None, end: Utc | None
-) -> compare.RatesOfRuns | None:
+) -> models.RatesOfRuns | None:
     """The rates of all stars of each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
@@ -351,13 +359,13 @@ def run_rates(
         buckets = read_buckets(connection, span, level, tables.COUNTS)
         place = (buckets["unix_s"] // width_s - first_s // width_s).astype(int)
         rates.append(
-            compare.RunRates(
+            models.RunRates(
                 run=run,
                 totals={name: int(buckets[name].sum()) for name in tables.COUNTS},
                 shares={name: _share(buckets, name, place, cells) for name in _SHARES},
             )
         )
-    return compare.RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
+    return models.RatesOfRuns(start=start, end=end, cell_s=width_s, runs=tuple(rates))
 
 
 def _common_days(

@@ -16,16 +16,9 @@ from service.storage.archive.reading import Archive
 from service.storage.models.base import Page
 from service.storage.models.runs import Run
 from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
-from service.storage.queries.pages import (
-    COVARIANCE,
-    PLACE,
-    QUATERNION,
-    ResultFilter,
-    covariance_of,
-    newest,
-)
+from service.storage.queries import pages
+from service.storage.queries.pages import MOST_OPENED, Listing
 from service.storage.queries.results import summary_of, summary_query
-from service.storage.queries.with_archive import MOST_OPENED, Listing
 from service.storage.recording.answer import state_in
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.tables import (
@@ -60,9 +53,9 @@ class Retired:
 
 def list_attitudes(
     connection: Connection,
-    archive: Archive,
-    selected: ResultFilter,
+    selected: pages.ResultFilter,
     *,
+    archive: Archive,
     limit: int,
     cursor: str | None,
 ) -> Page[AttitudeRow]:
@@ -80,10 +73,10 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
     no_batches.  `attitude` is that batch's own, or None; `last_attitude` is the
     newest there is, which may be of an older batch.
     """
-    selected = ResultFilter(run, mission.name)
-    batch = newest(connection, summary_query(), selected, now)
+    selected = pages.ResultFilter(run, mission.name)
+    batch = pages.newest(connection, summary_query(), selected, now)
     solved = attitudes().where(results.c.status.is_not(None))
-    row = newest(connection, solved, selected, now)
+    row = pages.newest(connection, solved, selected, now)
     last = None if row is None else attitude_row(row)
     is_latest = batch is not None and last is not None and last.id == batch["id"]
     tracking = None
@@ -185,7 +178,7 @@ def _day(number: int) -> str:
 
 def attitudes() -> Select[Any]:
     """The query for what `attitude_row` shows."""
-    place = [results.c.id, *PLACE, batches.c.batch, batches.c.time]
+    place = [results.c.id, *pages.PLACE, batches.c.batch, batches.c.time]
     return (
         select(*place, *(column for column in solutions.c if column.name != "result_id"))
         .join_from(results, batches, results.c.batch_id == batches.c.id)
@@ -200,9 +193,9 @@ def attitude_row(row: Any) -> AttitudeRow:
         id=row["id"],
         batch=row["batch"],
         time=row["time"],
-        quaternion=[row[name] for name in QUATERNION],
+        quaternion=[row[name] for name in pages.QUATERNION],
         frame=row["frame"],
-        covariance_arcsec2=covariance_of([row[name] for name in COVARIANCE]),
+        covariance_arcsec2=pages.covariance_of([row[name] for name in pages.COVARIANCE]),
         residual_rms_arcsec=None if is_measured else row["residual_rms_arcsec"],
         predicted_rms_arcsec=None if is_measured else row["predicted_rms_arcsec"],
         taste=None if is_measured else row["taste"],

@@ -1,13 +1,22 @@
-"""Current results in order of their batches' time, a page at a time."""
+"""Current results in order of their batches' time, a page at a time, recorded and archived ones.
+
+The database knows which parts of the archive reach into a period.  The same query then runs on the
+record and on one row group of the archive after another, until it is certain what comes first.
+"""
 
 import base64
-from collections.abc import Sequence
+import heapq
+import itertools
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Connection, RowMapping, Select, select
+from sqlalchemy import ColumnElement, Connection, RowMapping, Select, func, select, tuple_
 
 from service.errors import BadBatch, Fault, shown_value
+from service.storage.archive.reading import Archive, Block, PlacedPart, parts_between
+from service.storage.models.base import Page
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.tables import batches, results
@@ -104,3 +113,224 @@ def read_cursor(cursor: str) -> Place:
         fault = Fault("cursor", "is not a cursor of this list", shown_value(cursor))
         raise BadBatch(fault) from None
     return place, batch_id
+
+
+T = TypeVar("T")
+Reading = Callable[[], AbstractContextManager[Connection]]
+
+MOST_OPENED = 40
+"""Row groups that a page of a list opens: about a second's work."""
+FIRST_ID, LAST_ID = "0" * 26, "7" + "Z" * 25
+"""Ids before and after any other."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A row, and whether it is of the archive."""
+
+    row: Any
+    archived: bool
+
+    @property
+    def place(self) -> Place:
+        """Its place in the order of time."""
+        return self.row.time_ns, self.row.batch_id
+
+    @property
+    def shown(self) -> dict[str, Any]:
+        """The row by column, with `archived`."""
+        return {**self.row._mapping, "archived": self.archived}
+
+
+@dataclass(frozen=True)
+class Merged:
+    """Rows in order; `resume` is the place where the next ones begin if not all were looked for."""
+
+    rows: list[Found]
+    resume: Place | None = None
+
+
+@dataclass(frozen=True)
+class Listing:
+    """A query over current results, recorded and archived, in order of time.
+
+    The columns of the query include `PLACE`; it has no order and, of the filter, all conditions.
+    """
+
+    archive: Archive
+    query: Select[Any]
+    selected: ResultFilter
+    newest_first: bool = False
+    needs: Collection[str] = ()
+    """What it needs of the archive beside the columns of results and batches: names of
+    `rows.WHOLE`."""
+    most_opened: int | None = None
+    parts: Collection[int] | None = None
+    """The ids of the only parts to look in."""
+
+    def first_rows(self, connection: Connection, limit: int, beyond: Place | None = None) -> Merged:
+        """The first `limit` rows beyond a place."""
+        query = self.query
+        if beyond is not None:
+            place, bound = tuple_(*PLACE), tuple_(*beyond)
+            query = query.where(place < bound if self.newest_first else place > bound)
+        order = [column.desc() if self.newest_first else column for column in PLACE]
+        query = query.order_by(*order).limit(limit)
+        found = [Found(row, False) for row in connection.execute(query)]
+        sign = -1 if self.newest_first else 1
+        last_ns = found[limit - 1].place[0] if len(found) >= limit else None
+        # Parts and row groups that are not read yet, by where they begin in the order of the list.
+        heap: list[tuple[int, int, PlacedPart | Block]] = []
+        numbers = itertools.count()
+
+        def read_later(more: Iterable[PlacedPart | Block]) -> None:
+            for each in more:
+                begins = each.first_ns if sign > 0 else -each.last_ns
+                heapq.heappush(heap, (begins, next(numbers), each))
+
+        read_later(self._parts(connection, beyond, last_ns))
+        opened = 0
+        while heap:
+            begins, _, next_up = heapq.heappop(heap)
+            if len(found) >= limit and sign * found[limit - 1].place[0] < begins:
+                break
+            if isinstance(next_up, PlacedPart):
+                blocks = self.archive.blocks(next_up)
+                read_later(each for each in blocks if self._reaches(each, beyond))
+                continue
+            # Row groups that begin where the page does are all opened: the next page would begin
+            # there.
+            is_further = beyond is None or sign * beyond[0] < begins
+            if self.most_opened is not None and opened >= self.most_opened and is_further:
+                certain = [each for each in found if sign * each.place[0] < begins]
+                border = LAST_ID if self.newest_first else FIRST_ID
+                return Merged(certain, (sign * begins, border))
+            opened += 1
+            with self.archive.open(next_up, self.needs).reading() as connection_of_block:
+                rows = connection_of_block.execute(query).all()
+            found += [Found(row, True) for row in rows]
+            found.sort(key=lambda each: each.place, reverse=self.newest_first)
+            del found[limit:]
+        return Merged(found)
+
+    def page(
+        self, connection: Connection, limit: int, cursor: str | None, shown: Callable[[Any], T]
+    ) -> Page[T]:
+        """The first `limit` rows beyond a cursor, each as `shown` makes it of a dictionary.
+
+        The dictionary says by `archived` where the row is from.  A page over many parts of the
+        archive may have fewer rows, or none, and a cursor all the same.
+        """
+        beyond = None if cursor is None else read_cursor(cursor)
+        # One row more than asked for tells whether there is another page.
+        found = self.first_rows(connection, limit + 1, beyond)
+        rows, resume = found.rows, found.resume
+        if len(rows) > limit:
+            rows = rows[:limit]
+            resume = rows[-1].place
+        items = [shown(each.shown) for each in rows]
+        return Page(items, None if resume is None else cursor_of(resume))
+
+    def row_pages(self, reading: Reading, page: int) -> Iterator[list[Any]]:
+        """All rows, `page` of them at a time.
+
+        Between two pages no connection is held, so that a slow reader keeps none from others.
+        """
+        beyond: Place | None = None
+        while True:
+            with reading() as connection:
+                found = self.first_rows(connection, page, beyond).rows
+            if found:
+                yield [each.row for each in found]
+            if len(found) < page:
+                return
+            beyond = found[-1].place
+
+    def _parts(
+        self, connection: Connection, beyond: Place | None, last_ns: int | None
+    ) -> list[PlacedPart]:
+        """The parts that may have rows beyond a place and not after `last_ns`."""
+        if self.parts is not None and not self.parts:
+            return []
+        first_ns, end_ns = bounds_of(self.selected)
+        if last_ns is not None and self.newest_first:
+            first_ns = last_ns if first_ns is None else max(first_ns, last_ns)
+        elif last_ns is not None:
+            end_ns = last_ns + 1 if end_ns is None else min(end_ns, last_ns + 1)
+        return [
+            each
+            for each in parts_between(
+                connection, self.selected.spacecraft, self.selected.run, first_ns, end_ns
+            )
+            if (self.parts is None or each.id in self.parts) and self._reaches(each, beyond)
+        ]
+
+    def _reaches(self, each: PlacedPart | Block, beyond: Place | None) -> bool:
+        """True if it may have rows of the filter beyond a place."""
+        start_ns, end_ns = bounds_of(self.selected)
+        if start_ns is not None and each.last_ns < start_ns:
+            return False
+        if end_ns is not None and each.first_ns >= end_ns:
+            return False
+        if beyond is None:
+            return True
+        return each.first_ns <= beyond[0] if self.newest_first else each.last_ns >= beyond[0]
+
+
+def all_rows(
+    connection: Connection,
+    archive: Archive,
+    needs: Collection[str],
+    query: Select[Any],
+    places: Sequence[Place],
+) -> list[Any]:
+    """Every row of a query over some results, which stand at these places, in order of time.
+
+    The query has its order within a place.
+    """
+    rows = list(connection.execute(query))
+    if not places:
+        return rows
+    ends = min(places)[0], max(places)[0]
+    for part in parts_between(connection, None, None, ends[0], ends[1] + 1):
+        for block in archive.blocks(part):
+            if block.first_ns <= ends[1] and block.last_ns >= ends[0]:
+                with archive.open(block, needs).reading() as connection_of_block:
+                    rows += connection_of_block.execute(query)
+    rows.sort(key=lambda row: (row.time_ns, row.batch_id))
+    return rows
+
+
+def count(connection: Connection, archive: Archive, selected: ResultFilter, most: int) -> int:
+    """How many current results are selected; no more than `most` are counted."""
+    bounded = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
+    query = select(func.count()).select_from(bounded)
+    found = int(connection.scalar(query) or 0)
+    for part in parts_of(connection, selected):
+        if found >= most:
+            return most
+        found += count_of_part(archive, part, selected)
+    return min(found, most)
+
+
+def parts_of(connection: Connection, selected: ResultFilter) -> list[PlacedPart]:
+    """The parts of the archive that may have selected results."""
+    return parts_between(connection, selected.spacecraft, selected.run, *bounds_of(selected))
+
+
+def count_of_part(archive: Archive, part: PlacedPart, selected: ResultFilter) -> int:
+    """How many batches of a part are selected."""
+    start_ns, end_ns = bounds_of(selected)
+    if (start_ns is None or part.first_ns >= start_ns) and (
+        end_ns is None or part.last_ns < end_ns
+    ):
+        return part.batches
+    return len(archive.current_ids(part, start_ns, end_ns))
+
+
+def bounds_of(selected: ResultFilter) -> tuple[int | None, int | None]:
+    """Start and end of a filter in nanoseconds; None where it is open."""
+    return (
+        None if selected.start is None else selected.start.tai_ns,
+        None if selected.end is None else selected.end.tai_ns,
+    )

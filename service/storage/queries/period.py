@@ -26,8 +26,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star
 from service.storage.queries.pages import PLACE, ResultFilter, newest_first
-from service.storage.queries.recorded_batch import recorded_mission
-from service.storage.queries.results import answer_from_json
+from service.storage.queries.results import answer_from_json, recorded_mission
 from service.storage.queries.star_field import presumed_attitude
 from service.storage.queries.time_buckets import BucketFilter, read_buckets
 from service.storage.sql.columns import Row

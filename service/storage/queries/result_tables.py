@@ -12,8 +12,15 @@ from service.alarms.quantities import QUANTITIES
 from service.products.attitudes import AttitudeRows
 from service.products.tables import Column, Page, Table
 from service.storage.archive.reading import Archive
-from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter
-from service.storage.queries.with_archive import Listing, Reading, all_rows
+from service.storage.queries.pages import (
+    COVARIANCE,
+    PLACE,
+    QUATERNION,
+    Listing,
+    Reading,
+    ResultFilter,
+    all_rows,
+)
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, solutions, star_results
 from service.vectors import Vector
 

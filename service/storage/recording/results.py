@@ -20,9 +20,9 @@ from service.storage.recording.identity import (
 from service.storage.recording.result_metrics import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql import tables
-from service.storage.sql.access_tables import audit
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
+from service.storage.sql.tables import audit
 
 RecordOutcome = Answered | AcquisitionError
 

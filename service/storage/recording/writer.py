@@ -24,9 +24,8 @@ from service.storage.recording import events
 from service.storage.recording.identity import ArchivedMeanwhile
 from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
-from service.storage.sql.connections import PersistentConnection, RolledBack
 from service.storage.sql.database_file import DatabaseFile, FileLock
-from service.storage.sql.engines import TO_WRITE, patience
+from service.storage.sql.engines import TO_WRITE, PersistentConnection, RolledBack, patience
 from service.storage.sql.projector_lock import Attempt, NotProjecting, ProjectorLock
 from service.storage.sql.statements import execute
 from service.storage.sql.tables import WRITTEN_BY_POSTS, event_counter

@@ -105,7 +105,7 @@ def check(database: str) -> list[str]:
 def all_tables() -> list[Table]:
     """All tables of the code, each after those that it refers to."""
     # A table is known to the metadata when its module is loaded.
-    from service.storage.sql import access_tables, alarm_tables, grade_tables, tables  # noqa: F401
+    from service.storage.sql import alarm_tables, grade_tables, tables  # noqa: F401
 
     return metadata.sorted_tables
 

@@ -13,7 +13,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 
 from service.storage.sql.columns import PackedText, Row, pack
-from service.storage.sql.connections import TranslatedErrors
+from service.storage.sql.engines import TranslatedErrors
 from service.storage.sql.tables import COUNTS, MAXIMA, MINIMA, SUMS, runs
 
 T = TypeVar("T")

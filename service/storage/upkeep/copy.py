@@ -20,11 +20,10 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
 from service.storage.sql import engines, migrations
-from service.storage.sql.access_tables import webhook_sender
 from service.storage.sql.database_file import writing_alone
 from service.storage.sql.projector_lock import ProjectorLock
 from service.storage.sql.statements import count, insert_all
-from service.storage.sql.tables import event_counter, projector
+from service.storage.sql.tables import event_counter, projector, webhook_sender
 from service.storage.upkeep.verify import verify
 
 FIRST_ROWS = (event_counter, projector, webhook_sender)

@@ -10,7 +10,7 @@ import erfa
 from msgspec import Struct
 from sqlalchemy import Connection, select
 
-from service.storage.sql.access_tables import access_tokens
+from service.storage.sql.tables import access_tokens
 from service.times import LAST_YEAR, Utc, parse_utc, recorded_utc, shifted, utc_now
 
 log = logging.getLogger(__name__)

@@ -209,7 +209,7 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
     # Archives need pyarrow, which is an extra.
     from service.storage.archive.folder import claim, locked, manifest_of, parts_of, remove_part
     from service.storage.archive.rows import read_part
-    from service.storage.upkeep.restoring import forget_part, put_back
+    from service.storage.upkeep.archiving import forget_part, put_back
 
     def forget_whole(connection: Connection, row: Row) -> None:
         own = archived_hours.c.spacecraft == row["spacecraft"], archived_hours.c.run == row["run"]

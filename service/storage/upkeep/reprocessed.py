@@ -19,8 +19,7 @@ from service.errors import BadConfiguration
 from service.storage.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
 from service.storage.archive.rows import Rows, read_part
 from service.storage.projections import alarms, rollups
-from service.storage.projections.recorded import RecordedResult
-from service.storage.projections.rollups import WHOLE, insert_share
+from service.storage.projections.rollups import WHOLE, RecordedResult, insert_share
 from service.storage.recording import events
 from service.storage.recording.identity import look_up
 from service.storage.recording.result_metrics import rolled_up
@@ -29,8 +28,7 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import count, portions
 from service.storage.store import Store
-from service.storage.upkeep.archiving import described, hours_of, newest_hours, note_part
-from service.storage.upkeep.restoring import put_back
+from service.storage.upkeep.archiving import described, hours_of, newest_hours, note_part, put_back
 from service.times import DAY_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")

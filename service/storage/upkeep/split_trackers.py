@@ -28,8 +28,7 @@ from service.sky.model import SkyModel
 from service.storage.models.answers import Answer
 from service.storage.projections import rollups, seals
 from service.storage.queries.pages import PLACE, newest_first
-from service.storage.queries.recorded_batch import recorded_mission
-from service.storage.queries.results import answer_from_json
+from service.storage.queries.results import answer_from_json, recorded_mission
 from service.storage.recording.identity import SETTINGS, digest_of, digest_of_row, made_later
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row

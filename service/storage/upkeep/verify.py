@@ -19,8 +19,13 @@ import sqlalchemy as sa
 from sqlalchemy.exc import DatabaseError
 
 from service.errors import BadInput
-from service.grades.day import GRADES, GradedSamples, unpacked, unpacked_innovations
-from service.grades.innovations import MeasuredInnovations
+from service.grades.day import (
+    GRADES,
+    GradedSamples,
+    MeasuredInnovations,
+    unpacked,
+    unpacked_innovations,
+)
 from service.gyro import SAME_TIME_NS, Nanoseconds, first_shared_ns
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json

@@ -7,7 +7,7 @@ from pydantic import AfterValidator, ConfigDict, Field, StringConstraints, model
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
 from service.errors import NotFound, shown_value
@@ -15,8 +15,14 @@ from service.observations.schema import Key, Wire
 from service.storage.models import alarms as models
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    page_response,
+    require_all_spacecraft,
+)
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Time, Who
 from service.web.requests.request_body import JsonBody, read_model
 

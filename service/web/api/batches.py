@@ -13,17 +13,19 @@ from service.gyro import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep, require_scope
-from service.web.requests.dependencies import (
+from service.web.requests.access import (
     AppDep,
+    CallerDep,
+    ChangeDep,
     MetricsDep,
     json_response,
     page_response,
+    require_scope,
 )
 from service.web.requests.problems import problem_within
 from service.web.requests.query_parameters import FromQuery, PeriodPageQuery, SpacecraftPath, Who

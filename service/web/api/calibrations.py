@@ -7,19 +7,18 @@ from pydantic import AfterValidator, Field, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
-from service.calibration.unknowns import LARGEST_DEGREE
+from service.calibration.linearise import LARGEST_DEGREE
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
 from service.storage import calibrations as models
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, ChangeDep
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, ChangeDep, json_response, page_response
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 

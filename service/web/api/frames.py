@@ -18,8 +18,7 @@ from service.storage.models.answers import Answer
 from service.storage.models.pictures import Picture
 from service.web.api.batches import answer_response
 from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
-from service.web.requests.access import CallerDep
-from service.web.requests.dependencies import AppDep, MetricsDep, json_response
+from service.web.requests.access import AppDep, CallerDep, MetricsDep, json_response
 from service.web.requests.query_parameters import TIME_SCHEMA, FromQuery, Query, SpacecraftPath
 from service.web.requests.request_body import IdempotencyKey, frame_body
 

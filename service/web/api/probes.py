@@ -12,7 +12,7 @@ from service.app.factory import App
 from service.errors import Busy
 from service.storage.projections.projector import WAIT_S, Lag
 from service.web.openapi import ApiRouter, Returns
-from service.web.requests.dependencies import AppDep, MetricsDep
+from service.web.requests.access import AppDep, MetricsDep
 
 router = ApiRouter("probes", prefix="")
 

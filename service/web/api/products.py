@@ -10,26 +10,12 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.observations.schema import RunName, Wire
-from service.products.formats import (
-    JSON_FORMAT,
-    OUTPUT_FORMATS,
-    attitude_formats,
-    write_attitudes,
-    write_table,
-)
-from service.storage.models.products import (
-    AttitudeAtMoment,
-    AttitudeProduct,
-    DefinitiveJob,
-    DefinitiveJobList,
-    InnovationPage,
-    LiveAttitude,
-)
+from service.products import formats
+from service.storage.models import products
 from service.storage.tracks import TrackList
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep, author
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, author, json_response, page_response
 from service.web.requests.exports import ExportsDep, attached_as
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
@@ -39,7 +25,7 @@ router = ApiRouter("products")
 
 @router.serves(
     "GET /spacecraft/{name}/attitude",
-    Returns("The attitudes, in the requested format.", AttitudeProduct, attitudes=True),
+    Returns("The attitudes, in the requested format.", products.AttitudeProduct, attitudes=True),
     problems=(503,),
 )
 def get_attitude(
@@ -52,18 +38,22 @@ def get_attitude(
     """The attitudes of a period, oldest first: as JSON, a table, or a file of flight dynamics."""
     asked = query.asked()
     format = asked.pop("format")
-    written = attitude_formats()[format]
+    written = formats.attitude_formats()[format]
     kind = "attitude" if query.grade == "raw" else f"attitude-{query.grade}"
     series = app.products.attitudes(name, **asked, most_batches=written.most_batches)
     return exports.response(
         caller,
-        lambda: write_attitudes(format, series),
+        lambda: formats.write_attitudes(format, series),
         written.media_type,
-        None if format == JSON_FORMAT else attached_as(f"{name}-{query.run}-{kind}", format),
+        None
+        if format == formats.JSON_FORMAT
+        else attached_as(f"{name}-{query.run}-{kind}", format),
     )
 
 
-@router.serves("GET /spacecraft/{name}/attitude/at", Returns("The attitude.", AttitudeAtMoment))
+@router.serves(
+    "GET /spacecraft/{name}/attitude/at", Returns("The attitude.", products.AttitudeAtMoment)
+)
 def get_attitude_at(
     name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
 ) -> Response:
@@ -74,14 +64,14 @@ def get_attitude_at(
     """
     asked = query.asked()
     found = app.products.attitude_at(name, asked.pop("time"), asked.pop("method"), **asked)
-    return json_response(AttitudeAtMoment(**asdict(found)))
+    return json_response(products.AttitudeAtMoment(**asdict(found)))
 
 
 @router.serves(
     "GET /spacecraft/{name}/tables/{kind}",
     Returns(
         "The table, in the requested format.",
-        media_type=OUTPUT_FORMATS["csv"].media_type,
+        media_type=formats.OUTPUT_FORMATS["csv"].media_type,
         tables=True,
     ),
     problems=(503,),
@@ -98,17 +88,19 @@ def get_table(
 
     The batches with their quantities, their stars with outcomes, or the gyro samples.
     """
-    written = OUTPUT_FORMATS[query.format]
+    written = formats.OUTPUT_FORMATS[query.format]
     table = app.products.table(name, kind, **query.run_and_times, most_batches=written.most_batches)
     return exports.response(
         caller,
-        lambda: write_table(query.format, table),
+        lambda: formats.write_table(query.format, table),
         written.media_type,
         attached_as(f"{name}-{query.run}-{kind}", query.format),
     )
 
 
-@router.serves("GET /spacecraft/{name}/attitude/latest", Returns("The attitude.", LiveAttitude))
+@router.serves(
+    "GET /spacecraft/{name}/attitude/latest", Returns("The attitude.", products.LiveAttitude)
+)
 def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     """The filtered attitude at the last epoch of live data, where the mission keeps it up.
 
@@ -118,7 +110,8 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
 
 
 @router.serves(
-    "GET /spacecraft/{name}/innovations", Returns("A page of innovations.", InnovationPage, LINK)
+    "GET /spacecraft/{name}/innovations",
+    Returns("A page of innovations.", products.InnovationPage, LINK),
 )
 def list_innovations(
     request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
@@ -146,7 +139,7 @@ class DefinitiveIn(Wire):
 
 @router.serves(
     "POST /spacecraft/{name}/definitive-attitude",
-    Returns("The job, which is queued.", DefinitiveJob, LOCATION, status=202),
+    Returns("The job, which is queued.", products.DefinitiveJob, LOCATION, status=202),
     body=DefinitiveIn,
 )
 def make_definitive_attitude(
@@ -165,15 +158,15 @@ def make_definitive_attitude(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude", Returns("The jobs.", DefinitiveJobList)
+    "GET /spacecraft/{name}/definitive-attitude", Returns("The jobs.", products.DefinitiveJobList)
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     """The jobs of a spacecraft since the start of the service, the newest first."""
-    return json_response(DefinitiveJobList(items=app.definitive.all(name)))
+    return json_response(products.DefinitiveJobList(items=app.definitive.all(name)))
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude/{id}", Returns("The job.", DefinitiveJob)
+    "GET /spacecraft/{name}/definitive-attitude/{id}", Returns("The job.", products.DefinitiveJob)
 )
 def get_definitive_attitude(
     name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep

@@ -15,16 +15,15 @@ from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
-from service.web.requests.access import CallerDep, ChangeDep, require_all_spacecraft
-from service.web.requests.dependencies import AppDep, json_response
-from service.web.requests.query_parameters import FromQuery, Query
-from service.web.requests.request_body import (
-    MAX_JSON_BYTES,
-    JsonBody,
-    Spooled,
-    read_model,
-    telemetry_body,
+from service.web.requests import request_body
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    require_all_spacecraft,
 )
+from service.web.requests.query_parameters import FromQuery, Query
 
 router = ApiRouter("runs and replays")
 
@@ -82,7 +81,7 @@ class ReplayUpload:
     """A telemetry file and the run it goes to."""
 
     query: _ReplayQuery
-    body: Spooled
+    body: request_body.Spooled
 
 
 async def _telemetry(
@@ -93,7 +92,9 @@ async def _telemetry(
         # Like `watch_run`: the run may hold batches of every spacecraft.
         require_all_spacecraft(caller)
         request.state.changes = request.scope["route"].name
-    body = await telemetry_body(request, partial(app.replays.new_upload, caller), discard_upload)
+    body = await request_body.telemetry_body(
+        request, partial(app.replays.new_upload, caller), discard_upload
+    )
     return ReplayUpload(query, body)
 
 
@@ -104,22 +105,26 @@ def list_runs(app: AppDep, caller: CallerDep) -> Response:
 
 
 @router.serves("PUT /runs/{run}", Returns("The run.", RunState), body=RunIn, may_create=True)
-def watch_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
+def watch_run(
+    run: RunPath, body: request_body.JsonBody, app: AppDep, change: ChangeDep
+) -> Response:
     """Switch the alarms of a run on or off; creates the run if it does not exist."""
-    asked = read_model(RunIn, body)
+    asked = request_body.read_model(RunIn, body)
     return json_response(app.runs.watch(run, asked.alarms, change.entry()))
 
 
 @router.serves(
     "POST /runs/{run}/forget", Returns("What is removed, or would be.", Forgotten), body=ForgetIn
 )
-def forget_run(run: RunPath, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
+def forget_run(
+    run: RunPath, body: request_body.JsonBody, app: AppDep, change: ChangeDep
+) -> Response:
     """Remove what was recorded wrongly, with its trends and archived batches; it cannot be undone.
 
     The same batches can be recorded again afterwards. Alarms, events, notes and the audit list
     stay.
     """
-    asked = read_model(ForgetIn, body)
+    asked = request_body.read_model(ForgetIn, body)
     if asked.spacecraft is None:
         require_all_spacecraft(change.caller)
     else:
@@ -159,7 +164,7 @@ def start_replay(
         discard_upload(body.file)
         message = "goes with space packets; a batch names its own spacecraft"
         raise BadBatch(Fault("spacecraft", message, shown_value(query.spacecraft)))
-    form = UploadForm(body.coding, MAX_JSON_BYTES, body.is_packets, query.spacecraft)
+    form = UploadForm(body.coding, request_body.MAX_JSON_BYTES, body.is_packets, query.spacecraft)
     id = app.replays.start_upload(
         body.file,
         form,

@@ -13,11 +13,10 @@ from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.storage.models import spacecraft as models
 from service.storage.models.advice import Advice
 from service.storage.models.answers import Result
-from service.storage.models.overview import About, Overview
+from service.storage.models.spacecraft import About, Overview
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import CallerDep
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, json_response, page_response
 from service.web.requests.exports import (
     THINNED,
     ExportsDep,

@@ -7,14 +7,18 @@ from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.audit import list_entries
-from service.access.tokens import DEFAULT_DAYS, MAX_DAYS, SESSION_H
+from service import access
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
-from service.storage.models.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.web.openapi import LINK, ApiRouter, Returns
-from service.web.requests.access import COOKIE, CallerDep, ChangeDep
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import (
+    COOKIE,
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    json_response,
+    page_response,
+)
 from service.web.requests.query_parameters import AuditQuery, FromQuery
 from service.web.requests.request_body import JsonBody, SessionBody, read_model
 
@@ -28,7 +32,7 @@ class SignIn(Wire):
 
 
 @router.serves(
-    "POST /session", Returns("The signed-in caller.", Session), body=SignIn, problems=(401,)
+    "POST /session", Returns("The signed-in caller.", access.Session), body=SignIn, problems=(401,)
 )
 def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     """Exchange a token for a session cookie (`HttpOnly`, `SameSite=Strict`)."""
@@ -37,7 +41,7 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     response.set_cookie(
         COOKIE,
         secret,
-        max_age=SESSION_H * 3600,
+        max_age=access.SESSION_H * 3600,
         httponly=True,
         samesite="strict",
         secure=request.url.scheme == "https",
@@ -45,13 +49,15 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     return response
 
 
-@router.serves("GET /session", Returns("The caller.", Session))
+@router.serves("GET /session", Returns("The caller.", access.Session))
 def session(caller: CallerDep) -> Response:
     """The caller and its scopes."""
     return json_response(_shown(caller))
 
 
-@router.serves("DELETE /session", Returns("The session has ended.", Session), problems=(401,))
+@router.serves(
+    "DELETE /session", Returns("The session has ended.", access.Session), problems=(401,)
+)
 def sign_out(request: Request, app: AppDep) -> Response:
     """End the browser's session."""
     cookie = request.cookies.get(COOKIE)
@@ -74,14 +80,14 @@ class TokenIn(Wire):
             examples=["pipeline"],
         ),
     ]
-    scopes: Annotated[list[Scope], Field(min_length=1, max_length=3)]
+    scopes: Annotated[list[access.Scope], Field(min_length=1, max_length=3)]
     spacecraft: Annotated[
         list[Key] | None,
         Field(min_length=1, max_length=200, description="Bind it to these; null: all."),
     ] = None
     days: Annotated[
-        int, Field(ge=1, le=MAX_DAYS, strict=True, description="Days until it expires.")
-    ] = DEFAULT_DAYS
+        int, Field(ge=1, le=access.MAX_DAYS, strict=True, description="Days until it expires.")
+    ] = access.DEFAULT_DAYS
     rate_per_s: Annotated[
         float | None, Field(ge=0.001, le=1e6, description="Requests per second; null: no limit.")
     ] = None
@@ -90,15 +96,15 @@ class TokenIn(Wire):
 TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
 
 
-@router.serves("GET /tokens", Returns("All tokens, without their secrets.", TokenList))
+@router.serves("GET /tokens", Returns("All tokens, without their secrets.", access.TokenList))
 def list_tokens(app: AppDep) -> Response:
     """Every token, with its scopes, spacecraft, end and state."""
-    return json_response(TokenList(items=app.tokens.all()))
+    return json_response(access.TokenList(items=app.tokens.all()))
 
 
 @router.serves(
     "POST /tokens",
-    Returns("The token, and its secret this once.", NewToken, status=201),
+    Returns("The token, and its secret this once.", access.NewToken, status=201),
     body=TokenIn,
     problems=(409,),
 )
@@ -111,7 +117,7 @@ def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
 
 
 @router.serves(
-    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(503,)
+    "DELETE /tokens/{token}", Returns("The token that was revoked.", access.Token), problems=(503,)
 )
 def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     """Revoke a token at once, with the browser sessions that were begun with it."""
@@ -120,11 +126,11 @@ def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     return json_response(revoked)
 
 
-@router.serves("GET /audit", Returns("A page of changes.", AuditPage, LINK))
+@router.serves("GET /audit", Returns("A page of changes.", access.AuditPage, LINK))
 def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
     with app.context.reading() as connection:
-        page = list_entries(connection, query.limit, query.cursor)
+        page = access.list_entries(connection, query.limit, query.cursor)
     return page_response(request, page)
 
 

@@ -7,14 +7,19 @@ from pydantic import Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.observations.schema import Key, RunName, Wire
 from service.storage import webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
-from service.web.requests.access import ChangeDep, require_scope
-from service.web.requests.dependencies import AppDep, json_response, page_response
+from service.web.requests.access import (
+    AppDep,
+    ChangeDep,
+    json_response,
+    page_response,
+    require_scope,
+)
 from service.web.requests.query_parameters import Cursor, FromQuery, PageLimit, Query, Time
 from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_model
 

@@ -6,10 +6,9 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.observations.schema import APrioriIn, Key, Wire
-from service.storage.models.overview import Dropped, ZoneCache, ZoneList
+from service.storage.models.spacecraft import Dropped, ZoneCache, ZoneList
 from service.web.openapi import ApiRouter, Returns
-from service.web.requests.access import CallerDep
-from service.web.requests.dependencies import AppDep, json_response
+from service.web.requests.access import AppDep, CallerDep, json_response
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter, Time
 from service.web.requests.request_body import JsonBody, read_model
 

@@ -22,7 +22,7 @@ from starlette.requests import Request
 from starlette.responses import HTMLResponse, Response
 
 from service import __version__, logs
-from service.access.tokens import Caller
+from service.access import Caller
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
@@ -30,11 +30,9 @@ from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc
 from service.web.console.formatting import FILTERS, present
-from service.web.requests import problem_types
-from service.web.requests.access import POLICIES, CallerDep, Policy
-from service.web.requests.dependencies import AppDep
-from service.web.requests.problem_types import ProblemType
-from service.web.requests.problems import faults_in_query, on_http_error, root_path
+from service.web.requests import problems
+from service.web.requests.access import POLICIES, AppDep, CallerDep, Policy
+from service.web.requests.problems import ProblemType, faults_in_query, on_http_error, root_path
 from service.web.requests.query_parameters import FromQuery as FromQuery  # for pages
 from service.web.requests.query_parameters import Query, Run
 
@@ -354,11 +352,11 @@ class PageRoute(APIRoute):
                 return below_path(request, await inner(request))
             except RequestValidationError as error:
                 page = _error_page(
-                    problem_types.PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
+                    problems.PROBLEM_TYPES[BadInput], problem_of_faults(faults_in_query(error))
                 )
                 return below_path(request, page)
             except AcquisitionError as error:
-                if (kind := problem_types.problem_type_of(error)) is problem_types.INTERNAL_ERROR:
+                if (kind := problems.problem_type_of(error)) is problems.INTERNAL_ERROR:
                     raise
                 answer = _error_page(kind, problem_of(error))
                 if isinstance(error, Busy):

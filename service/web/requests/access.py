@@ -1,27 +1,33 @@
-"""Access to routes: which scope each requires, and for which spacecraft.
+"""Access to routes: which scope each requires, and for which spacecraft; what handlers depend on.
 
 `POLICIES` has the policy of every route by its name.  A route without one is
 refused to every caller, so a new route cannot be forgotten.
+
+All dependencies are asynchronous: they never wait for a worker thread, because
+all of them may be busy when a probe arrives.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 from urllib.parse import quote
 
+import msgspec
 from anyio import CapacityLimiter, fail_after
 from anyio.to_thread import run_sync
 from fastapi import Depends
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
+from starlette.responses import Response
 from starlette.types import Scope as HttpScope
 
 from service import logs
-from service.access.audit import Entry
-from service.access.tokens import OPEN_CALLER, Access, Caller
+from service.access import OPEN_CALLER, Access, Caller, Entry, Scope
 from service.app.factory import App
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
-from service.storage.models.access import Scope
+from service.storage.models.base import Page
+from service.web.requests.metrics import Metrics
+from service.web.requests.request_body import JSON
 
 COOKIE = "acquire_session"
 SIGN_IN = "/sign-in"
@@ -369,3 +375,39 @@ async def _require_spacecraft_access(
             raise NotFound(f"there is no batch with the id {id[:80]!r}")
     elif place == "every":
         require_all_spacecraft(caller)
+
+
+_JSON = msgspec.json.Encoder()
+
+
+async def _app(request: Request) -> App:
+    app = request.app.state.app
+    assert isinstance(app, App)
+    return app
+
+
+async def _metrics(request: Request) -> Metrics:
+    metrics = request.app.state.metrics
+    assert isinstance(metrics, Metrics)
+    return metrics
+
+
+AppDep = Annotated[App, Depends(_app)]
+MetricsDep = Annotated[Metrics, Depends(_metrics)]
+
+
+def json_response(
+    content: Any, status: int = 200, headers: dict[str, str] | None = None
+) -> Response:
+    """An answer of plain values."""
+    return Response(_JSON.encode(content), status, headers, media_type=JSON)
+
+
+def page_response(request: Request, page: Page[Any]) -> Response:
+    """A page; where there is another, `Link` leads to it with the same filters."""
+    headers = None
+    if page.next_cursor is not None:
+        following = request.url.include_query_params(cursor=page.next_cursor)
+        headers = {"Link": f'<{following.path}?{following.query}>; rel="next"'}
+    content = {"items": page.items, "next_cursor": page.next_cursor}
+    return json_response(content, headers=headers)

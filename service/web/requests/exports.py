@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from service.access.tokens import Caller
+from service.access import Caller
 from service.errors import Busy, RateLimited
 from service.products.formats import OUTPUT_FORMATS, file_suffix, write_table
 from service.products.tables import Table

@@ -28,7 +28,7 @@ from service.app.factory import App
 from service.ingest.queue import Backlog
 from service.ingest.submit import Recorded
 from service.storage.models.alarms import Alarm
-from service.storage.models.overview import ZoneCache
+from service.storage.models.spacecraft import ZoneCache
 from service.storage.projections.projector import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries

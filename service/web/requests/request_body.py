@@ -21,9 +21,9 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
-from service.observations.faults import faults_of
-from service.observations.readers.decompress import Coding
-from service.web.requests.problem_types import NotJson
+from service.observations.decompress import Coding
+from service.observations.schema import faults_of
+from service.web.requests.problems import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"

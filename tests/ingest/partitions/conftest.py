@@ -41,7 +41,7 @@ def place(tmp_path):
 @pytest.fixture(autouse=True)
 def _small_parts(monkeypatch):
     monkeypatch.setattr(archiving, "MOST_BATCHES", PART)
-    monkeypatch.setattr("service.ingest.partitions.coordinator.MOST_BATCHES", PART)
+    monkeypatch.setattr("service.ingest.partition_coordinator.MOST_BATCHES", PART)
 
 
 def fill(app, place, bodies):

@@ -8,7 +8,7 @@ from contextlib import ExitStack
 import pytest
 
 from service.errors import BadConfiguration
-from service.ingest.partitions import coordinator
+from service.ingest import partition_coordinator
 from service.storage.archive.folder import manifests
 from tests.fresh_databases import sqlite_at
 from tests.ingest.partitions.checks import assert_whole, files_of
@@ -29,7 +29,7 @@ from tests.waiting import wait_until
 __all__ = ["faulty_disk"]
 
 WORKER_KILLS, COORDINATOR_KILLS, FAULTS = 200, 20, 50
-MOST_BATCHES = coordinator.MOST_BATCHES
+MOST_BATCHES = partition_coordinator.MOST_BATCHES
 
 
 @pytest.fixture
@@ -61,7 +61,7 @@ def folders(archived, place, tmp_path, database):
 def undisturbed(folders, opened, monkeypatch):
     """The parts that a single process makes of all, as large as the commands make them."""
     database, place = folders()
-    monkeypatch.setattr(coordinator, "MOST_BATCHES", MOST_BATCHES)
+    monkeypatch.setattr(partition_coordinator, "MOST_BATCHES", MOST_BATCHES)
     app = opened(database=database, archive_folder=place)
     app.runs.reprocess_into_archive("again", place, processes=1)
     app.close()
@@ -130,7 +130,7 @@ def test_a_scheduler_that_goes_is_told_and_the_rest_is_done_without(
 
 @pytest.mark.parametrize("package", ["attitude-acquisition", "numba", "numpy", "pyarrow"])
 def test_a_worker_of_another_version_is_refused(missions, package):
-    from service.ingest.partitions import dask_workers
+    from service.ingest import dask_workers
     from service.ingest.worker_process import WorkerConfig
 
     versions = dask_workers.versions() | {package: "1.0"}

@@ -10,7 +10,7 @@ from msgspec.structs import asdict
 from sqlalchemy import func, select
 
 from service.errors import BadBatch, BadConfiguration, Busy, Conflict
-from service.ingest.partitions import coordinator
+from service.ingest import partition_coordinator
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
 from service.storage.archive import folder
@@ -185,7 +185,7 @@ class _Stopped(Exception):
 @pytest.mark.parametrize("at", ["name_part", "merge", "_take", "restore_newest"])
 def test_what_ends_anywhere_goes_on_and_every_batch_comes_once(archived, place, monkeypatch, at):
     """Before and after each step of every partition in turn."""
-    real = getattr(coordinator, at)
+    real = getattr(partition_coordinator, at)
     calls = 0
     for fails_after in (False, True):
 
@@ -198,11 +198,11 @@ def test_what_ends_anywhere_goes_on_and_every_batch_comes_once(archived, place, 
                 real(*given)
             raise _Stopped
 
-        monkeypatch.setattr(coordinator, at, fail)
+        monkeypatch.setattr(partition_coordinator, at, fail)
         for _ in range(2):
             with pytest.raises(_Stopped):
                 again(archived, place, f"again-{fails_after}")
-    monkeypatch.setattr(coordinator, at, real)
+    monkeypatch.setattr(partition_coordinator, at, real)
     for fails_after in (False, True):
         run = f"again-{fails_after}"
         progress = again(archived, place, run)
@@ -307,7 +307,7 @@ def test_a_damaged_part_ends_it_by_name_and_what_was_done_stays(archived, place)
 def test_an_archive_of_another_database_is_refused(archived, place, tmp_path):
     from service.app.factory import open_app
     from service.settings import Settings
-    from service.storage.upkeep.restoring import PartFilter, restore
+    from service.storage.upkeep.archiving import PartFilter, restore
 
     other = open_app(Settings(database=f"sqlite:///{tmp_path / 'other.db'}", replay_processes=0))
     try:

@@ -16,15 +16,15 @@ from service.vectors import angle_between_deg, matrix_from_quaternion
 from studies.paper_1994.command import run_paper
 from studies.paper_1994.experiments import run_experiments
 from studies.paper_1994.printed import PrintedCounts, the_paper
-from studies.paper_1994.region import (
+from studies.paper_1994.tables import geometric_share, measure, proportion
+from studies.paper_1994.tally import (
     CHI_SQUARE_95,
     Spread,
+    Tally,
     distance_squared,
     is_inside,
     spread,
 )
-from studies.paper_1994.tally import Tally
-from studies.paper_1994.time_tables import geometric_share, measure, proportion
 from studies.paper_1994.views import (
     EPOCH,
     View,

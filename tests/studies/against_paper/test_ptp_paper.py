@@ -15,7 +15,11 @@ from studies.ptp_2015 import tables
 from studies.ptp_2015.command import CASES, run_ptp
 from studies.ptp_2015.comparison import (
     ALGORITHMS,
+    COLUMNS,
     COMPARED,
+    Case,
+    FieldShare,
+    Tally,
     all_projections,
     compare,
     databases,
@@ -26,7 +30,6 @@ from studies.ptp_2015.projections import printed_slope
 from studies.ptp_2015.rivals.liebe import features
 from studies.ptp_2015.rivals.planar_triangle import area_and_moment, area_and_moment_sigma
 from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES
-from studies.ptp_2015.tally import COLUMNS, Case, FieldShare, Tally
 
 PIXEL_RAD = Conditions().camera.pixel_rad
 SCENES = 60

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 
 from service.imaging.centroids.sequential import diffuse
-from studies.star_image_report.correlate import misaligned
+from studies.star_image_report.correlate import (
+    FIELD,
+    SIGMA_PX,
+    align,
+    correlation_of_field,
+    field_image,
+    misaligned,
+)
 from studies.star_image_report.measurements import (
     HUMP,
     SIGMA,
@@ -19,14 +26,7 @@ from studies.star_image_report.measurements import (
     spreads_along,
 )
 from studies.star_image_report.optics import DIAMETER_M, LASER_M
-from studies.star_image_report.rotation import (
-    FIELD,
-    SIGMA_PX,
-    align,
-    correlation_of_field,
-    field_image,
-)
-from studies.star_image_report.sun_acquisition import ThreeDetectors
+from studies.star_image_report.sun_tracker import ThreeDetectors
 from studies.star_image_report.wires_and_lines import (
     THICK_M,
     THIN_M,

@@ -23,7 +23,7 @@ from service.web.console.page import (
 )
 from service.web.openapi import SCHEMAS
 from service.web.requests.access import OPEN
-from service.web.requests.problem_types import types_with_pages
+from service.web.requests.problems import types_with_pages
 
 
 @console_page("/docs", "API", OPEN)

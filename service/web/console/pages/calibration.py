@@ -1,20 +1,155 @@
-"""The page of a spacecraft's calibration: what was found, what it would change, what holds."""
+"""The page of a spacecraft's calibration: what was found, what it would change, what holds.
 
-from collections.abc import Callable, Sequence
+Its chart shows the parameters of trackers over the versions of a calibration, with their sigmas.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
-from service.app.calibration_estimates import CALIBRATION_SAMPLE
-from service.calibration.unknowns import LARGEST_DEGREE
+from service.app.calibration_estimates import CALIBRATION_SAMPLE, geometry_of
+from service.calibration.linearise import LARGEST_DEGREE
+from service.calibration.magnitudes import COLOR, SCALE
 from service.errors import NotFound
-from service.storage.calibrations import Calibration, CalibrationSummary
+from service.missions.mission import AS_MEASURED, Mission
+from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
+from service.storage.calibrations import Calibration, CalibrationSummary, TrackerGeometry
 from service.storage.recording.unsaved_result import LIVE
-from service.web.console.charts.calibration_history import parameter_histories
+from service.times import parse_utc
+from service.vectors import ARCSEC_PER_RADIAN
 from service.web.console.charts.focal_plane import residual_pictures
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
+
+WIDTH, HEIGHT, PAD = 420.0, 96.0, 10.0
+SIGMAS = 1.0
+STAR_MAG = 5.0
+"""V of the star, of a Sun-like colour, by which zero points are compared."""
+
+
+@dataclass(frozen=True)
+class Point:
+    """One version's value; `low` and `high` are the ends of its error bar."""
+
+    version: int
+    time: str
+    value: float
+    sigma: float
+    x: float = 0.0
+    y: float = 0.0
+    low: float = 0.0
+    high: float = 0.0
+
+
+@dataclass(frozen=True)
+class ParameterHistory:
+    """A parameter by the time of its batches; `top` and `bottom` are the ends of the chart."""
+
+    name: str
+    unit: str
+    points: tuple[Point, ...]
+    top: float
+    bottom: float
+    width: float = WIDTH
+    height: float = HEIGHT
+
+    @property
+    def line(self) -> str:
+        """The path through all points."""
+        places = (f"{each.x:.1f} {each.y:.1f}" for each in self.points)
+        return "M" + "L".join(places)
+
+
+def parameter_histories(
+    versions: Sequence[CalibrationSummary], file: Mission
+) -> list[ParameterHistory]:
+    """Alignment, scale and magnitudes by the mission file's, and time tags, of versions done.
+
+    All are counted from the same settings, whatever was in force when they were estimated.
+    """
+    found: dict[tuple[str, str], list[Point]] = {}
+    for each in versions:
+        if each.state == "done" and each.first is not None:
+            for name, unit, point in _points(each, file):
+                found.setdefault((name, unit), []).append(point)
+    return [_drawn(name, unit, points) for (name, unit), points in sorted(found.items())]
+
+
+def _points(found: CalibrationSummary, file: Mission) -> Iterator[tuple[str, str, Point]]:
+    own = {each.name: each for each in found.trackers}
+    files = {each.name: each for each in file.trackers}
+    files_geometry = [geometry_of(each) for each in file.trackers]
+    for each in found.unknowns:
+        if each.tracker not in own or each.tracker not in files:
+            continue
+        if each.kind == "alignment":
+            turned = _turned_arcsec(own[each.tracker], files[each.tracker].body_from_tracker)
+            value = turned["xyz".index(each.name[-1])]
+        elif each.kind == "scale":
+            value = own[each.tracker].calibration.scale - files[each.tracker].calibration.scale
+        elif each.kind == "time_tag":
+            value = each.value
+        elif each.kind == "magnitude":
+            value = _of_magnitudes(each.name, found.trackers, each.tracker)
+            value -= _of_magnitudes(each.name, files_geometry, each.tracker)
+        else:
+            continue
+        point = Point(found.version, found.first or "", value, each.sigma)
+        yield each.name, "" if each.unit == "1" else each.unit, point
+
+
+def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str) -> float:
+    """What settings say of a tracker: how much fainter it measures a star of `STAR_MAG`, how many
+    magnitudes it measures for one of the catalog, or its colour term.
+    """
+    own = {each.name: each.magnitudes or AS_MEASURED for each in trackers}
+    if name.endswith(COLOR):
+        return own[tracker].color_mag
+    if name.endswith(SCALE):
+        return 1.0 / own[tracker].scale
+    color_mag = sum(each.color_mag for each in own.values()) / len(own)
+    instrument_mag = STAR_MAG + color_mag * UNKNOWN_COLOR_BV_MAG
+    return (instrument_mag - own[tracker].zero_mag) / own[tracker].scale
+
+
+def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:
+    """The rotation about the body axes from one alignment to another; small angles."""
+    axes = [tracker.x_axis_body, tracker.y_axis_body, tracker.z_axis_body]
+    turn = np.column_stack(axes) @ before.T
+    vector = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+    return [float(part) / 2.0 * ARCSEC_PER_RADIAN for part in vector]
+
+
+def _drawn(name: str, unit: str, points: Sequence[Point]) -> ParameterHistory:
+    ordered = sorted(points, key=lambda each: (each.time, each.version))
+    top = max(each.value + SIGMAS * each.sigma for each in ordered)
+    bottom = min(each.value - SIGMAS * each.sigma for each in ordered)
+    times = np.array([parse_utc(each.time).tai_ns for each in ordered], dtype=float)
+    # Versions of one stretch would lie upon each other.
+    places = times if len(set(times)) == len(times) else np.arange(float(len(times)))
+    spread = places[-1] - places[0]
+    xs = (places - places[0]) / spread if spread else np.full(len(places), 0.5)
+
+    def y_of(value: float) -> float:
+        part = (value - bottom) / (top - bottom) if top > bottom else 0.5
+        return HEIGHT - PAD - part * (HEIGHT - 2.0 * PAD)
+
+    drawn = tuple(
+        replace(
+            each,
+            x=PAD + float(x) * (WIDTH - 2.0 * PAD),
+            y=y_of(each.value),
+            low=y_of(each.value - SIGMAS * each.sigma),
+            high=y_of(each.value + SIGMAS * each.sigma),
+        )
+        for each, x in zip(ordered, xs, strict=True)
+    )
+    return ParameterHistory(name, unit, drawn, top, bottom)
+
 
 SHOWN = 50
 CERTAIN_SIGMAS = 3.0

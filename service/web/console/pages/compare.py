@@ -13,17 +13,12 @@ from starlette.responses import Response
 from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.compare import Comparison
+from service.storage.models.runs import Comparison
 from service.times import DAY_S, parse_utc, recorded_utc, unix_seconds, utc_now
 from service.vectors import Vector
 from service.web.api.batches import COMPARISON_S, SampleSize
+from service.web.console import options
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.options import (
-    asked_options,
-    faults_of_form,
-    fields_of,
-    settings_of_mission,
-)
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import READ, Policy
 
@@ -69,7 +64,7 @@ async def _query(request: Request) -> CompareQuery:
     try:
         return CompareQuery.model_validate(plain)
     except ValidationError as error:
-        raise BadBatch(faults_of_form(error)) from None
+        raise BadBatch(options.faults_of_form(error)) from None
 
 
 @console_page("/compare", "Compare", Policy("read", "nothing"), position=40)
@@ -86,7 +81,7 @@ def compare_page(
     if pair is not None and (query.other is not None or query.spacecraft is None):
         runs = context.app.runs.compare_latest(*pair, start, end)
         rates = context.app.runs.rates(*pair, start, end)
-    asked = {side: asked_options(request.query_params, f"{side}.") for side in SIDES}
+    asked = {side: options.asked_options(request.query_params, f"{side}.") for side in SIDES}
     result = None
     if query.spacecraft is not None and query.other is None:
         context.caller.require(query.spacecraft)
@@ -115,8 +110,8 @@ def compare_page(
         rate_trends=rates and _drawn(rates.cell_s, [each.shares for each in rates.runs]),
         most_compared=MOST_COMPARED,
         spacecraft=context.spacecraft,
-        forms={side: fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
-        now={} if mission is None else settings_of_mission(mission),
+        forms={side: options.fields_of(asked[side], None, f"{side}.", mission) for side in SIDES},
+        now={} if mission is None else options.settings_of_mission(mission),
         result=result,
         trends=result and _drawn(result.cell_s, _shares(result)),
         sides=SIDES,

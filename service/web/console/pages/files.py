@@ -13,12 +13,7 @@ from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products.attitudes import AttitudeSeries, ProductGrade
 from service.products.formats import attitude_formats, table_formats
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
-from service.web.console.pages.spacecraft import (
-    RANGES_S,
-    ShownPeriod,
-    SpacecraftQuery,
-    shown_period,
-)
+from service.web.console.pages import spacecraft
 from service.web.requests.access import Policy
 
 GRADES: dict[ProductGrade, str] = {
@@ -34,7 +29,7 @@ FEW_PER_STRETCH = 10
 """A file whose stretches have fewer attitudes than that is hardly of use for interpolation."""
 
 
-class FilesQuery(SpacecraftQuery):
+class FilesQuery(spacecraft.SpacecraftQuery):
     """The period, and the largest gap within a stretch; empty: that of the mission or cadence."""
 
     gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
@@ -69,7 +64,7 @@ class GradeOfFile:
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
     """Attitudes of a period as files of every grade and format, and its tables."""
     context.app.context.mission(name)
-    shown = shown_period(context, name, query)
+    shown = spacecraft.shown_period(context, name, query)
 
     def address(product: str, format: str, **more: str) -> str:
         assert shown is not None
@@ -89,7 +84,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
         name=name,
         query=query,
         stretch=shown,
-        ranges=list(RANGES_S),
+        ranges=list(spacecraft.RANGES_S),
         grades=_grades(context, name, query, shown) if shown else [],
         attitude_formats=attitude_formats(),
         formats=table_formats(),
@@ -100,7 +95,7 @@ def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> 
 
 
 def _grades(
-    context: PageContext, name: str, query: FilesQuery, shown: ShownPeriod
+    context: PageContext, name: str, query: FilesQuery, shown: spacecraft.ShownPeriod
 ) -> list[GradeOfFile]:
     found = []
     for grade, what in GRADES.items():

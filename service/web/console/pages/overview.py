@@ -13,15 +13,8 @@ from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, parse_utc, shifted
 from service.vectors import Matrix
+from service.web.console import page
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
-from service.web.console.page import (
-    ContextDep,
-    FromQuery,
-    PageContext,
-    SortedQuery,
-    alarm_counts,
-    console_page,
-)
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
@@ -50,7 +43,7 @@ def share_names() -> tuple[str, ...]:
     return tuple(name for name, each in QUANTITIES.items() if each.is_share)
 
 
-class OverviewQuery(SortedQuery):
+class OverviewQuery(page.SortedQuery):
     """Which rows, in which order, over which period."""
 
     period: Period = "day"
@@ -114,8 +107,8 @@ def _is_long(seconds: float | None) -> bool:
     return seconds is not None and seconds > STALE_AFTER_S
 
 
-@console_page("/", "Overview", Policy("read", "nothing"), position=10)
-def overview_page(query: FromQuery[OverviewQuery], context: ContextDep) -> Response:
+@page.console_page("/", "Overview", Policy("read", "nothing"), position=10)
+def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
     fleet = context.app.spacecraft.fleet(
         context.spacecraft, query.run, query.period, context.caller.spacecraft
@@ -141,12 +134,12 @@ def overview_page(query: FromQuery[OverviewQuery], context: ContextDep) -> Respo
         periods=list(PERIODS_S),
         shown=SHOWN,
         heat=_heat(fleet, lines, shares, query.period),
-        alarms=alarm_counts([each for line in every for each in line.item.alarms]),
+        alarms=page.alarm_counts([each for line in every for each in line.item.alarms]),
         webhooks=_webhooks_in_trouble(context),
     )
 
 
-def _webhooks_in_trouble(context: PageContext) -> list[str]:
+def _webhooks_in_trouble(context: page.PageContext) -> list[str]:
     """The webhooks that do not deliver, in words, for who may see their page."""
     if context.caller.spacecraft is not None or "operate" not in context.caller.scopes:
         return []

@@ -8,9 +8,8 @@ from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
 from service.storage.queries.period import TrackerStarsOfPeriod
 from service.web.console.charts.all_sky import all_sky_chart
-from service.web.console.charts.attitude import attitude_charts
 from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
-from service.web.console.charts.grades import grade_charts, innovation_charts
+from service.web.console.charts.grades import attitude_charts, grade_charts, innovation_charts
 from service.web.console.charts.histogram import (
     Histogram,
     MagnitudeChart,

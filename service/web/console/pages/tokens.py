@@ -5,8 +5,7 @@ from typing import Annotated
 from pydantic import Field
 from starlette.responses import Response
 
-from service.access.audit import list_entries
-from service.access.tokens import MAX_DAYS, SCOPES
+from service.access import MAX_DAYS, SCOPES, list_entries
 from service.storage.recording.events import EVENT_KINDS
 from service.web.console.page import (
     EMPTY_LAYOUT,

@@ -1,9 +1,10 @@
-"""Access tokens: create, list, revoke; and callers by token or session, with their rates.
+"""Access: tokens, callers by token or session with their rates, and the audit list.
 
 A token is 32 random bytes behind `acq_`.  The database keeps its SHA-256 alone:
 nothing can be guessed of that many random bits, so no slower digest is needed.
 Until the first token is made, access on a loopback address is open.  Callers are
 cached for a second, so a revocation takes effect in every process within a second.
+The audit list says who changed what; entries are only added.
 """
 
 import hashlib
@@ -15,11 +16,10 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Any, Protocol, get_args
+from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
-from service.access.audit import Entry
 from service.errors import (
     BadInput,
     Busy,
@@ -32,10 +32,109 @@ from service.errors import (
     shown_value,
 )
 from service.missions.mission import Mission, mission_named
-from service.storage.models.access import NewToken, Scope, Token, TokenState
+from service.storage.models.base import Id, Page, Record, Stamp, doc, list_record, page_record
 from service.storage.recording.ids import Ulids
-from service.storage.sql.access_tables import access_sessions, access_tokens
+from service.storage.sql.columns import Row
+from service.storage.sql.tables import access_sessions, access_tokens, audit
 from service.times import DAY_S, Utc, shifted, utc_now
+
+Scope = Literal["read", "submit", "operate"]
+
+
+class Session(Record, frozen=True, kw_only=True):
+    """The caller and its scopes."""
+
+    name: str | None
+    """The token's name, which the audit list records with each change."""
+    scopes: list[Scope]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
+
+
+TokenState = Literal["good", "expired", "revoked"]
+
+
+class Token(Record, frozen=True, kw_only=True):
+    """A token without its secret, of which only a digest is stored."""
+
+    name: Annotated[str, doc("The audit list records changes under it; never used again.")]
+    scopes: list[Scope]
+    spacecraft: list[str] | None
+    """Spacecraft that the token is bound to; null: all."""
+    rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
+    created: Stamp
+    expires: Stamp
+    revoked: Stamp | None
+    state: TokenState
+
+
+class NewToken(Token, frozen=True, kw_only=True):
+    """A new token with its secret, which is shown this once."""
+
+    token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
+
+
+TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
+
+
+class AuditEntry(Record, frozen=True, kw_only=True):
+    """One change."""
+
+    component: ClassVar[str] = "AuditRow"
+    id: Id
+    moment: Stamp
+    who: Annotated[str, doc("The token's name; `local` while access is open.")]
+    action: Annotated[str, doc("The operation's name in this description.")]
+    about: Annotated[str, doc("Path and query of the request.")]
+    body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
+    status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
+
+
+AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")
+
+
+MAX_BODY_KEPT = 4_000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One entry: who did what to what, with what body, and the status of the answer.
+
+    Handed to the operation that makes the change, it becomes part of the change's own
+    transaction: neither is stored without the other.
+    """
+
+    id: str
+    moment: str
+    who: str
+    action: str
+    about: str
+    body: str | None = None
+    status: int | None = None
+
+    def row(self) -> Row:
+        """The entry as a row of the table, its body shortened."""
+        return vars(self) | {"body": _kept(self.body)}
+
+    def add_to(self, connection: Connection) -> None:
+        """Add the entry to the list."""
+        connection.execute(insert(audit).values(self.row()))
+
+
+def _kept(body: str | None) -> str | None:
+    if body is None or len(body) <= MAX_BODY_KEPT:
+        return body
+    return body[: MAX_BODY_KEPT - 1] + "…"
+
+
+def list_entries(connection: Connection, limit: int, cursor: str | None) -> Page[AuditEntry]:
+    """The entries, newest first; a cursor is the id of the last one shown."""
+    query = select(audit).order_by(audit.c.id.desc()).limit(limit + 1)
+    if cursor is not None:
+        query = query.where(audit.c.id < cursor)
+    rows = [AuditEntry(**row) for row in connection.execute(query).mappings()]
+    return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)
 

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from service.csv_cells import original
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.observations.readers.decompress import MAX_LINE_BYTES, Line, physical_lines
+from service.observations.decompress import MAX_LINE_BYTES, Line, physical_lines
 from service.times import parse_utc
 
 # The sums of the lines of a raster are one cell, and larger than the module's own limit.

@@ -1,7 +1,11 @@
-"""Attitude Data Messages of CCSDS 504.0-B-2: AEM, APM and ACM, as KVN and XML.
+"""Messages of CCSDS as KVN and XML: of attitudes (AEM, APM, ACM; 504.0-B-2), and of tracks (TDM).
 
 A message is written from pairs of keyword and value, in order; the keyword `COMMENT` may
 be repeated.  Both forms take the same pairs.
+
+A TDM (version 2, KVN alone) gives right ascensions and declinations of tracked objects, a
+segment for each object.  Angles are as seen from the spacecraft, aberration removed, in
+EME2000; a time is that of the point itself.
 """
 
 import math
@@ -422,3 +426,61 @@ def write_apm(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
             "ANGVEL_STOP\n",
         ]
     yield "".join(parts).encode()
+
+
+REFERENCE_FRAME = "EME2000"
+
+
+@dataclass(frozen=True)
+class TrackedObject:
+    """An object with its points, in order of time: UTC, degrees, magnitudes where known.
+
+    `comments` are comments on it.
+    """
+
+    name: str
+    comments: Sequence[str]
+    time: Sequence[str]
+    ra_deg: Sequence[float]
+    dec_deg: Sequence[float]
+    magnitude: Sequence[float | None]
+
+
+def write_tdm(
+    observer: str, run: str, created: str, version: str, objects: Sequence[TrackedObject]
+) -> Iterator[bytes]:
+    """Write a message: `observer` is the spacecraft that saw the objects."""
+    opening: Pairs = [
+        ("CCSDS_TDM_VERS", "2.0"),
+        ("COMMENT", f"Written by attitude-acquisition {one_line(version)}"),
+        ("COMMENT", f"Run {one_line(run)}; points that no catalog star explains"),
+        ("CREATION_DATE", time_text(created)),
+        ("ORIGINATOR", ORIGINATOR),
+    ]
+    yield kvn(opening).encode()
+    for each in objects:
+        yield _segment(observer, each).encode()
+
+
+def _segment(observer: str, tracked: TrackedObject) -> str:
+    order = sorted(range(len(tracked.time)), key=tracked.time.__getitem__)
+    times = [time_text(tracked.time[k]) for k in order]
+    metadata: Pairs = [
+        *(("COMMENT", one_line(each)) for each in tracked.comments),
+        ("TIME_SYSTEM", TIME_SYSTEM),
+        ("START_TIME", times[0]),
+        ("STOP_TIME", times[-1]),
+        ("PARTICIPANT_1", one_line(observer)),
+        ("PARTICIPANT_2", one_line(tracked.name)),
+        ("MODE", "SEQUENTIAL"),
+        ("PATH", "2,1"),
+        ("ANGLE_TYPE", "RADEC"),
+        ("REFERENCE_FRAME", REFERENCE_FRAME),
+    ]
+    lines = []
+    for k, time in zip(order, times, strict=True):
+        lines.append(f"ANGLE_1 = {time} {tracked.ra_deg[k]!r}\n")
+        lines.append(f"ANGLE_2 = {time} {tracked.dec_deg[k]!r}\n")
+        if tracked.magnitude[k] is not None:
+            lines.append(f"MAG = {time} {tracked.magnitude[k]!r}\n")
+    return f"\nMETA_START\n{kvn(metadata)}META_STOP\n\nDATA_START\n{''.join(lines)}DATA_STOP\n"

@@ -16,10 +16,9 @@ from pathlib import Path
 from typing import Any, BinaryIO, Literal
 
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.observations.readers.csv_columns import COLUMNS, BadCell, number_cell
-from service.observations.readers.csv_rows import BATCH_ROWS, BatchRows, JoinedRows, joined_lines
-from service.observations.readers.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
-from service.observations.readers.decompress import Line, physical_lines
+from service.observations import csv_rows
+from service.observations.csv_table import SEPARATORS, CsvRow, CsvTable, RowKind
+from service.observations.decompress import Line, physical_lines
 from service.times import parse_utc
 
 TelemetryFormat = Literal["ndjson", "csv"]
@@ -44,9 +43,9 @@ def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> 
     form = form or (telemetry_format(source) if isinstance(source, Path) else "ndjson")
     with _opened(source, form) as stream:
         if form == "csv":
-            table = CsvTable(stream, (BATCH_ROWS, GYRO_ROWS))
-            kind = BlockRows if table.kind is GYRO_ROWS else BatchRows
-            yield from joined_lines(table.rows(), kind)
+            table = CsvTable(stream, (csv_rows.BATCH_ROWS, GYRO_ROWS))
+            kind = BlockRows if table.kind is GYRO_ROWS else csv_rows.BatchRows
+            yield from csv_rows.joined_lines(table.rows(), kind)
         else:
             yield from physical_lines(stream)
 
@@ -91,7 +90,7 @@ def _not_telemetry(start: bytes, form: TelemetryFormat) -> str | None:
     if any(line.startswith(b"{") for line in lines):
         return None
     names = re.split('[{}"]+'.format("".join(SEPARATORS)), lines[0].decode("utf-8", "replace"))
-    if len({name.strip().lower() for name in names} & {*COLUMNS, *GYRO_ROWS.columns}) > 1:
+    if len({name.strip().lower() for name in names} & {*csv_rows.COLUMNS, *GYRO_ROWS.columns}) > 1:
         return "is no NDJSON but looks like CSV: name it .csv"
     return "is no NDJSON, which has one batch a line as a JSON object"
 
@@ -141,7 +140,7 @@ GYRO_COLUMNS = (*KEY, "time", *RATES)
 MAX_ROWS = 10_000
 
 
-class BlockRows(JoinedRows):
+class BlockRows(csv_rows.JoinedRows):
     """The rows of one gyro block, a sample a row."""
 
     key_columns = KEY
@@ -157,15 +156,15 @@ class BlockRows(JoinedRows):
     def take(self, row: CsvRow) -> None:
         """Take the cells of a row; raises `BadCell`."""
         if len(self.rates) == MAX_ROWS:
-            raise BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
+            raise csv_rows.BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
         try:
             time = parse_utc(row["time"])
         except BadInput as error:
-            raise BadCell("time", error.faults[0].message, row["time"]) from None
+            raise csv_rows.BadCell("time", error.faults[0].message, row["time"]) from None
         if not self.rates:
             self.start, self.start_ns = time.text, time.tai_ns
         self.times_s.append((time.tai_ns - self.start_ns) * 1e-9)
-        self.rates.append([number_cell(row, column) for column in RATES])
+        self.rates.append([csv_rows.number_cell(row, column) for column in RATES])
 
     def body(self) -> Mapping[str, Any]:
         """The JSON object of the block."""

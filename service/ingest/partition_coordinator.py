@@ -18,7 +18,7 @@ import pyarrow as pa
 from sqlalchemy import ColumnElement, Connection, func, select
 
 from service.errors import BadBatch, Fault, shown_value
-from service.ingest.partitions.tasks import (
+from service.ingest.partition_tasks import (
     PartitionResult,
     PartitionTask,
     Source,
@@ -44,8 +44,7 @@ from service.storage.archive.folder import (
     manifests,
 )
 from service.storage.archive.reading import Archive, PlacedPart, parts_between
-from service.storage.queries.pages import PLACE, Place, ResultFilter
-from service.storage.queries.with_archive import bounds_of
+from service.storage.queries.pages import PLACE, Place, ResultFilter, bounds_of
 from service.storage.recording.identity import look_up
 from service.storage.sql.tables import batches, results, rollups_daily
 from service.storage.store import Store

@@ -21,14 +21,7 @@ from service import __version__
 from service.acquire.prewarm import prewarm_kernels
 from service.errors import BadConfiguration, BadInput, Fault
 from service.extras import require_extra
-from service.ingest.partitions.tasks import (
-    Outcome,
-    PartitionResult,
-    PartitionTask,
-    Wait,
-    attempt,
-    result_of,
-)
+from service.ingest import partition_tasks
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole
@@ -96,7 +89,7 @@ class DaskWorkers:
         """How many tasks should be begun before the first of them is taken."""
         return max(FEWEST_PENDING, PENDING_A_WORKER * self.workers)
 
-    def submit(self, task: PartitionTask) -> Wait:
+    def submit(self, task: partition_tasks.PartitionTask) -> partition_tasks.Wait:
         """Queue a task."""
         # Its file is what it is done for: a result that is known from before would not make one.
         future = self._client.submit(
@@ -105,8 +98,10 @@ class DaskWorkers:
         self._unfinished.add(future)
         return self._wait(future, task)
 
-    def _wait(self, future: Any, task: PartitionTask) -> Callable[[float], PartitionResult | None]:
-        def wait(seconds: float) -> PartitionResult | None:
+    def _wait(
+        self, future: Any, task: partition_tasks.PartitionTask
+    ) -> Callable[[float], partition_tasks.PartitionResult | None]:
+        def wait(seconds: float) -> partition_tasks.PartitionResult | None:
             try:
                 outcome = future.result(timeout=seconds)
             except TimeoutError:
@@ -120,11 +115,13 @@ class DaskWorkers:
                 # Of the scheduler: workers died over it, or it is gone itself.
                 raise self._gone(task, error) from None
             self._unfinished.discard(future)
-            return result_of(outcome)
+            return partition_tasks.result_of(outcome)
 
         return wait
 
-    def _gone(self, task: PartitionTask, error: BaseException | None = None) -> BadConfiguration:
+    def _gone(
+        self, task: partition_tasks.PartitionTask, error: BaseException | None = None
+    ) -> BadConfiguration:
         why = "the scheduler is gone" if error is None else f"{type(error).__name__}: {error}"
         return BadConfiguration(
             f"--scheduler: {self._address}: {task.target.name}: {why}; to go on, run the command "
@@ -167,7 +164,9 @@ def versions() -> dict[str, str]:
     }
 
 
-def do_task(config: bytes, expected: dict[str, str], task: PartitionTask) -> Outcome:
+def do_task(
+    config: bytes, expected: dict[str, str], task: partition_tasks.PartitionTask
+) -> partition_tasks.Outcome:
     """Do a task in a worker, whose versions and catalog must be those of the command."""
     for package, version in versions().items():
         if expected[package] != version:
@@ -177,7 +176,7 @@ def do_task(config: bytes, expected: dict[str, str], task: PartitionTask) -> Out
             )
     if not task.folder.is_dir():
         raise BadConfiguration(f"{task.folder}: a worker has no such folder: mount it there")
-    return attempt(_solver_of(config), task)[0]
+    return partition_tasks.attempt(_solver_of(config), task)[0]
 
 
 def _solver_of(config: bytes) -> Solver:

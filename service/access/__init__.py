@@ -1,1 +1,0 @@
-"""Tokens, sessions, rate limits, and the audit list."""

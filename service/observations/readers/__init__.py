@@ -1,1 +1,0 @@
-"""Telemetry files and request bodies as lines, each one batch."""
