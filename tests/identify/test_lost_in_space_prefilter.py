@@ -9,7 +9,7 @@ import pytest
 from service.attitude.covariance import within
 from service.identify.lost_in_space.decision import LARGEST_SIGMA_RAD
 from service.identify.lost_in_space.pair_order import rows_of_magnitude
-from service.identify.lost_in_space.prefilter import candidates_of
+from service.identify.lost_in_space.prefilter import pairs_of
 from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
 from service.identify.lost_in_space.workspace import CHUNK, Chunk
 from service.simulate.scenes import Conditions, SceneSky, draw_random_points, draw_scenes
@@ -29,10 +29,11 @@ def index(sky):
 @pytest.fixture
 def chunk():
     return Chunk(
-        np.empty((2, CHUNK), np.int32),
         np.empty((6, CHUNK), np.float32),
         np.empty(CHUNK, np.int32),
+        np.empty((2, CHUNK), np.int32),
         np.empty(CHUNK, np.int32),
+        np.empty(2 * CHUNK, np.int32),
     )
 
 
@@ -59,15 +60,20 @@ def test_candidates_are_all_pairs_of_a_run_both_ways_round(index, chunk, rng):
         rows_i, rows_j = (tuple(sorted(rng.integers(0, 9000, 2).tolist())) for _ in range(2))
         found, at = [], start
         while at < end:
-            count, at = candidates_of(arrays.pairs, arrays.place, at, end, rows_i, rows_j, chunk)
-            assert count <= CHUNK
-            for q in range(count):
-                a, b = chunk.rows[:, q]
-                found.append((int(a), int(b)))
-                assert np.array_equal(chunk.places[:3, q], arrays.place[a, :3])
-                assert np.array_equal(chunk.places[3:, q], arrays.place[b, :3])
+            count = min(CHUNK, end - at)
+            candidates = pairs_of(arrays.pairs, arrays.place, at, count, rows_i, rows_j, chunk)
+            assert candidates == sum(int(bits).bit_count() for bits in chunk.allowed[:count])
+            for q, pair in enumerate(arrays.pairs[at : at + count].tolist()):
+                found += [
+                    pair[::-1] if turned else pair
+                    for turned in (0, 1)
+                    if chunk.allowed[q] >> turned & 1
+                ]
+                assert np.array_equal(chunk.places[:3, q], arrays.place[pair[0], :3])
+                assert np.array_equal(chunk.places[3:, q], arrays.place[pair[1], :3])
+            at += count
         expected = [
-            (a, b)
+            [a, b]
             for r, s in arrays.pairs[start:end].tolist()
             for a, b in ((r, s), (s, r))
             if rows_i[0] <= a < rows_i[1] and rows_j[0] <= b < rows_j[1]

@@ -13,7 +13,7 @@ from service.sky.whole_sky.bitmap import (
     CELLS,
     build_sky_bitmap,
     cell_of,
-    cells_of_candidates,
+    cells_of_pairs,
     cells_of_points,
 )
 from service.sky.whole_sky.index import (
@@ -97,25 +97,28 @@ def test_the_rim_of_a_disc_is_never_denied_in_single_precision_either(rng):
             rim = star * math.cos(radius) + away * math.sin(radius)
             other = unit(np.cross(rim, away))
             pair = np.concatenate([rim.T, other.T]).astype(np.float32)
-            cell = np.empty(len(rim), np.int32)
+            cell = np.empty((2, len(rim)), np.int32)
             scale = np.float32(rng.uniform(0.5, 2.0))
-            cells_of_candidates(len(rim), scale, np.float32(0.0), np.float32(0.0), pair, cell)
-            assert ((bits[cell >> 3] >> (cell & 7)) & 1).all()
+            cells_of_pairs(len(rim), scale, np.float32(0.0), np.float32(0.0), pair, cell)
+            assert ((bits[cell[0] >> 3] >> (cell[0] & 7)) & 1).all()
 
 
 def test_many_points_of_one_candidate_lie_where_one_point_of_many_does(rng):
     pair = np.concatenate([unit(rng.normal(size=(50, 3))).T, unit(rng.normal(size=(50, 3))).T])
     pair = pair.astype(np.float32)
     coefficients = rng.normal(size=(3, 8)).astype(np.float32)
-    of_points, of_candidates = np.empty(8, np.int32), np.empty(50, np.int32)
+    of_points, of_turned = np.empty(8, np.int32), np.empty(8, np.int32)
+    of_candidates = np.empty((2, 50), np.int32)
     for q in range(50):
-        cells_of_points(8, coefficients, pair, q, of_points)
+        cells_of_points(8, coefficients, pair[:3, q], pair[3:, q], of_points)
+        cells_of_points(8, coefficients, pair[3:, q], pair[:3, q], of_turned)
         exact = coefficients.T.astype(float) @ np.array(
             [pair[:3, q], pair[3:, q], np.cross(pair[:3, q].astype(float), pair[3:, q])]
         )
         for s in range(8):
-            cells_of_candidates(50, *coefficients[:, s], pair, of_candidates)
-            assert of_candidates[q] == of_points[s]
+            cells_of_pairs(50, *coefficients[:, s], pair, of_candidates)
+            assert of_candidates[0, q] == of_points[s]
+            assert of_candidates[1, q] == of_turned[s]
             u, v = np.divmod(of_points[s], CELLS)
             expected = np.divmod(cell_of(*exact[s]), CELLS)
             # Beside an edge single precision may fall on the other side of it.

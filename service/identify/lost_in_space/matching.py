@@ -22,7 +22,7 @@ EDGE = 0.985
 """A star is expected in the field only within this share of its half widths."""
 
 
-@njit(nogil=True, error_model="numpy")
+@njit(nogil=True, error_model="numpy", forceinline=True)
 def nearest_stars(  # type: ignore[no-untyped-def]
     cell_place, faces, cell_start, cell_rows, x, y, z, gate, brightest, faintest
 ):

@@ -25,8 +25,9 @@ from service.identify.lost_in_space.pair_order import (
     rows_of_magnitude,
 )
 from service.identify.lost_in_space.predictors import GATE, predict
-from service.identify.lost_in_space.prefilter import candidates_of, possible_of, ranked, stars_near
+from service.identify.lost_in_space.prefilter import pairs_of, possible_of, ranked, stars_near
 from service.identify.lost_in_space.workspace import (
+    CHUNK,
     MAX_DEFERRED,
     MOST_POINTS,
     candidate_in,
@@ -107,6 +108,8 @@ def search(points, index, field, max_work, workspace):  # type: ignore[no-untype
         prefilter_in(workspace),
     )
     counters[:] = 0
+    # Ranks that no point has are worked out too, in vain.
+    prefilter.single[:] = 1.0
     counters[LIMIT] = min(MAX_WORK, max_work)
     fewest = posterior.fewest_stars(points, field.area, field.magnitude_sigma)
     if fewest > n:
@@ -206,15 +209,16 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
     for c in range(first, last + 1):
         at, end = np.int64(index.offset[c, low]), np.int64(index.offset[c, high + 1])
         while at < end:
-            count, at = candidates_of(index.pairs, index.place, at, end, rows_i, rows_j, chunk)
-            counters[WORK] += count
+            upto = min(at + CHUNK, end)
+            count = upto - at
+            counters[WORK] += pairs_of(index.pairs, index.place, at, count, rows_i, rows_j, chunk)
             for left in range(possible_of(index.bits, count, asked, prefilter, chunk)):
-                q = chunk.possible[left]
-                near = stars_near(index.bits, prefilter, plan, chunk.places, q)
+                pair, turned = at + (chunk.possible[left] >> 1), chunk.possible[left] & 1
+                a, b = np.int64(index.pairs[pair, turned]), np.int64(index.pairs[pair, 1 - turned])
+                near = stars_near(index.bits, prefilter, plan, index.place[a], index.place[b])
                 possible = bit_count(near)
                 if possible < plan.further:
                     continue
-                a, b = np.int64(chunk.rows[0, q]), np.int64(chunk.rows[1, q])
                 if possible < plan.strong and counters[DEFERRED] < MAX_DEFERRED:
                     defer(workspace, i, j, a, b, near)
                     continue
@@ -226,6 +230,7 @@ def try_pair(points, index, field, gate_mag, plan, workspace):  # type: ignore[n
                     continue
                 if weigh(points, index, field, gate_mag, i, j, workspace):
                     return ACCEPTED
+            at = upto
             if counters[WORK] > counters[LIMIT]:
                 return AT_BOUND
     return GOING_ON
@@ -259,13 +264,14 @@ def hits_of(points, index, gate_mag, plan, a, b, near, workspace):  # type: igno
     x0, x1, x2 = stars[a, 0], stars[a, 1], stars[a, 2]
     y0, y1, y2 = stars[b, 0], stars[b, 1], stars[b, 2]
     z0, z1, z2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
-    hits = 0
+    hits, left = 0, bit_count(near)
     match[:] = -1
     for s in range(plan.prefiltered):
-        if hits + plan.prefiltered - s < plan.further or hits == plan.strong:
+        if hits + left < plan.further or hits == plan.strong:
             break
         if (near >> s) & 1 == 0:
             continue
+        left -= 1
         k = order[s]
         f, g, h = coefficients[k, 0], coefficients[k, 1], coefficients[k, 2]
         p0, p1, p2 = f * x0 + g * y0 + h * z0, f * x1 + g * y1 + h * z1, f * x2 + g * y2 + h * z2

@@ -19,7 +19,7 @@ LEDGER = 12
 MOST_POINTS = 24
 """Brightest points of which pairs are made."""
 CHUNK = 64
-"""Candidates that are prefiltered at a time."""
+"""Pairs of stars that are prefiltered at a time."""
 MAX_DEFERRED = 4096
 """Candidates of few further points wait until all pairs were tried for one that has more."""
 USUAL_POINTS = 64
@@ -35,10 +35,11 @@ _SHARED = np.dtype(
         ("single", np.float32, (3, RANKS)),
         ("level", np.int32, RANKS),
         ("rank_cell", np.int32, RANKS),
-        ("rows", np.int32, (2, CHUNK)),
         ("places", np.float32, (6, CHUNK)),
-        ("chunk_cell", np.int32, CHUNK),
-        ("possible", np.int32, CHUNK),
+        ("allowed", np.int32, CHUNK),
+        ("chunk_cell", np.int32, (2, CHUNK)),
+        ("seen", np.int32, CHUNK),
+        ("possible", np.int32, 2 * CHUNK),
         ("t", np.float64, (3, 3)),
         ("t_covariance", np.float64, (3, 3)),
         ("matrix", np.float64, (3, 3)),
@@ -152,15 +153,18 @@ class Prefilter(NamedTuple):
 
 
 class Chunk(NamedTuple):
-    """Candidates to be prefiltered together.
+    """Pairs of stars to be prefiltered together, each both ways round: two candidates.
 
-    Their star `rows` (2, CHUNK) and `places` (6, CHUNK), the `cell` (CHUNK,) where a
-    further point is looked for, and which are `possible` (CHUNK,).
+    The `places` (6, CHUNK) of their stars.  Which of the two are `allowed` (CHUNK,) by their
+    magnitudes and which have been `seen` (CHUNK,) to have a star near: a bit for the pair as
+    it is, a second for the pair turned round.  The `cell` (2, CHUNK) where a further
+    point is looked for, and the candidates that are `possible` (2 CHUNK,).
     """
 
-    rows: Any
     places: Any
+    allowed: Any
     cell: Any
+    seen: Any
     possible: Any
 
 
@@ -256,10 +260,11 @@ def chunk_in(workspace):  # type: ignore[no-untyped-def]
     """See `Chunk`."""
     block = workspace.block
     return Chunk(
-        view_into(block, AT.rows, (2, CHUNK), np.int32),
         view_into(block, AT.places, (6, CHUNK), np.float32),
-        view_into(block, AT.chunk_cell, (CHUNK,), np.int32),
-        view_into(block, AT.possible, (CHUNK,), np.int32),
+        view_into(block, AT.allowed, (CHUNK,), np.int32),
+        view_into(block, AT.chunk_cell, (2, CHUNK), np.int32),
+        view_into(block, AT.seen, (CHUNK,), np.int32),
+        view_into(block, AT.possible, (2 * CHUNK,), np.int32),
     )
 
 
