@@ -18,7 +18,7 @@
         └── Stopping          the service is stopping: a later attempt here will fail too
 
 Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
-the status codes are given in `service.web.requests.problem_types`.
+the status codes are given in `service.web.requests.problems`.
 """
 
 from collections.abc import Iterable, Sequence

@@ -10,8 +10,14 @@ from sqlalchemy import Connection
 from service.access import Entry
 from service.alarms import state_machine
 from service.alarms.limits import LimitSettings, Preview, Sample, preview_of, preview_of_gaps
-from service.alarms.quantities import REJECTED, SILENCE, QuantityName, tracker_names
-from service.alarms.subjects import limited_trackers, subject_of
+from service.alarms.quantities import (
+    REJECTED,
+    SILENCE,
+    QuantityName,
+    limited_trackers,
+    subject_of,
+    tracker_names,
+)
 from service.app.context import ALL_RUNS, Context, known_id
 from service.errors import BadBatch, Fault, shown_value
 from service.ingest.solver_pool import mission_in_input

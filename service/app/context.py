@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
 from service.access import Entry
-from service.alarms.subjects import limited_trackers
+from service.alarms.quantities import limited_trackers
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName

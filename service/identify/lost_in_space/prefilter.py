@@ -70,11 +70,11 @@ def possible_of(bits, count, asked, prefilter, chunk):  # type: ignore[no-untype
             *(count, prefilter.single[0, s], prefilter.single[1, s], prefilter.single[2, s]),
             *(chunk.places, cell),
         )
-        some = bits[prefilter.level[s]]
+        marked = bits[prefilter.level[s]]
         for q in range(count):
             c, d = np.uint32(cell[0, q]), np.uint32(cell[1, q])
-            straight = (some[c >> np.uint32(3)] >> (c & np.uint32(7))) & 1
-            turned = (some[d >> np.uint32(3)] >> (d & np.uint32(7))) & 1
+            straight = (marked[c >> np.uint32(3)] >> (c & np.uint32(7))) & 1
+            turned = (marked[d >> np.uint32(3)] >> (d & np.uint32(7))) & 1
             seen[q] |= np.int32(straight) | (np.int32(turned) << np.int32(1))
     left = 0
     for q in range(count):

@@ -15,11 +15,12 @@ from service.attitude.solution import NoAttitude
 from service.compiled.arrays import borrowed_view
 from service.compiled.jit import njit
 from service.identify.lost_in_space import decision, posterior
-from service.identify.lost_in_space.observations import FieldBounds, Points
 from service.identify.lost_in_space.pair_order import magnitude_gate
 from service.identify.lost_in_space.search import MAX_WORK, search
 from service.identify.lost_in_space.workspace import (
     USUAL_POINTS,
+    FieldBounds,
+    Points,
     Workspace,
     ledger_in,
     order_in,
@@ -251,10 +252,10 @@ def _searched(n, store, field, max_work, block, matrices, star):  # type: ignore
     workspace = Workspace(block, n)
     points, ledger = points_in(workspace), ledger_in(workspace)
     count, work, bounded = search(points, index, field, max_work, workspace)
-    told = _decided(n, count, work, bounded, workspace, matrices, star)
-    code, log_odds, matched, _, _ = told
+    decided = _decided(n, count, work, bounded, workspace, matrices, star)
+    code, log_odds, matched, _, _ = decided
     if code != decision.FOUND or log_odds > NO_MIRROR_ABOVE or n - matched < 2:
-        return told
+        return decided
     # Stars that lie alike on both sides of a line are found in a mirror too, though not all others.
     weight = ledger.weight[:count].max()
     for k in range(n):

@@ -12,7 +12,6 @@ import numpy as np
 
 from service.compiled.arrays import view_into
 from service.compiled.jit import njit
-from service.identify.lost_in_space.observations import Points
 
 LEDGER = 12
 """Attitudes that are remembered, the heaviest."""
@@ -84,6 +83,36 @@ def _offsets(layout: np.dtype[Any]) -> Any:
 
 AT, POINT_AT = _offsets(_SHARED), _offsets(_OF_A_POINT)
 SHARED_BYTES, POINT_BYTES = _SHARED.itemsize, _OF_A_POINT.itemsize
+
+
+class Points(NamedTuple):
+    """The observed points (n), brightest first, in the tracker's axes, +Z the boresight.
+
+    Magnitudes may be NaN.  Sigmas are one standard deviation per tangent axis,
+    radians.  `velocity` of the observer in inertial axes, in units of c, is
+    zero where aberration is not to be corrected.
+    """
+
+    observed: Any
+    magnitude: Any
+    sigma: Any
+    velocity: Any
+
+
+class FieldBounds(NamedTuple):
+    """The field of view: within a cosine of the boresight, and within two tangents.
+
+    `area` is its solid angle, `limit_mag` the faintest star that the tracker
+    shows, NaN where that is not known, `magnitude_sigma` what a magnitude is
+    off by at random.
+    """
+
+    cos_radius: Any
+    tan_x: Any
+    tan_y: Any
+    area: Any
+    limit_mag: Any
+    magnitude_sigma: Any
 
 
 class Ledger(NamedTuple):

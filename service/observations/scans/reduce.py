@@ -24,7 +24,6 @@ from service.observations.scans.lines import BREAKDOWN_RATIO, cross_scan
 from service.observations.scans.raster import raster_stars
 from service.vectors import Vector, read_only, rotate_about, unit
 
-_GIVES = {CrossScan: "counts", Sweep: "times", Raster: "lines"}
 _FIELDS = {"counts": "h_counts", "times": "h_times"}
 _ROUNDS = 20
 _SETTLED_DEG = 1e-9

@@ -13,8 +13,7 @@ from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
 from service.alarms.limits import BatchRef, LimitSettings, Point, Sample, SampleWindow, Severity
-from service.alarms.quantities import SILENCE
-from service.alarms.subjects import Subject, quantity_and_tracker, sampler, subject_of
+from service.alarms.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 from service.missions.mission import Mission
 from service.storage.projections.rollups import RecordedResult
 from service.storage.queries.alarms import change, limits_of

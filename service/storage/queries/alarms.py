@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, and_, bindparam, insert, or_, select, update
 
-from service.alarms import quantities, subjects
+from service.alarms import quantities
 from service.alarms.limits import LimitSettings, Sample, Severity
 from service.alarms.quantities import QuantityName, quantity_named
 from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
@@ -29,7 +29,7 @@ from service.storage.sql.statements import prepared
 from service.storage.sql.tables import COUNTED, MEASURED, results, tracker_values
 from service.times import Utc, recorded_utc, utc_now
 
-LimitsInForce = Mapping[subjects.Subject, LimitSettings]
+LimitsInForce = Mapping[quantities.Subject, LimitSettings]
 
 _SHIPPED: dict[tuple[str, tuple[str, ...]], Mapping[QuantityName, LimitSettings]] = {}
 # Run with every batch of a live spacecraft.
@@ -48,11 +48,11 @@ def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
     if shipped is None:
         shipped = _SHIPPED[key] = quantities.default_limits(mission)
     own = {
-        subjects.subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
+        quantities.subject_of(row["quantity"], row["tracker"]): _read(row["settings"])
         for row in _in_force(connection, mission.name)
         if row["settings"] is not None
     }
-    return subjects.limits_of_subjects(mission, shipped, own)
+    return quantities.limits_of_subjects(mission, shipped, own)
 
 
 @lru_cache(maxsize=256)
@@ -163,10 +163,10 @@ def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
 
 
 def latest_samples(
-    connection: Connection, selected: ResultFilter, subject: subjects.Subject, limit: int
+    connection: Connection, selected: ResultFilter, subject: quantities.Subject, limit: int
 ) -> tuple[list[int], list[Sample]]:
     """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
-    _, tracker = subjects.quantity_and_tracker(subject)
+    _, tracker = quantities.quantity_and_tracker(subject)
     values = tracker_values if tracker else results
     columns = [values.c[name] for name in (*COUNTED, "status", *MEASURED)]
     query = select(results.c.time_ns, *columns).where(*selected.conditions())
@@ -175,7 +175,7 @@ def latest_samples(
         of_tracker = tracker_values.c.tracker == tracker
         query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
     query = newest_first(query).limit(limit)
-    sample_of = subjects.sampler(subject)
+    sample_of = quantities.sampler(subject)
     rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
     samples = [sample_of(row, {tracker: row}) for row in rows]
     return [row["time_ns"] for row in rows], [each for each in samples if each is not None]

@@ -9,8 +9,7 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.alarms.limits import Severity
-from service.alarms.quantities import quantity_named, trend_names
-from service.alarms.subjects import limited_trackers
+from service.alarms.quantities import limited_trackers, quantity_named, trend_names
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName

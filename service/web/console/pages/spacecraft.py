@@ -9,8 +9,13 @@ from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
-from service.alarms.quantities import QUANTITIES, RankedName, ranked_names, trend_names
-from service.alarms.subjects import limited_trackers
+from service.alarms.quantities import (
+    QUANTITIES,
+    RankedName,
+    limited_trackers,
+    ranked_names,
+    trend_names,
+)
 from service.observations.schema import Key
 from service.products.formats import table_formats
 from service.storage.models.alarms import Annotation
