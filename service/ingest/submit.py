@@ -353,17 +353,16 @@ class SubmissionService:
         self, batches: Sequence[ObservationBatch], mission: Mission | None = None
     ) -> list[Acquisition]:
         """As `run_again` of each of some batches of one spacecraft; raises the first error."""
-        several = self.pool.call(
-            lambda: self.solver.acquired(batches, mission),
-            ("again", batches[0].spacecraft),
-            is_long=True,
-        )
-        found = []
-        for each in several:
-            if isinstance(each, Exception):
-                raise each
-            found.append(each)
-        return found
+
+        def work() -> list[Acquisition]:
+            several = self.solver.acquired(batches, mission)
+            errors = [each for each in several if isinstance(each, Exception)]
+            if errors:
+                # Within the pool, which waits for a part of the sky that is being built.
+                raise errors[0]
+            return [each for each in several if isinstance(each, Acquisition)]
+
+        return self.pool.call(work, ("again", batches[0].spacecraft), is_long=True)
 
     def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
