@@ -38,7 +38,8 @@ IDLE_S = 600.0
 """The time without a chunk after which the processes end, and give their memory back."""
 MOST_STARTS = 3
 """The most starts of processes for one chunk, where they die before they have it."""
-SERVER_RETRY_S = 0.1
+SERVER_RETRY_S, SERVER_GONE_S = 0.1, 10.0
+"""How often, and for how long, starts are tried while the server of the workers is ending."""
 MOST_DEATHS = 2
 """A chunk that was alone at work when so many processes died is given up."""
 
@@ -234,14 +235,10 @@ class LocalWorkers(Generic[Input, Output]):
         reason = "processes died as soon as they were started"
         for _ in range(MOST_STARTS):
             try:
-                processes = self._processes or self._open()
+                processes = self._processes or self._opened()
             except OSError as error:
                 reason = f"no process can be started: {error}"
-                if not isinstance(error, ConnectionError):
-                    break
-                # The server of the workers has died, and is not known to have done so yet.
-                time.sleep(SERVER_RETRY_S)
-                continue
+                break
             try:
                 future = processes.executor.submit(compute, self._work, chunk.task)
             except BrokenProcessPool:
@@ -252,6 +249,18 @@ class LocalWorkers(Generic[Input, Output]):
             return
         _fail(chunk, WorkerLost(reason))
         self._go_on(chunk)
+
+    def _opened(self) -> "_Processes[Input, Output]":
+        """Started processes; waits for a server of the workers that dies to be gone."""
+        until_s = time.monotonic() + SERVER_GONE_S
+        while True:
+            try:
+                return self._open()
+            except ConnectionError:
+                # It has died, and is not known to have done so yet.
+                if time.monotonic() > until_s:
+                    raise
+                time.sleep(SERVER_RETRY_S)
 
     def _replace(self, broken: "_Processes[Input, Output]") -> None:
         if self._processes is broken:

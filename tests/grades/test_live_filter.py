@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from service.app.grades import LiveFilter
-from service.errors import NotFound
+from service.errors import Busy, NotFound
 from service.filtering.inputs import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import grade_day, window_of
@@ -28,6 +28,7 @@ from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.grades.passes import GYRO, MODEL, NOON, NOON_NS, mission_with, recorded_of
 from tests.grades.records import at, put_attitudes, put_gyro
 from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
+from tests.waiting import wait_until
 from tests.web.serving import served
 
 FIELDS = ("tai_ns", "quaternion", "covariance_arcsec2", "rate_deg_per_s", "bias_deg_per_h")
@@ -127,7 +128,16 @@ def bodies(attitudes):
 
 def send(app, attitudes):
     for body in bodies(attitudes):
-        app.submissions.submit(submission_from_json(json.dumps(body)))
+        submission = submission_from_json(json.dumps(body))
+        wait_until(lambda each=submission: is_taken(app, each), why="the service stays busy")
+
+
+def is_taken(app, submission):
+    try:
+        app.submissions.submit(submission)
+    except Busy:
+        return False
+    return True
 
 
 @pytest.fixture

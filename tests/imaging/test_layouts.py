@@ -1,6 +1,7 @@
 """Every layout of a picture gives the counts that were written, or is refused by its name."""
 
 import io
+import math
 import struct
 import zlib
 
@@ -300,7 +301,8 @@ def test_a_jpeg_with_a_changed_bit_is_refused_or_ends_in_its_place(rng, name):
         change = (frame.counts - truth)[-8:, 48:]
         moved += np.ptp(change) > 60
     assert refused > 5
-    assert moved <= 0.03 * tries
+    # Three in a hundred, within three standard deviations of the count.
+    assert moved <= 0.03 * tries + 3.0 * math.sqrt(0.03 * tries)
 
 
 def test_a_jpeg_with_a_byte_more_or_less_is_refused_where_pillow_reads_it(rng):

@@ -31,6 +31,8 @@ SESSION, BATCH = (
     for path in ("/api/v1/session", "/api/v1/batches")
 )
 REOPEN_S = 0.5
+LISTEN_S = 30.0
+"""How long it goes on until it has heard what some connection must be told."""
 
 ENDLESS = {
     # What begins a request, and what then comes again and again.
@@ -148,7 +150,8 @@ def attackers(port, kind, connections):
     return connections * [(send_endlessly, port, *ENDLESS[kind])]
 
 
-def main(port, kind, connections):
+def main(port, kind, connections, expected):
+    """Attack until the end of the standard input, and until something was heard if it must be."""
     os.nice(19)
     threads = [
         threading.Thread(target=each[0], args=each[1:], daemon=True)
@@ -157,6 +160,9 @@ def main(port, kind, connections):
     for thread in threads:
         thread.start()
     sys.stdin.read()
+    until_s = time.monotonic() + LISTEN_S
+    while expected not in ("", *told) and time.monotonic() < until_s:
+        time.sleep(0.1)
     stopping.set()
     print(json.dumps({**counted, "told": dict(itertools.islice(told.items(), 20))}), flush=True)
     # Senders may be blocked; they end with the process.

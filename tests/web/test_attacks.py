@@ -66,7 +66,7 @@ def test_an_attack_costs_a_healthy_client_nothing(server, batch, kind, figures):
     def while_attacked(client):
         command = [sys.executable, "-m", "tests.web.attack", str(httpx.URL(url).port), kind]
         with subprocess.Popen(
-            [*command, str(connections)],
+            [*command, str(connections), told or ""],
             cwd=CHECKOUT,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -299,14 +299,13 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
     width_s = TRENDS[bucket].width_s
     found: Rollups = {}
     # PostgreSQL's client would hold all rows at once.
-    read = connection.execute(
-        query.where(results.c.current), execution_options={"yield_per": ROWS_AT_ONCE}
-    )
-    for row in read.mappings():
-        tracker = (row["tracker"],) if of_trackers else ()
-        number = parse_utc(row["time"]).bucket(width_s)
-        key = row["spacecraft"], row["run"], *tracker, number
-        _put(found, key, result_metrics.rolled_up([dict(row)]))
+    in_pieces = {"yield_per": ROWS_AT_ONCE}
+    with connection.execute(query.where(results.c.current), execution_options=in_pieces) as read:
+        for row in read.mappings():
+            tracker = (row["tracker"],) if of_trackers else ()
+            number = parse_utc(row["time"]).bucket(width_s)
+            key = row["spacecraft"], row["run"], *tracker, number
+            _put(found, key, result_metrics.rolled_up([dict(row)]))
     for spacecraft, run, name, hour, share in _shares(connection):
         if (name != WHOLE) == of_trackers:
             owner = (spacecraft, run, name) if of_trackers else (spacecraft, run)

@@ -233,8 +233,8 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
         .join(old, old.c.result_id == pairs.c.before)
         .join(new, new.c.result_id == pairs.c.after)
     )
-    read: Any = connection.execution_options(yield_per=_READ_AT_ONCE).execute(query)
-    return [_between(np.array(rows, dtype=float)) for rows in read.partitions(_READ_AT_ONCE)]
+    with connection.execute(query, execution_options={"yield_per": _READ_AT_ONCE}) as read:
+        return [_between(np.array(rows, dtype=float)) for rows in read.partitions()]
 
 
 def _between(rows: Vector) -> Vector:

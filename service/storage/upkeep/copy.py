@@ -189,7 +189,8 @@ def _chunks(
     """The rows of a query on a table, as many at a time as memory allows."""
     has_large = any(isinstance(column.type, sa.LargeBinary) for column in table.columns)
     at_once = LARGE_ROWS_AT_ONCE if has_large else ROWS_AT_ONCE
-    yield from connection.execute(query, execution_options={"yield_per": at_once}).partitions()
+    with connection.execute(query, execution_options={"yield_per": at_once}) as read:
+        yield from read.partitions()
 
 
 def _copy_rows(
