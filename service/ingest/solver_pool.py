@@ -84,6 +84,17 @@ class Solver:
             found |= dict(zip(places, several, strict=True))
         return [found[place] for place in range(len(batches))]
 
+    def all_acquired(
+        self, batches: Sequence[ObservationBatch], mission: Mission | None = None
+    ) -> list[Acquisition]:
+        """As `acquired`; raises the first error, for which a pool may have to wait."""
+        found = []
+        for each in self.acquired(batches, mission):
+            if isinstance(each, Exception):
+                raise each
+            found.append(each)
+        return found
+
     def asks_for_last(self, batch: ObservationBatch) -> bool:
         """True if the attitude of a batch is to be predicted from the record first.
 

@@ -343,26 +343,20 @@ class SubmissionService:
 
         Raises `Busy` where every thread is at work for long.
         """
-        return self.pool.call(
-            lambda: self.solver.acquire(batch, mission),
-            ("again", batch.spacecraft),
-            is_long=may_take_long(batch),
-        )
+        return self.run_again_many([batch], mission, is_long=may_take_long(batch))[0]
 
     def run_again_many(
-        self, batches: Sequence[ObservationBatch], mission: Mission | None = None
+        self,
+        batches: Sequence[ObservationBatch],
+        mission: Mission | None = None,
+        is_long: bool = True,
     ) -> list[Acquisition]:
         """As `run_again` of each of some batches of one spacecraft; raises the first error."""
-
-        def work() -> list[Acquisition]:
-            several = self.solver.acquired(batches, mission)
-            errors = [each for each in several if isinstance(each, Exception)]
-            if errors:
-                # Within the pool, which waits for a part of the sky that is being built.
-                raise errors[0]
-            return [each for each in several if isinstance(each, Acquisition)]
-
-        return self.pool.call(work, ("again", batches[0].spacecraft), is_long=True)
+        return self.pool.call(
+            lambda: self.solver.all_acquired(batches, mission),
+            ("again", batches[0].spacecraft),
+            is_long=is_long,
+        )
 
     def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
