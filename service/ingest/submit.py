@@ -361,8 +361,7 @@ class SubmissionService:
     def warm_up(self, submission: Submission) -> None:
         """Look up, solve and record a batch, and take it back: nothing is kept or told.
 
-        Connections are opened and statements prepared that the first batch
-        would wait for.
+        Connections are opened and statements prepared that the first batch would wait for.
         """
         pending = PendingBatch(
             identity_of(submission.batch),
