@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from msgspec import Struct
 
-from service.compiled.jit import njit
+from service.compiled.jit import njit, njit_no_refcount
 from service.sky.cache import LruCache
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.directions import separation_rad
@@ -253,23 +253,42 @@ def count_within(
 
 @njit
 def _count_within(which, axes, leasts, mosts, direction, pair_rows, found):  # type: ignore[no-untyped-def]
-    inside = np.empty(len(direction), np.uint8)
+    inside = np.empty(len(direction), np.int32)
     for s in which:
         axis, least, most = axes[s], leasts[s], mosts[s]
         inner, outer = math.cos(least) if least > 0.0 else 2.0, math.cos(most)
-        stars = pairs = 0
-        for row in range(len(direction)):
-            r = direction[row]
-            cosine = r[0] * axis[0] + r[1] * axis[1] + r[2] * axis[2]
-            inside[row] = outer < cosine < inner
-            # The accurate angle decides about those near a bound alone.
-            if min(abs(cosine - inner), abs(cosine - outer)) <= _CLEAR:
-                inside[row] = least <= separation_rad(r, axis) <= most
-            stars += inside[row]
-        for k in range(pair_rows.shape[1]):
-            # Unsigned: a row that might be counted from the end takes as long to look at again.
-            pairs += inside[np.uint64(pair_rows[0, k])] & inside[np.uint64(pair_rows[1, k])]
-        found[s, 0], found[s, 1] = stars, pairs
+        if _stars_inside(direction, axis, inner, outer, inside):
+            for row in range(len(direction)):
+                inside[row] = least <= separation_rad(direction[row], axis) <= most
+        found[s, 0] = inside.sum()
+        found[s, 1] = _pairs_inside(pair_rows[0], pair_rows[1], inside)
+
+
+@njit_no_refcount
+def _stars_inside(direction, axis, inner, outer, inside):  # type: ignore[no-untyped-def]
+    """Mark the stars (n, 3) with a cosine to the axis between two; whether one is near a bound.
+
+    Then the accurate angles decide.  Without a branch several are looked at at a time.
+    """
+    is_near = False
+    x, y, z = axis[0], axis[1], axis[2]
+    for row in range(len(direction)):
+        cosine = direction[row, 0] * x + direction[row, 1] * y + direction[row, 2] * z
+        inside[row] = (outer < cosine) & (cosine < inner)
+        is_near |= min(abs(cosine - inner), abs(cosine - outer)) <= _CLEAR
+    return is_near
+
+
+@njit_no_refcount
+def _pairs_inside(one, other, inside):  # type: ignore[no-untyped-def]
+    """How many pairs, by the rows of their stars (p,), have both inside: 0 or 1 of each star (n,).
+
+    In words of 32 bits and by unsigned rows, so that sixteen pairs are looked up at a time.
+    """
+    pairs = np.int32(0)
+    for k in range(len(one)):
+        pairs += inside[np.uint32(one[k])] & inside[np.uint32(other[k])]
+    return pairs
 
 
 def zone_for(
