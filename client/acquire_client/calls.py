@@ -76,6 +76,7 @@ class _Method:
 
     def function_of(self, owner: type["Caller"]) -> Callable[..., Any]:
         """The function that a class of clients has in place of this object."""
+        # Each of the two kinds of methods has its own.
         raise NotImplementedError
 
 

@@ -282,7 +282,7 @@ class SampleWindow:
     def from_json(cls, kept: Any) -> "SampleWindow":
         """A window as it was kept."""
         since_ns = {Severity[word.upper()]: time_ns for word, time_ns in kept["since_ns"].items()}
-        # What was written before worst values were kept has none: the next value takes their place.
+        # A window of a version that kept no worst values has none: the next value is the worst.
         worst = {
             Severity[word.upper()]: Point(*each) for word, each in kept.get("worst", {}).items()
         }

@@ -164,7 +164,7 @@ class ProgressRecorder:
     def conclude(self, state: records.ReplayStateName, closing: threading.Event) -> None:
         """Store the state at the end; try again until that succeeds or the service closes.
 
-        Nothing else would say that the replay is over.
+        Without this record the replay would look as if it still ran.
         """
         pause_s = SAVE_PAUSE_S
         while True:
