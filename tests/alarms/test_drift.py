@@ -136,7 +136,8 @@ def test_points_in_one_place_that_tell_of_two_stars_have_a_value(missions, rng):
     """A tolerance of degrees lets them; rounding leaves less than nothing of their scatter."""
     tracker = twin(missions).trackers[0]
     for _ in range(100):
-        seen, other = (unit(rng.normal(size=3)) for _ in range(2))
+        seen, across = (unit(rng.normal(size=3)) for _ in range(2))
+        other = unit(seen + rng.uniform(0.2, 5.0) * unit(np.cross(seen, across)))
         offset = scale_offset_ppm([MeanStars(tracker, 2, 2.0 * seen, seen + other)])
         assert offset == pytest.approx(-1e6, abs=1.0)
 

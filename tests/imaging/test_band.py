@@ -109,7 +109,8 @@ def assert_as_claimed(psf, frames):
     )
     assert counts["right"] == counts["frames"]
     assert counts["misnamed"] == 0
-    slack = max(0.0, 4.0 / np.sqrt(2.0 * len(errors)) - 0.1)
+    # What is promised is promised of all of them: fewer may differ by their own chance.
+    slack = 4.0 / np.sqrt(2.0 * len(errors)) if counts["frames"] < FRAMES else 0.0
     assert SPREAD[0] - slack < spread < SPREAD[1] + slack
 
 
