@@ -60,10 +60,10 @@ def test_whatever_write_fails_nothing_acknowledged_is_lost_and_writing_resumes(
     )
     assert worker.returncode == 0, worker.stderr
     told = json.loads(worker.stdout)
-    # A checkpoint that fails comes again by itself: not every fault is noticed by who sends.
     assert (told["struck"], told["reads_failed"]) == (faults, 0)
-    assert told["told_busy"] > 0
     if faults == FAULTS:
+        # A checkpoint that fails comes again by itself: who sends may not notice a fault.
+        assert told["told_busy"] > 0
         struck = " ".join(told["kinds"])
         assert all(each in struck for each in ("acquire.db-wal", "acquire.db ", "sync"))
     app = open_app(Settings(database=database))

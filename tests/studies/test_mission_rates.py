@@ -46,10 +46,9 @@ class TestRates:
             rates = {"wrong": reference.misidentified_pct, "lost": reference.unidentified_pct}
             ours = {"wrong": found.wrong.value, "lost": 1.0 - found.unique_right.value}
             ours["lost"] -= found.wrong.value
-            reach = {
-                "wrong": found.wrong.high - found.wrong.low,
-                "lost": found.unique_right.high - found.unique_right.low,
-            }
+            reach = {"wrong": found.wrong.high - found.wrong.low}
+            # What is lost is neither right nor wrong, so both scatter in it.
+            reach["lost"] = found.unique_right.high - found.unique_right.low + reach["wrong"]
             for kind, rate_pct in rates.items():
                 allowed = 1.5 * reach[kind] + 0.005
                 assert ours[kind] == pytest.approx(rate_pct / 100.0, abs=allowed), (name, kind)
