@@ -126,6 +126,9 @@ def test_a_secondary_header_in_each_segment_is_skipped(batches):
     (line,) = read(b"".join(pieces))
     assert "it is joined of 3 segments" in str(line.fault)
     assert "packets.segment_header_bytes" in str(line.fault)
+    # Of one that came whole nothing of segments is said.
+    (line,) = read(segment(fields(batches[0])[:40], WHOLE, 0))
+    assert "it is joined of" not in str(line.fault)
 
 
 def test_later_segments_without_a_secondary_header_lose_nothing(batches):

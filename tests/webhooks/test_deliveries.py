@@ -6,9 +6,11 @@ import time
 from email.utils import formatdate
 
 import pytest
+from sqlalchemy import update
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
 from service.storage.recording import events
+from service.storage.sql.tables import webhooks
 from service.webhooks import sender
 from service.webhooks.sender import retry_delay_s
 from tests.waiting import wait_until
@@ -266,6 +268,18 @@ def test_of_two_services_on_one_database_one_delivers(database, receiver):
         wait_until(lambda: len(receiver.requests) >= 20)
         time.sleep(0.5)
     assert texts(receiver) == [f"n{n}" for n in range(20)]
+
+
+def test_a_webhook_that_another_process_moved_on_goes_on_from_there(service, receiver):
+    service.hook(receiver.url)
+    service.note("n0")
+    receiver.next()
+    moved = update(webhooks).values(position=webhooks.c.position + 1)
+    service.app.store.writer.change(lambda writing: writing.execute(moved).rowcount).result()
+    service.note("n1")
+    service.note("n2")
+    wait_until(lambda: texts(receiver)[-1:] == ["n2"])
+    assert texts(receiver) == ["n0", "n2"]
 
 
 def test_events_that_were_deleted_before_their_turn_are_counted(service, receiver, monkeypatch):
