@@ -113,6 +113,8 @@ def test_the_value_does_not_depend_on_the_order_in_which_batches_come(samples, c
 )
 # A single value that is out, while the means are within, makes a later mean of values within out.
 @example([([(0, 0.5), (1, 0.5), (2, 1.3)], False), ([(3, 0.95), (4, 0.95)], False)], 3, 0)
+# The last mean is out by its last digit; as a difference of two sums it is not.
+@example([([(0, -0.8), (1, 0.8), (2, 1.27), (3, 0.93)], False)], 3, 0)
 def test_what_is_passed_over_would_have_been_in_limits_one_by_one(groups, count, duration_s):
     """Group after group, whatever order they come in, and where the limits are set anew between."""
     wide, narrow = (
