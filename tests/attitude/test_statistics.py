@@ -108,7 +108,8 @@ def test_a_star_under_a_wrong_name_makes_the_solution_suspect(rng):
     # Half of the noise that is allowed for: one sound solution in a thousand is suspect, too.
     body = seen(rng, truth, inertial, 1.0)
     assert not solved(body, inertial, 2.0).suspect
-    inertial[2] = rotation(rng.normal(size=3), 0.01) @ inertial[2]
+    across = np.cross(inertial[2], rng.normal(size=3))
+    inertial[2] = rotation(across, 0.01) @ inertial[2]
     assert solved(body, inertial, 2.0).suspect
 
 

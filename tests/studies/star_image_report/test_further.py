@@ -80,7 +80,8 @@ def test_the_tail_of_three_wires_is_that_of_points_all_over_the_aperture(rng):
     waves = np.exp(-2j * np.pi / LASER_M * np.outer(np.append(p, 0.0), x[~dark])).sum(axis=1)
     expected = np.abs(waves) ** 2 / np.abs(waves[-1]) ** 2
     got = tail_of_wires(three, LASER_M, p)
-    assert got == pytest.approx(expected[:-1], rel=0.03, abs=2e-6)
+    # Six times what the points of another seed change.
+    assert got == pytest.approx(expected[:-1], rel=0.03, abs=5e-6)
 
 
 def test_a_spectrum_of_lines_is_the_sum_of_its_lines():
