@@ -12,6 +12,7 @@ differs there: where the test or its file has the mark `both_databases`, and eve
 under --full.
 """
 
+import ctypes
 import faulthandler
 import json
 import logging
@@ -196,6 +197,14 @@ def logging_as_before():
     ]
     root.setLevel(levels[0])
     service.setLevel(levels[1])
+
+
+@pytest.fixture(autouse=True, scope="module")
+def memory_given_back():
+    """What a file of tests freed goes back to the system; glibc would keep it in pieces."""
+    yield
+    if trim := getattr(ctypes.CDLL(None), "malloc_trim", None):
+        trim(0)
 
 
 @pytest.fixture(autouse=True)

@@ -3,8 +3,9 @@
 import ast
 import re
 from collections import Counter
-from functools import cache
 from pathlib import Path
+
+import pytest
 
 import service
 
@@ -22,7 +23,7 @@ def name_of(path):
     return path.relative_to(ROOT).as_posix()
 
 
-@cache
+@pytest.fixture(scope="module")
 def modules():
     return {
         path: path.read_text(encoding="utf-8")
@@ -31,24 +32,24 @@ def modules():
     }
 
 
-@cache
-def functions():
+@pytest.fixture(scope="module")
+def functions(modules):
     """Every function of the service, kernels and methods included, by module and name."""
     return {
         f"{name_of(path)}:{node.name}": node
-        for path, text in modules().items()
+        for path, text in modules.items()
         for node in ast.walk(ast.parse(text))
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef)
     }
 
 
-def test_there_is_something_to_measure():
-    assert len(modules()) > 300
-    assert len(functions()) > 1500
+def test_there_is_something_to_measure(modules, functions):
+    assert len(modules) > 300
+    assert len(functions) > 1500
 
 
-def test_no_module_is_too_long():
-    long = {name_of(path) for path, text in modules().items() if lines_of(text) > MAX_MODULE_LINES}
+def test_no_module_is_too_long(modules):
+    long = {name_of(path) for path, text in modules.items() if lines_of(text) > MAX_MODULE_LINES}
     assert long <= LONG_MODULES
 
 
@@ -56,24 +57,24 @@ def lines_of(text):
     return text.count("\n")
 
 
-def test_no_function_is_too_long():
+def test_no_function_is_too_long(functions):
     long = {
         name
-        for name, node in functions().items()
+        for name, node in functions.items()
         if node.end_lineno - node.lineno + 1 > MAX_FUNCTION_LINES
     }
     assert long <= LONG_FUNCTIONS
 
 
-def test_no_function_takes_too_many_arguments():
+def test_no_function_takes_too_many_arguments(functions):
     def count(arguments):
         return len(arguments.posonlyargs + arguments.args + arguments.kwonlyargs)
 
-    assert not {name for name, node in functions().items() if count(node.args) > MAX_ARGUMENTS}
+    assert not {name for name, node in functions.items() if count(node.args) > MAX_ARGUMENTS}
 
 
-def test_no_folder_holds_too_many_modules():
-    counts = Counter(name_of(path.parent) for path in modules())
+def test_no_folder_holds_too_many_modules(modules):
+    counts = Counter(name_of(path.parent) for path in modules)
     assert {folder for folder, count in counts.items() if count > MAX_MODULES} <= FULL_FOLDERS
 
 
