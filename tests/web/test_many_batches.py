@@ -1,6 +1,7 @@
 """An array of batches: each has its own outcome, and counts like a request of its own."""
 
 import json
+from types import SimpleNamespace
 
 import httpx
 import pytest
@@ -115,6 +116,16 @@ def test_an_array_counts_as_many_requests_as_it_has_batches():
         access.count_request(caller)
     # A hundred at one in two seconds, less the burst.
     assert refused.value.retry_after_s == pytest.approx((100 - LEAST_BURST + 1) / 0.5, abs=2)
+
+
+def test_a_burst_comes_at_once_and_no_request_more(monkeypatch):
+    monkeypatch.setattr("service.access.time", SimpleNamespace(monotonic=lambda: 1000.0))
+    access = Access(reading=None, change=None, loopback=False, now=None)
+    caller = Caller("pipeline", frozenset({"submit"}), token_id="1", rate_per_s=0.5)
+    for _ in range(int(LEAST_BURST)):
+        access.count_request(caller)
+    with pytest.raises(RateLimited):
+        access.count_request(caller)
 
 
 def test_an_array_waits_for_the_burst():

@@ -282,6 +282,16 @@ def test_a_webhook_that_another_process_moved_on_goes_on_from_there(service, rec
     assert texts(receiver) == ["n0", "n2"]
 
 
+def test_a_webhook_that_is_enabled_delivers_at_once(service, receiver, monkeypatch):
+    monkeypatch.setattr(sender, "POLL_S", 600.0)
+    hook = service.hook(receiver.url, enabled=False)
+    service.note("n0")
+    time.sleep(0.5)
+    assert not receiver.requests
+    service.client.put(f"{HERE}/{hook['id']}", json={"name": "t", "url": receiver.url})
+    wait_until(lambda: texts(receiver) == ["n0"])
+
+
 def test_events_that_were_deleted_before_their_turn_are_counted(service, receiver, monkeypatch):
     hook = service.hook(receiver.url, enabled=False)
     monkeypatch.setattr(events, "KEPT", 10)
