@@ -109,7 +109,7 @@ def assert_as_claimed(psf, frames):
     )
     assert counts["right"] == counts["frames"]
     assert counts["misnamed"] == 0
-    # What is promised is promised of all of them: fewer may differ by their own chance.
+    # The bounds hold for all frames together; the spread of fewer frames varies more.
     slack = 4.0 / np.sqrt(2.0 * len(errors)) if counts["frames"] < FRAMES else 0.0
     assert SPREAD[0] - slack < spread < SPREAD[1] + slack
 

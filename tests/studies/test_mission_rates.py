@@ -47,7 +47,7 @@ class TestRates:
             ours = {"wrong": found.wrong.value, "lost": 1.0 - found.unique_right.value}
             ours["lost"] -= found.wrong.value
             reach = {"wrong": found.wrong.high - found.wrong.low}
-            # What is lost is neither right nor wrong, so both scatter in it.
+            # Lost stars are those neither right nor wrong: their rate varies with both of these.
             reach["lost"] = found.unique_right.high - found.unique_right.low + reach["wrong"]
             for kind, rate_pct in rates.items():
                 allowed = 1.5 * reach[kind] + 0.005

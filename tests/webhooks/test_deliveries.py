@@ -283,7 +283,7 @@ def test_a_webhook_that_another_process_moved_on_goes_on_from_there(service, rec
 
 
 def test_a_webhook_that_is_enabled_delivers_at_once(service, receiver, monkeypatch):
-    monkeypatch.setattr(sender, "POLL_S", 600.0)
+    monkeypatch.setattr(sender, "POLL_S", 60.0)
     hook = service.hook(receiver.url, enabled=False)
     service.note("n0")
     time.sleep(0.5)
