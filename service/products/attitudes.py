@@ -474,7 +474,7 @@ def write_json(series: AttitudeSeries) -> Iterator[bytes]:
 
 
 def _items(block: AttitudeBlock) -> Iterator[str]:
-    """The attitudes of a block as objects.
+    """The attitudes of a block, which has at least one, as objects.
 
     They are put together from texts: plain objects take twice the time, most of it to
     collect garbage.
@@ -493,7 +493,7 @@ def _items(block: AttitudeBlock) -> Iterator[str]:
         "batch": _plain(block.batch),
         "id": _plain(block.id),
     }
-    if len(block) and block.revision[0]:
+    if block.revision[0]:
         members |= {
             "model": _plain(block.model),
             "revision": number_texts(block.revision.tolist()),
@@ -514,8 +514,6 @@ def _plain(values: Texts) -> list[str]:
 
 def _vectors(values: Vector) -> list[str]:
     """Arrays of the three or four numbers of each row, null where they are not known."""
-    if not len(values):
-        return []
     text = _ENCODER.encode(values.tolist()).decode()[1:-1].replace("],[", "]\n[")
     return text.replace("[null,null,null]", "null").split("\n")
 

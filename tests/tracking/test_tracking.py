@@ -261,3 +261,25 @@ def test_the_recorded_gyro_predicts_where_it_reaches(database, sky):
         )
         # That of the attitude before, for the gyro of this test measures without errors.
         assert np.linalg.norm(error) < 150.0
+
+
+def test_gyro_rates_beyond_what_the_mission_names_now_predict_nothing(database, flown):
+    mission = tracked(load_missions()["XTE"])
+    gyro = GyroSettings(sigma_v_rad_s0_5=1e-6, sigma_u_rad_s1_5=1e-9, bias_sigma_rad_s=1e-6)
+    rates = [each.rate_rad_s.tolist() for each in flown[:2] for _ in range(30)]
+    block = {"block": "g1", "start": flown[0].body["time"], "step_s": 1.0}
+    block["rates_rad_per_s"] = [rates[0], *rates]
+    less_deg_s = 0.5 * np.degrees(np.abs(rates).max())
+    told = []
+    for settings in (gyro, gyro.model_copy(update={"largest_rate_deg_per_s": less_deg_s})):
+        named = mission.model_copy(update={"gyro": settings})
+        app = open_app(Settings(database=database, replay_processes=0), named)
+        try:
+            if not told:
+                app.gyro.record(block_from_json(json.dumps(block), "XTE"))
+                send(app, flown[0].body)
+            answer = send(app, flown[len(told) + 1].body)
+            told.append(answer["tracking"]["prediction"]["rate"])
+        finally:
+            app.close()
+    assert told == ["gyro", "attitudes"]
