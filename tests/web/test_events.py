@@ -2,11 +2,14 @@
 
 import asyncio
 import json
+import socket
 import threading
+import time
 from contextlib import contextmanager
 
 import httpx
 import pytest
+from sqlalchemy import make_url
 
 from service.access import OPEN_CALLER
 from service.app.factory import open_app
@@ -169,6 +172,20 @@ def test_what_another_process_writes_is_told_of_too(postgresql_schemas, drawn):
         assert "batches" in kinds
         assert kinds.count("replay") >= 2
         assert sum(d["batches"] for kind, _, d in seen if kind == "batches") == 3
+
+
+def test_a_database_that_is_away_is_asked_for_events_once_a_second(caplog):
+    caplog.set_level("INFO", records.__name__)
+    with socket.socket() as nobody:
+        nobody.bind(("127.0.0.1", 0))  # Nobody listens there, and no one else can.
+        url = make_url(f"postgresql+psycopg://nobody@127.0.0.1:{nobody.getsockname()[1]}/none")
+        began = time.monotonic()
+        heard = records.HeardEvents(url, lambda: None)
+        try:
+            wait_until(lambda: len(caplog.records) >= 3, 60)
+            assert time.monotonic() - began > 1.9
+        finally:
+            heard.close()
 
 
 def test_a_listener_hears_of_its_run_and_spacecraft_alone(database, drawn):
