@@ -6,16 +6,16 @@ from scipy import stats
 
 from service.advice import intervals
 
-TRIALS = 400
+TRIALS = 2000
 LEAST_COVERED = 0.90
-"""Of 95 %: with 400 trials three standard deviations below would be 92 %."""
+"""Of 95 %: sixty clusters are few (of high quantiles 93 % are covered), and chance takes 2 %."""
 
 
-def covered(rng, draw, estimate, truth):
+def covered(rng, draw, estimate, truth, trials=TRIALS):
     held = 0
-    for _ in range(TRIALS):
+    for _ in range(trials):
         held += estimate(*draw(rng)).holds(truth)
-    return held / TRIALS
+    return held / trials
 
 
 def clustered_normal(rng, batches=60, each=8, between=0.7):
@@ -92,7 +92,8 @@ def test_a_line_through_clustered_outliers_is_covered(rng):
         def estimate(*drawn, place=place):
             return intervals.intervals(*intervals.robust_fit(*drawn))[place]
 
-        assert covered(rng, draw, estimate, truth) >= LEAST_COVERED
+        # A fit takes thirty times as long as a share.
+        assert covered(rng, draw, estimate, truth, trials=400) >= LEAST_COVERED
 
 
 def test_values_that_all_agree_are_bounded_by_themselves():
