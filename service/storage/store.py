@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
-from sqlalchemy import Connection
+from sqlalchemy import Connection, event
 from sqlalchemy.exc import DBAPIError, TimeoutError
 
 from service import logs
@@ -77,10 +77,12 @@ class Readers:
             yield connection
 
     def close(self) -> None:
-        """Let go of the database."""
+        """Let go of the database; what is still read by then is read to its end."""
         self._lookup_connection.close()
-        self._lookup_engine.dispose()
-        self._readers.dispose()
+        for engine in (self._lookup_engine, self._readers):
+            # Else a connection that comes back later would stay open in a pool that nobody has.
+            event.listen(engine, "checkin", lambda _, entry: entry.close())
+            engine.dispose()
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 from urllib.parse import quote
 
+import psycopg
 import pytest
 from alembic import command
 from sqlalchemy import create_engine, event, inspect, make_url, select, text
@@ -78,6 +79,16 @@ def test_a_postgresql_database_that_is_behind_is_not_opened_but_told_of(empty_da
         open_app(Settings(database=empty_database))
     migrations.upgrade(empty_database)
     open_app(Settings(database=empty_database)).close()
+
+
+def test_a_connection_that_is_read_from_while_the_store_is_closed_is_closed_after_that(database):
+    store = Store(database)
+    with store.reading() as connection:
+        driver = connection.connection.driver_connection
+        store.close()
+        assert connection.execute(text("SELECT 1")).scalar() == 1
+    with pytest.raises((sqlite3.ProgrammingError, psycopg.OperationalError), match="closed"):
+        driver.execute("SELECT 1")
 
 
 def test_a_database_of_a_newer_version_is_refused(database):
