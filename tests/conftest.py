@@ -38,6 +38,8 @@ from tests.torture import FIGURES
 DEFAULT_SEED = 19941026
 TORTURE_TIMEOUT_S = 6 * 3600
 OTHER_DATABASE = "needs no database of its choice"
+M_MMAP_THRESHOLD = -3
+"""Of glibc's malloc.h."""
 LEFT_OUT, LEFT_OUT_BY_WORKERS = pytest.StashKey(), pytest.StashKey()
 
 hypothesis.settings.register_profile(
@@ -89,6 +91,9 @@ def pytest_configure(config):
     else:
         hypothesis.settings.load_profile("seeded")
         hypothesis.core.global_force_seed = seed
+    # Arrays apart from the heap, in whose holes their memory would stay: a fifth of a worker's.
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+        mallopt(M_MMAP_THRESHOLD, 256 << 10)
 
 
 def pytest_collection_modifyitems(config, items):
