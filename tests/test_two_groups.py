@@ -91,12 +91,15 @@ def test_reflections_in_one_of_two_trackers_are_named(sky, seed, with_prior):
     """The other tracker tells which group is real, and the reflections are named all the same."""
     mission = mission_like("XTE", second_tracker={})
     turn = np.radians([0.3, 0.0, 0.0])
-    named = 0
-    for drawn in draw_pass(mission, sky, Pass(BATCHES, seed, stars=6, angles_share=0.0)):
+    tried = named = 0
+    for drawn in draw_pass(mission, sky, Pass(200, seed, stars=6, angles_share=0.0)):
         body = drawn.batch
         first, second = (each["stars"] for each in body["observations"])
         if min(len(first), len(second)) < 5:
             continue
+        if named and tried >= BATCHES:
+            break
+        tried += 1
         ghosts = [s | {"vector": rotate_about(turn, np.array(s["vector"])).tolist()} for s in first]
         body["observations"][0]["stars"] = first + ghosts
         if not with_prior:
