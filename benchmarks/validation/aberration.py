@@ -44,7 +44,9 @@ def run(quick: bool, seed: int) -> Report:
         rng = np.random.default_rng(seed)
         priors = batches.prior_attitudes(rng, passes.toml, 20)
         off, shift, noise = [], [], []
-        for _ in range(count):
+        for number in range(count):
+            # Each of its own: where one way sees a star more at an edge, more would be drawn.
+            rng = np.random.default_rng([seed, number])
             prior = priors[rng.integers(len(priors))]
             directions = passes.seen if apparent else passes.directions
             truth, found = passes.draw(rng, prior, directions, said)
