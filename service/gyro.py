@@ -10,10 +10,10 @@ import msgspec
 import numpy as np
 import numpy.typing as npt
 from erfa import ufunc
-from pydantic import AfterValidator, Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from service.errors import BadBatch, Conflict, Fault, shown_value
-from service.observations.schema import Key, Number, RunName, Wire, faults_of, is_time
+from service.observations.schema import Key, Number, RunName, Wire, checked_by, is_time
 from service.times import DAY_S, Utc, parse_utc, shifted
 from service.vectors import Vector, read_only
 
@@ -196,19 +196,12 @@ def block_from_json(body: bytes | str, spacecraft: str, run: str | None = None) 
 
     Raises `BadBatch` with the faults, each naming field and value.
     """
-    try:
-        model = GyroBlockIn.model_validate_json(body)
-    except ValidationError as error:
-        raise BadBatch(faults_of(error)) from None
-    return block_from_model(model, spacecraft, run)
+    return block_from_model(checked_by(GyroBlockIn.model_validate_json, body), spacecraft, run)
 
 
 def block_from_line(line: bytes | str, run: str | None = None) -> GyroBlock:
     """The block of a line of a telemetry file; see `block_from_json`."""
-    try:
-        model = GyroLineIn.model_validate_json(line)
-    except ValidationError as error:
-        raise BadBatch(faults_of(error)) from None
+    model = checked_by(GyroLineIn.model_validate_json, line)
     return block_from_model(model, model.spacecraft, run)
 
 

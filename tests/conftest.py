@@ -242,7 +242,7 @@ def rng(seed):
 @pytest.fixture(scope="session")
 def sky():
     """The embedded catalog with a shelf, shared by all tests: answers do not depend on it."""
-    return SkyModel(load_embedded(), LruCache(max_bytes=256 << 20))
+    return SkyModel(load_embedded(), LruCache(max_bytes=160 << 20))
 
 
 @pytest.fixture(scope="session")

@@ -14,7 +14,7 @@ from typing import IO, TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import AfterValidator, Field, ValidationError
+from pydantic import AfterValidator, Field
 
 from service.errors import BadBatch, Fault
 from service.imaging.centroids.window import Flag
@@ -25,7 +25,7 @@ from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
 from service.observations.frame_record import FrameRecord
-from service.observations.schema import faults_of
+from service.observations.schema import checked_by
 from service.times import utc_now
 from service.vectors import Vector
 
@@ -79,11 +79,8 @@ class FrameIn(schema.Wire):
 
 def read_known(values: dict[str, Any]) -> FrameIn:
     """What is told of a frame, checked; raises `BadBatch` with every fault."""
-    try:
-        # Through JSON: a list there is a tuple here.
-        return FrameIn.model_validate_json(json.dumps(values))
-    except ValidationError as error:
-        raise BadBatch(faults_of(error)) from None
+    # Through JSON: a list there is a tuple here.
+    return checked_by(FrameIn.model_validate_json, json.dumps(values))
 
 
 def submission_of_frame(

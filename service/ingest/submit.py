@@ -12,7 +12,7 @@ from typing import Annotated, Any, TypeVar
 
 import msgspec
 from msgspec import Struct
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter
 from pydantic_core import to_json
 from sqlalchemy import Connection
 
@@ -26,7 +26,7 @@ from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long
 from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.schema import OptionsIn, Submission, faults_of, submission_from_json
+from service.observations.schema import OptionsIn, Submission, checked_by, submission_from_json
 from service.sky.model import SkyModel
 from service.storage.queries.results import batch_with_options, read_parent
 from service.storage.recording.answer import answer_of
@@ -585,11 +585,7 @@ def decided(outcomes: WriteOutcomes) -> Answers:
 
 
 def _submissions_of_array(sent: bytes) -> list[Submission | BadBatch]:
-    try:
-        elements = _ARRAY.validate_json(sent)
-    except ValidationError as error:
-        raise BadBatch(faults_of(error)) from None
-    return [_submission_of(each) for each in elements]
+    return [_submission_of(each) for each in checked_by(_ARRAY.validate_json, sent)]
 
 
 def _submission_of(element: Any) -> Submission | BadBatch:

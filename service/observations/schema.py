@@ -8,8 +8,8 @@ models are also what `openapi.yaml` shows.
 import codecs
 import hashlib
 import math
-from collections.abc import Iterable, Sequence
-from typing import Annotated, Any, Literal, Self
+from collections.abc import Callable, Iterable, Sequence
+from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 from msgspec import Struct
@@ -40,6 +40,8 @@ from service.observations.decode import batch_from_canonical, prior_from_canonic
 from service.observations.frame_record import FrameRecord
 from service.times import parse_utc
 
+Value = TypeVar("Value")
+
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
 
@@ -55,6 +57,21 @@ def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Faul
         Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
         for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
     ]
+
+
+def checked_by(
+    validate: Callable[[Any], Value], given: object, prefix: tuple[str, ...] = ()
+) -> Value:
+    """What one of pydantic's validators makes of what was given.
+
+    Raises `BadBatch` with the faults, outside the handler: pydantic's error holds all that was
+    given, and once it is part of a cycle Python's collector never frees it.
+    """
+    try:
+        return validate(given)
+    except ValidationError as error:
+        faults = faults_of(error, prefix)
+    raise BadBatch(faults)
 
 
 def _field(location: tuple[str | int, ...]) -> str:
@@ -512,10 +529,7 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
         body = body.removeprefix(codecs.BOM_UTF8)
     else:
         body = body.removeprefix("\ufeff")
-    try:
-        model = BatchIn.model_validate_json(body)
-    except ValidationError as error:
-        raise BadBatch(faults_of(error)) from None
+    model = checked_by(BatchIn.model_validate_json, body)
     return checked_from_model(model if run is None else model.model_copy(update={"run": run}))
 
 
@@ -568,7 +582,4 @@ def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:
         except ValueError:
             message = "must be NAME=VALUE, such as separation_deg=0.01"
             raise BadBatch(Fault(field, message, shown_value(text))) from None
-    try:
-        return TolerancesIn.model_validate(values)
-    except ValidationError as error:
-        raise BadBatch(faults_of(error, (field,))) from None
+    return checked_by(TolerancesIn.model_validate, values, (field,))

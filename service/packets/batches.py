@@ -5,11 +5,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from pydantic import ValidationError
-
-from service.errors import Fault
+from service.errors import BadBatch, Fault
 from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
-from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model, faults_of
+from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_by, checked_from_model
 from service.packets import clock
 from service.packets.definition import PacketFault
 from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns
@@ -315,9 +313,9 @@ class BatchMaker:
 def _json_of(body: dict[str, Any] | None, parameters_of: Callable[[Fault], str]) -> bytes:
     """A body as canonical JSON, with the checks of every batch."""
     try:
-        model = BatchIn.model_validate(body)
-    except ValidationError as error:
-        fault = faults_of(error)[0]
+        model = checked_by(BatchIn.model_validate, body)
+    except BadBatch as error:
+        fault = error.faults[0]
         message = f"{fault.field}: {fault.message}"
         raise PacketFault(parameters_of(fault), message, fault.value) from None
     return checked_from_model(model).text.encode()

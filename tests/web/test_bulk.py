@@ -117,3 +117,13 @@ def test_a_line_without_end_is_refused_without_being_held(client, batch, run, re
     state = replayed(client, run, packed.getvalue(), "gzip")
     assert resident_mb() - before < 50
     assert (state["counts"]["new"], state["lines"]["done"]) == (1, 2)
+
+
+def test_wrong_lines_are_not_held_once_they_are_refused(client, run, resident_mb):
+    """pydantic's errors hold what was sent, and of a cycle through one Python frees nothing."""
+    wrong = [json.dumps({"k" * 300_000 + str(number): 1}).encode() for number in range(300)]
+    packed = gzip.compress(b"\n".join(wrong))
+    before = resident_mb()
+    state = replayed(client, run, packed, "gzip")
+    assert state["lines"]["refused"] == 300
+    assert resident_mb() - before < 200

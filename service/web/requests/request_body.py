@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import IO, Annotated, Any, TypeVar
 
 from fastapi import Depends
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel
 from pydantic_core import from_json
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, Request
@@ -22,7 +22,7 @@ from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
-from service.observations.schema import faults_of
+from service.observations.schema import checked_by
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
@@ -253,9 +253,9 @@ async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
 def read_model(model: type[Body], body: bytes) -> Body:
     """The checked object of a body; an empty body gives every default."""
     try:
-        return model.model_validate_json(body or b"{}")
-    except ValidationError as error:
-        raise refused(body, BadBatch(faults_of(error))) from None
+        return checked_by(model.model_validate_json, body or b"{}")
+    except BadBatch as error:
+        raise refused(body, error) from None
 
 
 def refused(body: bytes, refusal: BadInput) -> BadInput:
