@@ -115,8 +115,12 @@ def _errors(errors: list[runs.RefusedLine]) -> dict[str, str]:
 
 
 def is_cancelled(connection: Connection, id: str) -> bool:
-    """True if the table says that a replay is cancelled, perhaps by another process."""
-    return connection.scalar(select(replays.c.state).where(replays.c.id == id)) == CANCELLED
+    """True if the table says that a replay is cancelled, perhaps by another process.
+
+    Until the transaction ends no other process changes the replay.
+    """
+    asked = select(replays.c.state).where(replays.c.id == id).with_for_update()
+    return connection.scalar(asked) == CANCELLED
 
 
 def unfinished_replays(connection: Connection) -> set[str]:
@@ -155,6 +159,8 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
 
     Raises `NotFound`, and `WrongState` for one that has ended.
     """
+    if is_cancelled(connection, id):
+        return
     replay = read_replay(connection, id)
     require_cancellable(replay.state)
     if replay.state in UNFINISHED:
