@@ -125,7 +125,7 @@ def test_a_damaged_kernel_is_removed_and_compiled_again(cache, caplog, suffix, d
     file.write_bytes(damaged(whole))
     assert call() == 42
     assert f"{file} is damaged" in caplog.text
-    # What is compiled anew may be named by a longer number.
+    # numba numbers each function that it compiles; a number of more digits makes a longer file.
     assert content_of(file)
     caplog.clear()
     assert call() == 42

@@ -157,11 +157,12 @@ def test_two_hundred_and_fifty_stars_are_named_within_the_bound(sky, rng):
         assert not identification.bounded
         right = identification.star == near
         assert not (identification.unique & ~right).any()
-        # What is as faint as the faintest of the catalog may be a star that it lacks.
+        # The identifier leaves stars near the catalog's limit unmatched: one that the catalog
+        # lacks may be as faint.
         expected = np.isin(near, zone_searched(found, sky).star) & (many.magnitude_mag < 7.5)
         named.append(right[expected].mean())
-    # Of 210 views one named half of them and one none: pairs of the twelve brightest are searched,
-    # of which but three lay inside.
+    # Of 210 views the identifier named half of the stars in one and none in another: it searches
+    # pairs of the twelve brightest stars, and only three or four of those lay inside the zone.
     assert np.median(named) > 0.9
 
 

@@ -177,7 +177,8 @@ def test_what_another_process_writes_is_told_of_too(postgresql_schemas, drawn):
 def test_a_database_that_is_away_is_asked_for_events_once_a_second(caplog):
     caplog.set_level("INFO", records.__name__)
     with socket.socket() as nobody:
-        nobody.bind(("127.0.0.1", 0))  # Nobody listens there, and no one else can.
+        # The socket never listens: connections are refused, and no other process takes its port.
+        nobody.bind(("127.0.0.1", 0))
         url = make_url(f"postgresql+psycopg://nobody@127.0.0.1:{nobody.getsockname()[1]}/none")
         began = time.monotonic()
         heard = records.HeardEvents(url, lambda: None)
