@@ -12,11 +12,13 @@ from collections import Counter
 import httpx
 import pytest
 import zstandard
+from sqlalchemy import text
 
 from service.app.factory import open_app
 from service.ingest import replays as replays_module
 from service.ingest.replays import RunningReplay
 from service.observations import decompress
+from service.storage.queries import replays as replay_rows
 from service.web.app import create_app
 from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM
@@ -25,6 +27,10 @@ from tests.web.test_access import Guarded, shown
 
 API = "/api/v1"
 NDJSON = {"Content-Type": "application/x-ndjson"}
+WAITING_FOR_THIS = text(
+    "SELECT count(*) FROM pg_locks WHERE pg_backend_pid() = ANY (pg_blocking_pids(pid))"
+)
+"""The transactions that wait for the one that asks."""
 
 
 PACKERS = {"gzip": gzip.compress, "zstd": zstandard.compress}
@@ -328,6 +334,35 @@ def test_a_replay_of_another_process_is_cancelled_through_the_database(database,
         state = client.get(place).json()
         assert row["batches"] == state["counts"]["new"] < 20_000
         assert state["state"] == "cancelled"
+
+
+@pytest.mark.parametrize("database", ["postgresql"], indirect=True)
+def test_a_cancellation_that_comes_while_progress_is_noted_is_kept(database, drawn, monkeypatch):
+    settings = in_process_settings(database)
+    batch = drawn("XTE", 1)[0]
+    places, answers = [], []
+    cancelling = threading.Thread(target=lambda: answers.append(elsewhere.delete(places[0])))
+    update_replay = replay_rows.update_replay
+
+    def update_once_a_cancellation_is_on_its_way(connection, progress, *others):
+        if places and progress.state == "running" and cancelling.ident is None:
+            cancelling.start()
+            wait_until(lambda: connection.scalar(WAITING_FOR_THIS) or not cancelling.is_alive())
+        update_replay(connection, progress, *others)
+
+    monkeypatch.setattr(replay_rows, "update_replay", update_once_a_cancellation_is_on_its_way)
+    with (
+        Server(create_app(open_app(settings))) as one,
+        Server(create_app(open_app(settings))) as other,
+        httpx.Client(base_url=one, timeout=60) as client,
+        httpx.Client(base_url=other, timeout=60) as elsewhere,
+    ):
+        places.append(begun(client, "r", many(batch, "r")))
+        (answer,) = wait_until(lambda: answers)
+        cancelling.join()
+        assert (answer.status_code, answer.json()["state"]) == (200, "cancelled")
+        wait_until(lambda: not any(t.name.startswith("replay-") for t in threading.enumerate()))
+        assert client.get(places[0]).json()["state"] == "cancelled"
 
 
 def test_an_interrupted_command_cancels_its_replay_on_the_server(client, batch, run, tmp_path):
