@@ -19,6 +19,8 @@ Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]
 
 ARCSEC_PER_RADIAN = math.degrees(1.0) * 3600.0
+UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
+"""Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
@@ -236,3 +238,9 @@ def attitude_matrices(quaternion: Vector) -> Vector:
         + 2.0 * v[:, :, None] * v[:, None, :]
         - 2.0 * c[:, None, None] * cross
     )
+
+
+def full_matrices(upper: Vector) -> Vector:
+    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6) in the order of `UPPER`."""
+    full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
+    return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))

@@ -32,10 +32,9 @@ from service.advice.statements import FileChange, Statement
 from service.advice.trackers import NoiseFinding
 from service.filtering.result import Outcome
 from service.grades.day import MeasuredInnovations
-from service.grades.stretches import full_matrices
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings
-from service.vectors import Vector
+from service.vectors import Vector, full_matrices
 
 MOST = 20_000
 """Measurements, the latest ones: of more the estimate needs too long."""

@@ -24,10 +24,10 @@ from service.filtering.inputs import AttitudeMeasurements, ConstantRateModel
 from service.filtering.result import AttitudeHistory, FilterResult, Integers, Outcome, Status
 from service.filtering.smoother import smooth
 from service.filtering.updates import ATTITUDE
-from service.grades.stretches import UPPER, Mask, Recorded, Stretch, cut
+from service.grades.stretches import Mask, Recorded, Stretch, cut
 from service.missions.mission import Mission
 from service.times import DAY_S, Utc, bucket_start, shifted
-from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
+from service.vectors import ARCSEC_PER_RADIAN, UPPER, Vector, rotation_vectors
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,19 +21,11 @@ from service.filtering.inputs import (
 from service.gyro import Nanoseconds
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings, MotionSettings
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices
 
 LONGEST_GAP_S = 600.0
 """A longer gap ends a stretch; what an attitude is worth is gone by then."""
 _LONGEST_GAP_NS = int(LONGEST_GAP_S) * 10**9
-UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""
-
-
-def full_matrices(upper: Vector) -> Vector:
-    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6) in the order of `UPPER`."""
-    full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
-    return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,7 +27,7 @@ FLOOR_DEG, CEILING_DEG = 0.1, 3.0
 MAX_AGE_S = 3600.0
 BODY_RATE_SIGMA_DEG_PER_S = 0.001
 """Of the rates that batches carry, where a mission names no other."""
-UNIT_TOLERANCE, LEAST_VOLUME = 1e-3, 0.1
+AXIS_LENGTH_TOLERANCE, LEAST_VOLUME = 1e-3, 0.1
 
 AxisName = Literal["X", "Y", "Z", "-X", "-Y", "-Z"]
 Axis = tuple[float, float, float]
@@ -59,7 +59,7 @@ class GyroSettings(Strict):
     @model_validator(mode="after")
     def _axes_span_space(self) -> "GyroSettings":
         axes = self._axes_body
-        if np.abs(np.linalg.norm(axes, axis=1) - 1.0).max() > UNIT_TOLERANCE:
+        if np.abs(np.linalg.norm(axes, axis=1) - 1.0).max() > AXIS_LENGTH_TOLERANCE:
             raise ValueError("axes: each must be a unit vector")
         if abs(np.linalg.det(axes)) < LEAST_VOLUME:
             raise ValueError("axes: the three must not lie near one plane")

@@ -330,12 +330,6 @@ def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
     return replace(rows, rate_deg_per_s=result, rate_origin=origin)
 
 
-def full_matrices(upper: Vector) -> Vector:
-    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6): 11, 12, 13, 22, 23, 33."""
-    full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
-    return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))
-
-
 _BODY, _INERTIAL = "SC_BODY_1", "EME2000"
 _TO_BODY = f"{_INERTIAL} to {_BODY}"
 _COVARIANCE = ("11", "12", "13", "22", "23", "33")

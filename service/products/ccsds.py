@@ -22,7 +22,7 @@ import numpy as np
 from service.products import attitudes
 from service.products.spool import pieces, spool
 from service.products.tables import rows_of_texts
-from service.vectors import Vector
+from service.vectors import Vector, full_matrices
 
 Pairs = Sequence[tuple[str, str]]
 
@@ -224,7 +224,7 @@ def _covariance_metadata(about: attitudes.SeriesInfo) -> Pairs:
 
 
 def _variances_deg2(about: attitudes.SeriesInfo, part: attitudes.AttitudeBlock) -> Vector:
-    p = attitudes.full_matrices(part.covariance_arcsec2)
+    p = full_matrices(part.covariance_arcsec2)
     if len(about.trackers) == 1:
         axes = np.array(about.trackers[0].body_from_tracker)
         p = axes.T @ p @ axes

@@ -10,6 +10,7 @@ from service.errors import NotFound
 from service.products import attitudes
 from service.products.reading.known import between
 from service.times import Utc
+from service.vectors import full_matrices
 
 AtMethod = Literal["nearest", "interpolated"]
 
@@ -77,7 +78,7 @@ def _nearest(
         moment.text,
         method,
         rows.quaternion[place].tolist(),
-        attitudes.full_matrices(rows.covariance_arcsec2[place]).tolist(),
+        full_matrices(rows.covariance_arcsec2[place]).tolist(),
         0.0 if offset_s == 0.0 else motion,
         offset_s,
         [str(rows.id[place])],
@@ -100,7 +101,7 @@ def _interpolated(rows: attitudes.AttitudeBlock, after: int, moment: Utc) -> Att
         moment.text,
         "interpolated",
         q.tolist(),
-        attitudes.full_matrices(weights[0] * one + weights[1] * other).tolist(),
+        full_matrices(weights[0] * one + weights[1] * other).tolist(),
         None if np.isnan(change) else change * step_s / 8.0,
         offset_s * 1e-9,
         list(dict.fromkeys(str(each) for each in rows.id[pair])),

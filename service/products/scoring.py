@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from service.products.attitudes import AttitudeBlock, Integers, full_matrices
+from service.products.attitudes import AttitudeBlock, Integers
 from service.products.reading.known import KnownAttitudes
-from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
+from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices, rotation_vectors
 
 AXES = ("x", "y", "z")
 _SHARES = (50.0, 95.0, 99.0)
