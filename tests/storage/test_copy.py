@@ -214,6 +214,11 @@ def run_and_kill(source, target, output, steps, after_s):
     return code != 0
 
 
+def has_begun(target):
+    """Whether a worker lived until there was a database to copy to."""
+    return not target.startswith("sqlite") or Path(database_url(target).database).is_file()
+
+
 @pytest.mark.slow
 @pytest.mark.torture
 def test_a_copy_that_is_killed_at_any_moment_goes_on(recorded, database, tmp_path, rng, figures):
@@ -230,7 +235,7 @@ def test_a_copy_that_is_killed_at_any_moment_goes_on(recorded, database, tmp_pat
             source, target, tmp_path / "out", int(rng.integers(0, 150)), float(rng.uniform(0, 0.02))
         ):
             killed += 1
-            if (revision_of(target) or "").startswith(UNFINISHED):
+            if has_begun(target) and (revision_of(target) or "").startswith(UNFINISHED):
                 assert "is an unfinished copy" in check(target)[0]
         assert verify(target) == []
         assert rows_of(target) == before
