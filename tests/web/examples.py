@@ -4,6 +4,7 @@ They are written to `service/web/examples.json`; `make openapi` then puts them
 into `openapi.yaml`.
 """
 
+import argparse
 import gzip
 import json
 import tempfile
@@ -406,4 +407,6 @@ def fresh_walk() -> Json:
 
 
 if __name__ == "__main__":
+    # With `--help` the parser ends the program before it writes the file.
+    argparse.ArgumentParser(prog="python -m tests.web.examples", description=__doc__).parse_args()
     FILE.write_text(json.dumps(fresh_walk(), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
