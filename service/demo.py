@@ -20,6 +20,7 @@ import httpx
 import msgspec
 
 from service.acquire.kernel_build import KernelBuild, kernel_progress
+from service.child_processes import command_of
 from service.errors import BadConfiguration, BadInput, Busy, Fault
 from service.missions.mission import load_missions
 from service.replay.items import items_of
@@ -226,7 +227,7 @@ def _digest(files: Sequence[Path]) -> str:
 @contextmanager
 def _served(settings: Settings, log: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A server of its own process, stopped when the block ends, however it ends."""
-    command = [sys.executable, "-m", "service.cli", "serve"]
+    command = [*command_of("service.cli"), "serve"]
     command += ["--host", settings.host, "--port", str(settings.port)]
     command += ["--database", settings.database]
     before = signal.signal(signal.SIGTERM, _interrupt)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from service.acquire.kernel_build import exit_after_parent
+from service.child_processes import Source, own_source, require_source, safe_path
 
 
 def number_of(processes: int | None) -> int:
@@ -23,5 +24,13 @@ def mapping(processes: int | None) -> Iterator[Callable[..., Iterator[Any]]]:
         yield map
         return
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(count, context, exit_after_parent) as workers:
+    with (
+        safe_path(),
+        ProcessPoolExecutor(count, context, _begin, (own_source(),)) as workers,
+    ):
         yield workers.map
+
+
+def _begin(parent: Source) -> None:
+    require_source(parent)
+    exit_after_parent()

@@ -24,6 +24,7 @@ import llvmlite.binding  # type: ignore[import-untyped]
 import numba
 
 from service.acquire.prewarm import prewarm_kernels
+from service.child_processes import Source, own_source, require_source, safe_path
 from service.compiled.checked_file import count_whole
 from service.errors import Busy, Stopping
 from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
@@ -83,10 +84,13 @@ class KernelBuild:
             for share in _shares(_processors()):
                 receiver, sender = _CONTEXT.Pipe(duplex=False)
                 child = _CONTEXT.Process(
-                    target=_compile, args=(dict(missions), share, sender), daemon=True
+                    target=_compile,
+                    args=(dict(missions), share, sender, own_source()),
+                    daemon=True,
                 )
                 self._children.append(child)
-                child.start()
+                with safe_path():
+                    child.start()
                 # The child alone holds this end: when it has ended there is nothing to wait for.
                 sender.close()
                 receivers.append(receiver)
@@ -195,9 +199,13 @@ def _has_reported(child: connection.Connection) -> bool:
 
 
 def _compile(
-    missions: Mapping[str, Mission], share: _Share, zones_built: connection.Connection
+    missions: Mapping[str, Mission],
+    share: _Share,
+    zones_built: connection.Connection,
+    parent: Source,
 ) -> None:
     end_with_parent()
+    require_source(parent)
     sky = SkyModel(load_embedded(), LruCache(64 << 20), opens_files=False)
     prewarm_kernels(sky, missions, share.zones)
     zones_built.send_bytes(b"zones")

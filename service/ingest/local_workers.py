@@ -28,6 +28,7 @@ from typing import Any, Generic, TypeVar
 
 from service import logs
 from service.acquire.kernel_build import SIGNALS
+from service.child_processes import safe_path
 from service.errors import Stopping
 from service.ingest import worker_process
 from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
@@ -167,6 +168,10 @@ class LocalWorkers(Generic[Input, Output]):
 
     def _open(self) -> "_Processes[Input, Output]":
         """Start the processes; raises `OSError` where that cannot be done."""
+        with safe_path():
+            return self._start()
+
+    def _start(self) -> "_Processes[Input, Output]":
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([worker_process.__name__])
         # Python 3.11.0 would have the server listen where every local user can connect.

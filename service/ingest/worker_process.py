@@ -8,7 +8,7 @@ import logging
 import os
 import pickle
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 from service import logs
 from service.acquire.kernel_build import end_with_parent
 from service.acquire.prewarm import prewarm_kernels
+from service.child_processes import Source, own_source, require_source
 from service.errors import BadConfiguration
 from service.ingest.solver_pool import Solver
 from service.missions.mission import Mission
@@ -44,9 +45,16 @@ class WorkerConfig:
     catalog: Path | None
     catalog_digest: str
     cache_bytes: int
+    source: Source = field(default_factory=own_source)
+    """The version and digest of the parent's code."""
 
     def solver(self) -> Solver:
-        """The worker's solver; raises `BadConfiguration` where the catalog's file has changed."""
+        """The worker's solver.
+
+        Raises `BadConfiguration` where the catalog's file has changed, or the code is not the
+        parent's.
+        """
+        require_source(self.source)
         catalog = open_catalog(self.catalog)
         if catalog.digest != self.catalog_digest:
             raise BadConfiguration(f"catalog {self.catalog}: the file has changed since the start")
