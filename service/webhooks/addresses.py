@@ -23,8 +23,24 @@ METADATA = frozenset(
 )
 """Addresses at which clouds tell a machine its own secrets; no setting allows them."""
 NAT64 = networks("64:ff9b::/96")
-NOT_PUBLIC = networks("64:ff9b:1::/48, 192.88.99.0/24, 2001::/32, fec0::/10, ::/96, ::ffff:0:0/96")
-"""Special networks that Python's own table counts, or once counted, as public."""
+UNICAST_IPV6 = networks("2000::/3")
+"""The only part of IPv6 from which IANA assigns public addresses; `NAT64` stands for IPv4."""
+NOT_PUBLIC = networks(
+    # IANA's registry of IPv4 special-purpose addresses, as of October 2025.
+    "0.0.0.0/8, 10.0.0.0/8, 100.64.0.0/10, 127.0.0.0/8, 169.254.0.0/16, 172.16.0.0/12,"
+    "192.0.0.0/24, 192.0.2.0/24, 192.88.99.0/24, 192.168.0.0/16, 198.18.0.0/15, 198.51.100.0/24,"
+    "203.0.113.0/24, 240.0.0.0/4,"
+    # IANA's registry of IPv6 special-purpose addresses, as of October 2025.
+    "::/128, ::1/128, ::ffff:0:0/96, 64:ff9b:1::/48, 100::/64, 100:0:0:1::/64, 2001::/23,"
+    "2001:db8::/32, 3fff::/20, 5f00::/16, fc00::/7, fe80::/10,"
+    # Multicast; IPv4-compatible, IPv4-translated (RFC 2765) and site-local addresses.
+    "224.0.0.0/4, ff00::/8, ::/96, ::ffff:0:0:0/96, fec0::/10"
+)
+"""Networks that are not public, whatever the table of this version of Python says.
+
+Of 192.0.0.0/24 and 2001::/23 the registries call some addresses reachable: relays and
+translators, which receive no webhooks.
+"""
 NO_WEB_PORTS = frozenset(
     (1719, 1720, 1723, 2049, 3659, 4045, 4190, 5060, 5061, 6000, 6566, 6679, 6697, 10080)
 ) | frozenset(range(6665, 6670))
@@ -124,7 +140,7 @@ def require_reachable(
             continue
         if only_allowed:
             raise Refused(f"{address} is not in ACQUIRE_WEBHOOK_NETWORKS, as plain http requires")
-        if not each.is_global or each.is_multicast or _is_in(each, NOT_PUBLIC):
+        if not _is_public(each):
             raise Refused(f"{address} is not a public address, and no allowed network has it")
 
 
@@ -155,6 +171,12 @@ def _literal(host: str) -> Address | None:
 
 def _is_in(address: Address, among: Sequence[Network]) -> bool:
     return any(address in network for network in among)
+
+
+def _is_public(address: Address) -> bool:
+    if isinstance(address, ipaddress.IPv6Address) and not _is_in(address, UNICAST_IPV6 + NAT64):
+        return False
+    return not _is_in(address, NOT_PUBLIC)
 
 
 def _embedded(address: Address) -> Iterator[Address]:

@@ -1,5 +1,6 @@
 """Webhooks reach public addresses and named networks only, on the address connected to."""
 
+import ipaddress
 import socket
 import ssl
 import subprocess
@@ -9,7 +10,13 @@ import pytest
 
 from service.errors import BadInput
 from service.settings import networks
-from service.webhooks.addresses import MAX_URL, Refused, require_reachable, require_url
+from service.webhooks.addresses import (
+    MAX_URL,
+    NOT_PUBLIC,
+    Refused,
+    require_reachable,
+    require_url,
+)
 from tests.waiting import wait_until
 from tests.webhooks.conftest import HERE, receiving, serving
 
@@ -45,6 +52,23 @@ LITERALS = [
     "https://[64:ff9b:1::a00:1]/",
     "https://[2001:0:7f00:1::]/",
     "https://[2001:db8::1]/",
+    "https://192.0.0.1/",
+    "https://192.0.0.9/",
+    "https://192.0.0.171/",
+    "https://192.88.99.2/",
+    "https://[3fff::1]/",
+    "https://[3fff:fff:ffff:ffff::1]/",
+    "https://[5f00::1]/",
+    "https://[::ffff:0:8.8.8.8]/",
+    "https://[100::1]/",
+    "https://[100:0:0:1::1]/",
+    "https://[64:ff9b::c000:1]/",
+    "https://[64:ff9b::c0a8:101]/",
+    "https://[2002:c0a8:101::1]/",
+    "https://[2002:c000:1::1]/",
+    "https://[2001:1::1]/",
+    "https://[4000::1]/",
+    "https://[fec0::1]/",
 ]
 """Each is refused by itself; those that stand for an IPv4 address, for that one."""
 
@@ -86,6 +110,36 @@ def test_an_address_that_is_not_public_is_refused(url):
     with pytest.raises(BadInput) as refused:
         require_url(url, ())
     assert [fault.field for fault in refused.value.faults] == ["url"]
+
+
+@pytest.mark.parametrize("answer", [True, False])
+def test_the_table_of_this_python_decides_nothing(answer, monkeypatch):
+    for kind in (ipaddress.IPv4Address, ipaddress.IPv6Address):
+        for name in ("is_global", "is_private", "is_reserved", "is_multicast", "is_unspecified"):
+            monkeypatch.setattr(kind, name, answer)
+    for url in LITERALS:
+        with pytest.raises(BadInput):
+            require_url(url, ())
+    for url in ("https://8.8.8.8/", "https://[2606:4700::1111]/", "https://[64:ff9b::808:808]/"):
+        require_url(url, ())
+
+
+def test_the_addresses_beside_a_special_network_are_public(rng):
+    """Just outside of each network, unless another one is there; inside, all are refused."""
+    for network in NOT_PUBLIC:
+        first, size = int(network.network_address), network.num_addresses
+        inside = {first, first + size - 1, *(first + int(rng.random() * size) for _ in range(20))}
+        for each in inside:
+            with pytest.raises(Refused):
+                require_reachable(type(network.network_address)(each), ())
+    for beside in (
+        *("1.0.0.0", "9.255.255.255", "11.0.0.0", "100.63.255.255", "100.128.0.0"),
+        *("126.255.255.255", "128.0.0.0", "169.253.255.255", "172.15.255.255", "172.32.0.0"),
+        *("191.255.255.255", "192.0.1.0", "192.0.3.0", "192.88.98.255", "192.167.255.255"),
+        *("198.17.255.255", "198.20.0.0", "198.51.101.0", "203.0.114.0", "223.255.255.255"),
+        *("2001:200::", "2001:db7:ffff::", "2001:db9::", "3ffe:ffff::", "3fff:1000::", "2000::"),
+    ):
+        require_reachable(ip_address(beside), ())
 
 
 @pytest.mark.parametrize(("url", "said"), FORMS, ids=[url[:40] for url, _ in FORMS])
