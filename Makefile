@@ -152,7 +152,9 @@ pythons: $(DEV)
 dist: $(DEV)
 	@rm -rf dist
 	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --out-dir dist
-	@UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --wheel --out-dir dist client
+	@for part in client studies; do \
+		UV_PYTHON=$(BIN)/python $(BIN)/uv build --no-build-isolation --quiet --wheel --out-dir dist $$part || exit 1; \
+	done
 	@$(BIN)/uv tool run --quiet --from cyclonedx-bom==7.5.0 cyclonedx-py requirements \
 		--pyproject pyproject.toml --output-reproducible --output-file dist/bill-of-materials.cdx.json \
 		requirements.lock
@@ -189,16 +191,16 @@ define install
 	@echo "Installing the packages of $(1) into $(VENV) (once)"
 	@[ -x $(BIN)/uv ] || awk '/^[a-z]/ { wanted = /^uv==/ } wanted' requirements-dev.lock | \
 		$(PIP) --only-binary :all: --require-hashes --requirement /dev/stdin || true
-	@{ $(UV) --require-hashes --requirement $(1) && $(UV) --no-deps --no-build-isolation --editable .; } || \
+	@{ $(UV) --require-hashes --requirement $(1) && $(UV) --no-deps --no-build-isolation --editable . --editable ./studies; } || \
 		{ echo "uv cannot; pip takes about a minute"; \
-		$(PIP) --require-hashes --requirement $(1) && $(PIP) --no-deps --no-build-isolation --editable .; }
+		$(PIP) --require-hashes --requirement $(1) && $(PIP) --no-deps --no-build-isolation --editable . --editable ./studies; }
 endef
 
-$(RUNTIME): requirements.lock pyproject.toml | $(BIN)/python
+$(RUNTIME): requirements.lock pyproject.toml studies/pyproject.toml | $(BIN)/python
 	$(call install,requirements.lock)
 	@touch $@
 
 # Holds the runtime packages too, in the same versions.
-$(DEV): requirements-dev.lock requirements.lock pyproject.toml | $(BIN)/python
+$(DEV): requirements-dev.lock requirements.lock pyproject.toml studies/pyproject.toml | $(BIN)/python
 	$(call install,requirements-dev.lock)
 	@touch $(RUNTIME) $@

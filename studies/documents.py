@@ -1,11 +1,11 @@
-"""What studies write: tables as Markdown, rows as JSON, pictures and links to them.
+"""Files that studies write: rows as JSON, pictures and links to them.
 
 matplotlib is imported when a picture is drawn: it comes with the extra `plots`.
 """
 
 import json
 import os.path
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,20 +14,6 @@ from service.extras import require_extra
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns, the first to the left and the others to the right."""
-    table = [list(header), *(list(row) for row in rows)]
-    widths = [max(len(row[k]) for row in table) for k in range(len(header))]
-    rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]
-
-    def line(cells: Sequence[str]) -> str:
-        first = cells[0].ljust(widths[0])
-        others = (cell.rjust(width) for cell, width in zip(cells[1:], widths[1:], strict=True))
-        return "| " + " | ".join([first, *others]) + " |"
-
-    return "\n".join([line(table[0]), line(rule), *map(line, table[1:])])
 
 
 def json_rows(rows: Iterable[Any]) -> str:

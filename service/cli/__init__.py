@@ -10,6 +10,7 @@ import pkgutil
 import sys
 from collections.abc import Sequence
 from importlib import import_module
+from importlib.metadata import entry_points
 from io import TextIOWrapper
 
 from service import __version__
@@ -64,7 +65,11 @@ def _complain(text: str) -> None:
 
 
 def build_parser() -> argparse.ArgumentParser:
-    """The parser of the whole command; `function` of what it parses runs the chosen command."""
+    """The parser of the whole command; `function` of what it parses runs the chosen command.
+
+    An installed package adds commands by an entry point of the group `acquire.commands`: a function
+    that takes what `add` of the modules in `commands` takes.
+    """
     parser = add_command(
         None,
         "acquire",
@@ -80,4 +85,6 @@ def build_parser() -> argparse.ArgumentParser:
     added = add_subcommands(parser)
     for module in pkgutil.iter_modules(commands.__path__):
         import_module(f"{commands.__name__}.{module.name}").add(added)
+    for entry in entry_points(group="acquire.commands"):
+        entry.load()(added)
     return parser

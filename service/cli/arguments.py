@@ -46,6 +46,9 @@ class Parser(argparse.ArgumentParser):
     A command that has commands of its own prints its help where none is given.
     """
 
+    commands: Any = None
+    """What takes the commands of this command; None for one without."""
+
     def error(self, message: str) -> NoReturn:
         """Print the message and exit with code 2."""
         self.exit(2, f"acquire: {message} (see `{self.prog} --help`)\n")
@@ -136,7 +139,15 @@ def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:
 
 def add_subcommands(parser: argparse.ArgumentParser) -> Any:
     """Let a parser take one of several commands; without one it prints its help."""
-    return parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    taken = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
+    if isinstance(parser, Parser):
+        parser.commands = taken
+    return taken
+
+
+def commands_of(parent: Any, name: str) -> Any:
+    """Return what takes the commands of a group added before; a package adds its own to it."""
+    return parent.choices[name].commands
 
 
 def add_database(parser: argparse.ArgumentParser) -> None:
@@ -215,11 +226,6 @@ def count(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be a whole number of at least 1 (got {text!r})")
     return number
-
-
-def table(text: str) -> int | str:
-    """Parse the number of a table, or the name of one such as ptp-5."""
-    return count(text) if text.lstrip("-").isdigit() else text
 
 
 def speed(text: str) -> float | None:

@@ -14,8 +14,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from service.advice.intervals import Interval
+from service.cli.tables import markdown
 from service.errors import BadInput, Fault, shown_value
-from studies.documents import markdown, pictures_in
+from studies.documents import pictures_in
 from studies.mission_rates.simulation import OUTCOMES, Plan, Rates, sigobs_arcsec
 
 TITLES = {name: name.replace("_", " ") for name in OUTCOMES}

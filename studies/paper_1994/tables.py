@@ -14,12 +14,12 @@ import numpy as np
 
 from service.acquire import acquire
 from service.acquire.prewarm import prewarm_kernels
+from service.cli.tables import markdown
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import Band, Identifier, Mission
 from service.sky.geometry.pairs import PAIRS_PER_BIN, build_pairs
 from service.sky.model import SkyModel
 from service.sky.zones import build_zone
-from studies.documents import markdown
 from studies.paper_1994.experiments import open_sky
 from studies.paper_1994.printed import Run, Times, World, the_paper
 from studies.paper_1994.tally import (

@@ -7,12 +7,13 @@ from typing import Any, TextIO
 
 import numpy as np
 
+from service.cli.tables import markdown
 from service.errors import BadInput, Fault
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.geometry.triangles import build_triangles
-from studies.documents import json_rows, links, markdown
+from studies.documents import json_rows, links
 from studies.ptp_2015 import comparison, tables
 from studies.ptp_2015.comparison import Case
 from studies.ptp_2015.plots import draw

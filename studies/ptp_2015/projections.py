@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from service.cli.tables import markdown
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.kvector import KVector, build_kvector
 from service.sky.geometry.triangles import TriangleIndex, build_triangles
 from service.vectors import Vector
-from studies.documents import markdown
 from studies.ptp_2015.printed import the_ptp_paper
 from studies.ptp_2015.rivals.proposed import proposed_by_votes
 

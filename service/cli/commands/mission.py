@@ -186,8 +186,8 @@ def _changed(mission: "Mission", table: str, key: str, value: float, option: str
 
 
 def _text(mission: "Mission", epoch_year: float, found: "list[ZoneEstimate]") -> str:
+    from service.cli.tables import markdown
     from service.sky.geometry.pairs import MAX_PAIRS
-    from studies.documents import markdown
 
     header = (
         *("zone", "HMAX", "to mag", "NCAP least", "median", "most", "NTOT least", "median"),

@@ -1,13 +1,11 @@
 """`acquire simulate`: skies whose truth is known."""
 
-import io
 from argparse import Namespace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from service.cli import arguments
 from service.cli.arguments import mission_and_catalog
-from service.cli.simulated_rates import add_mission, add_paper
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
@@ -21,13 +19,11 @@ def add(commands: Any) -> None:
     group = arguments.add_group(
         commands,
         "simulate",
-        "Simulate telemetry and frames with known truth, and repeat published experiments.",
+        "Simulate telemetry and frames with known truth; with the package of studies, repeat "
+        "published experiments.",
         "acquire simulate telemetry --spacecraft XTE --batches 2000 --seed 7 xte.ndjson",
     )
     _add_frames(group)
-    _add_imaging(group)
-    add_mission(group)
-    add_paper(group)
     _add_telemetry(group)
 
 
@@ -130,50 +126,6 @@ def _run_frames(parsed: Namespace) -> int:
     written = write_frames(bar, parsed.output, parsed.format)
     print(f"{parsed.output}: {written} frames of {mission.name}; truth: {parsed.output / TRUTH}")
     return 0
-
-
-def _add_imaging(group: Any) -> None:
-    parser = arguments.add_command(group, "imaging", _run_imaging)
-    parser.add_argument(
-        "--row", nargs="+", default=[], metavar="IM-N", help="IM-1 to IM-11; default all"
-    )
-    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
-    parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
-    arguments.add_json_file(parser, "the claims with their figures")
-    parser.add_argument(
-        "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
-    )
-    parser.add_argument(
-        "--report",
-        type=Path,
-        metavar="FILE",
-        help="write everything to a page instead of printing it",
-    )
-
-
-def _run_imaging(parsed: Namespace) -> int:
-    """Compare every claim of the star image detection report with a measurement: crosses of wire
-    meshes, correlation, estimation, scans and their noise, pattern constants.
-
-    acquire simulate imaging --row IM-4
-    acquire simulate imaging --seed 7 --json claims.json
-    acquire simulate imaging --plots docs/plots --report docs/imaging.md
-    """
-    from studies.star_image_report.command import as_json, run_imaging
-
-    prints_json = parsed.json == arguments.STANDARD_OUTPUT
-    rows = run_imaging(
-        parsed.row,
-        parsed.seed,
-        parsed.quick,
-        json_path=None if prints_json else parsed.json,
-        plots_folder=parsed.plots,
-        report_path=parsed.report,
-        out=io.StringIO() if prints_json else None,
-    )
-    if prints_json:
-        print(as_json(rows), end="")
-    return 0 if all(row.holds for row in rows) else 1
 
 
 _SIZES = {

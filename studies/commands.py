@@ -1,4 +1,7 @@
-"""`acquire simulate mission` and `paper`: rates of settings under errors, and of papers."""
+"""The commands `acquire simulate mission`, `paper` and `imaging`, where this package is installed.
+
+The service finds `add` by the entry point of `pyproject.toml` in this folder.
+"""
 
 import io
 from argparse import ArgumentParser, ArgumentTypeError, Namespace
@@ -10,10 +13,10 @@ from service.cli.arguments import (
     add_command,
     add_json,
     add_json_file,
+    commands_of,
     count,
     mission_of_file_or_name,
     print_json,
-    table,
 )
 from service.errors import BadInput, Fault, shown_value
 from service.missions.identifiers import IDENTIFIERS
@@ -38,8 +41,15 @@ field of view, and magnitude_bound_mag is six times magnitude_error_mag.
 All settings see the same stars and draws. Nothing is searched outside the zone."""
 
 
-def add_mission(group: Any) -> None:
-    """Declare the command."""
+def add(commands: Any) -> None:
+    """Add the commands to the group `simulate`."""
+    group = commands_of(commands, "simulate")
+    _add_imaging(group)
+    _add_mission(group)
+    _add_paper(group)
+
+
+def _add_mission(group: Any) -> None:
     parser = add_command(group, "mission", _run_mission, notes=NOTES)
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
@@ -249,12 +259,11 @@ strict: all stars that the algorithm names are correct, at least three; checked:
 same after the attitude check of the identifier `ptp`."""
 
 
-def add_paper(group: Any) -> None:
-    """Declare the command."""
+def _add_paper(group: Any) -> None:
     parser = add_command(group, "paper", _run_paper, notes=PTP_HELP)
     parser.add_argument(
         "--table",
-        type=table,
+        type=_table,
         metavar="N|NAME",
         help="2 to 14 (default: all of these), or a name",
     )
@@ -361,3 +370,52 @@ def _run_ptp(parsed: Namespace) -> int:
     if prints_json:
         print_json(rows_of(found))
     return 0
+
+
+def _table(text: str) -> int | str:
+    """Parse the number of a table, or the name of one such as ptp-5."""
+    return count(text) if text.lstrip("-").isdigit() else text
+
+
+def _add_imaging(group: Any) -> None:
+    parser = add_command(group, "imaging", _run_imaging)
+    parser.add_argument(
+        "--row", nargs="+", default=[], metavar="IM-N", help="IM-1 to IM-11; default all"
+    )
+    parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
+    parser.add_argument("--quick", action="store_true", help="small samples and coarser grids")
+    add_json_file(parser, "the claims with their figures")
+    parser.add_argument(
+        "--plots", type=Path, metavar="FOLDER", help="write the figures (needs matplotlib)"
+    )
+    parser.add_argument(
+        "--report",
+        type=Path,
+        metavar="FILE",
+        help="write everything to a page instead of printing it",
+    )
+
+
+def _run_imaging(parsed: Namespace) -> int:
+    """Compare every claim of the star image detection report with a measurement: crosses of wire
+    meshes, correlation, estimation, scans and their noise, pattern constants.
+
+    acquire simulate imaging --row IM-4
+    acquire simulate imaging --seed 7 --json claims.json
+    acquire simulate imaging --plots docs/plots --report docs/imaging.md
+    """
+    from studies.star_image_report.command import as_json, run_imaging
+
+    prints_json = parsed.json == STANDARD_OUTPUT
+    rows = run_imaging(
+        parsed.row,
+        parsed.seed,
+        parsed.quick,
+        json_path=None if prints_json else parsed.json,
+        plots_folder=parsed.plots,
+        report_path=parsed.report,
+        out=io.StringIO() if prints_json else None,
+    )
+    if prints_json:
+        print(as_json(rows), end="")
+    return 0 if all(row.holds for row in rows) else 1
