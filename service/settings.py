@@ -47,6 +47,7 @@ class Settings:
     `follow` is a stream of NATS that the service follows, as `acquire follow` does: with the
     durable consumer `follow_consumer`, answers to the subject `follow_answers`, the file of
     credentials, and the CA certificate (PEM) that the NATS server's certificate is checked with.
+    `features_off` are the features (`service.feature`) that the service leaves out.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -75,6 +76,7 @@ class Settings:
     follow_answers: str | None = None
     follow_credentials: Path | None = None
     follow_authority: Path | None = None
+    features_off: str = ""
 
     def __post_init__(self) -> None:
         if not self.database.strip():

@@ -17,6 +17,7 @@ from service import __version__
 from service.cli import commands
 from service.cli.arguments import add_command, add_subcommands
 from service.errors import AcquisitionError, BadInput
+from service.feature import SETTING, feature_modules
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -32,8 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if isinstance(stream, TextIOWrapper):
             # A locale may have no sign for a name of a star, or of a file.
             stream.reconfigure(errors="backslashreplace")
-    parsed = build_parser().parse_args(arguments)
+    parsed = None
     try:
+        parsed = build_parser(os.environ.get(SETTING, "")).parse_args(arguments)
         code: int = parsed.function(parsed)
         sys.stdout.flush()
         return code
@@ -64,9 +66,10 @@ def _complain(text: str) -> None:
         print(f"acquire: {line}", file=sys.stderr)
 
 
-def build_parser() -> argparse.ArgumentParser:
+def build_parser(features_off: str = "") -> argparse.ArgumentParser:
     """The parser of the whole command; `function` of what it parses runs the chosen command.
 
+    `features_off` are the features whose commands are left out; see `service.feature`.
     An installed package adds commands by an entry point of the group `acquire.commands`: a function
     that takes what `add` of the modules in `commands` takes.
     """
@@ -83,8 +86,10 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"acquire {__version__}")
     added = add_subcommands(parser)
-    for module in pkgutil.iter_modules(commands.__path__):
-        import_module(f"{commands.__name__}.{module.name}").add(added)
+    for found in pkgutil.iter_modules(commands.__path__):
+        import_module(f"{commands.__name__}.{found.name}").add(added)
+    for module in feature_modules("command", features_off):
+        module.add(added)
     for entry in entry_points(group="acquire.commands"):
         entry.load()(added)
     return parser

@@ -7,7 +7,7 @@ import os
 import socket
 import threading
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from contextlib import AsyncExitStack, asynccontextmanager
 
 import anyio
 import anyio.to_thread
@@ -21,6 +21,7 @@ from starlette.staticfiles import StaticFiles
 from service import __version__
 from service.app.factory import App
 from service.errors import AcquisitionError
+from service.feature import feature_modules
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     alarms,
@@ -41,7 +42,6 @@ from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
 from service.web.openapi import add_reference
-from service.web.own_follower import following
 from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
@@ -100,7 +100,10 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
             app.webhooks.sender.start()
             app.live_filter.start()
             app.definitive.start_schedule()
-            async with following(app, web_app.state.metrics):
+            async with AsyncExitStack() as running:
+                for module in feature_modules("serving", app.settings.features_off):
+                    own = module.serving(app, web_app.state.metrics)
+                    await running.enter_async_context(own)
                 yield
         finally:
             reporting.cancel()

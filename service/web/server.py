@@ -16,11 +16,11 @@ from starlette.types import ASGIApp
 from service import logs
 from service.app.factory import App, open_app
 from service.errors import BadConfiguration
+from service.feature import feature_modules
 from service.settings import Settings, is_loopback, networks
 from service.storage.sql.database_file import warn_of_readers
 from service.web.app import create_app
 from service.web.middleware import ProbesOnly
-from service.web.own_follower import source_of
 from service.web.slow_clients import Admission, Connection, SharedState
 
 MAX_FILES = 4096
@@ -41,7 +41,8 @@ def serve(settings: Settings) -> None:
     a loopback address while there are no tokens: every client could submit there.
     """
     # A mistake is named before the database is opened.
-    source_of(settings)
+    for module in feature_modules("serving", settings.features_off):
+        module.check(settings)
     app, probes = _opened(settings)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     _run(settings, create_app(app), probes)

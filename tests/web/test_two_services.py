@@ -19,8 +19,8 @@ from sqlalchemy import create_engine, make_url, select, text
 from service.app.factory import open_app
 from service.storage.sql.engines import database_url
 from service.storage.sql.tables import batches
-from tests.follow.bus import bus, followers
-from tests.follow.nats_server import nats_server
+from tests.features.follow.bus import bus, followers
+from tests.features.follow.nats_server import nats_server
 from tests.scale import size
 from tests.storage import samples
 from tests.storage.recount import assert_equal_to_a_recount

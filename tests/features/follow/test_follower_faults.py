@@ -14,11 +14,11 @@ import threading
 import pytest
 
 from service.errors import BadConfiguration
-from service.follow import follower as followers
-from service.follow.follower import TRIES, Answer, Follower, Metrics, NotNow, Refused
-from service.follow.source import Source
-from tests.follow.bus import bus
-from tests.follow.nats_server import certificate, nats_server
+from service.features.follow import follower as followers
+from service.features.follow.follower import TRIES, Answer, Follower, Metrics, NotNow, Refused
+from service.features.follow.source import Source
+from tests.features.follow.bus import bus
+from tests.features.follow.nats_server import certificate, nats_server
 
 SECONDS = 60.0
 FAILED = {"type": "about:blank", "status": 500, "detail": "it failed", "errors": []}

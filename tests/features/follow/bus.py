@@ -11,8 +11,8 @@ from itertools import islice
 import nats
 from nats.errors import Error as NatsError
 
-from service.follow.follower import DELIVERED, SEQUENCE
-from service.follow.source import Source, refusals_of
+from service.features.follow.follower import DELIVERED, SEQUENCE
+from service.features.follow.source import Source, refusals_of
 
 FOLLOW = [sys.executable, "-m", "service.cli", "follow"]
 

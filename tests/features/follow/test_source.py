@@ -2,7 +2,7 @@
 
 import pytest
 
-from service.follow.source import server_and_stream
+from service.features.follow.source import server_and_stream
 
 
 @pytest.mark.parametrize(

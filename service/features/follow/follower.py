@@ -33,7 +33,7 @@ from nats.js.errors import APIError, NoStreamResponseError, NotFoundError
 from prometheus_client import CollectorRegistry, Counter, Gauge
 
 from service.errors import AcquisitionError, BadConfiguration
-from service.follow.source import Source
+from service.features.follow.source import Source
 from service.gyro import is_gyro_line
 
 ACK_WAIT_S = 30.0

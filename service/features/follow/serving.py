@@ -15,7 +15,7 @@ import anyio.to_thread
 from service import errors
 from service.app.factory import App
 from service.extras import require_extra
-from service.follow.source import EXPECTED, Source, refusals_of, server_and_stream
+from service.features.follow.source import EXPECTED, Source, refusals_of, server_and_stream
 from service.settings import Settings
 from service.web.requests.access import json_response
 from service.web.requests.metrics import Metrics
@@ -24,7 +24,7 @@ from service.web.requests.request_body import MAX_JSON_BYTES, refused
 
 if TYPE_CHECKING:
     # NATS comes with an extra.
-    from service.follow.follower import Submit
+    from service.features.follow.follower import Submit
 
 log = logging.getLogger(__name__)
 
@@ -61,15 +61,20 @@ def source_of(settings: Settings) -> Source | None:
     )
 
 
+def check(settings: Settings) -> None:
+    """Raise for settings that name no stream that can be followed; see `source_of`."""
+    source_of(settings)
+
+
 @asynccontextmanager
-async def following(app: App, metrics: Metrics) -> AsyncIterator[None]:
+async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
     """Follow the stream that the settings name, in a task of its own."""
     source = source_of(app.settings)
     if source is None:
         yield
         return
-    from service.follow.follower import Follower
-    from service.follow.follower import Metrics as Counters
+    from service.features.follow.follower import Follower
+    from service.features.follow.follower import Metrics as Counters
 
     follower = Follower(source, _submit_to(app, metrics), Counters(metrics.registry))
     task = asyncio.create_task(follower.keep_running())
@@ -82,7 +87,7 @@ async def following(app: App, metrics: Metrics) -> AsyncIterator[None]:
 
 def _submit_to(app: App, metrics: Metrics) -> "Submit":
     """Submit as the routes do, for a follower."""
-    from service.follow.follower import Answer, NotNow, Refused, gyro_block_in
+    from service.features.follow.follower import Answer, NotNow, Refused, gyro_block_in
 
     async def recorded(message: bytes) -> Answer:
         if len(message) > MAX_JSON_BYTES:

@@ -8,8 +8,8 @@ import pytest
 from acquire_client import AsyncClient
 from acquire_client import errors as answers
 
-from service.follow.follower import Answer, NotNow, Refused
-from service.follow.over_http import OverHttp
+from service.features.follow.follower import Answer, NotNow, Refused
+from service.features.follow.over_http import OverHttp
 
 
 def answered_with(status, kind, content, message=b"{}"):

@@ -6,7 +6,7 @@ from acquire_client.encoding import path_of
 from acquire_client.retrying import Repeat
 
 from service.errors import BadConfiguration
-from service.follow.follower import Answer, NotNow, Refused, gyro_block_in
+from service.features.follow.follower import Answer, NotNow, Refused, gyro_block_in
 
 RECORDED = (200, 201)
 """The statuses of a message that was recorded before, and of one that is recorded now."""

@@ -13,12 +13,12 @@ from acquire_client import AsyncClient
 from sqlalchemy import func, select
 
 from service.errors import BadConfiguration
-from service.follow.follower import ACK_WAIT_S, Follower, Metrics
-from service.follow.over_http import OverHttp
-from service.follow.source import Source
+from service.features.follow.follower import ACK_WAIT_S, Follower, Metrics
+from service.features.follow.over_http import OverHttp
+from service.features.follow.source import Source
 from service.storage.sql.tables import batches
-from tests.follow.bus import FOLLOW, bus, followers
-from tests.follow.nats_server import Account, certificate, nats_server, tls
+from tests.features.follow.bus import FOLLOW, bus, followers
+from tests.features.follow.nats_server import Account, certificate, nats_server, tls
 from tests.fresh_databases import sqlite_at
 from tests.gyro.blocks import body as gyro_block
 from tests.scale import size

@@ -9,7 +9,7 @@ from service.cli import arguments
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.follow.follower import Metrics
+    from service.features.follow.follower import Metrics
 
 DEFAULT_CONCURRENCY = 16
 
@@ -76,9 +76,9 @@ def run(parsed: Namespace) -> int:
     from acquire_client import AsyncClient
     from prometheus_client import start_http_server
 
-    from service.follow.follower import Follower, Metrics
-    from service.follow.over_http import OverHttp
-    from service.follow.source import Source, refusals_of, server_and_stream
+    from service.features.follow.follower import Follower, Metrics
+    from service.features.follow.over_http import OverHttp
+    from service.features.follow.source import Source, refusals_of, server_and_stream
     from service.replay.over_http import checked_url, translated
 
     try:

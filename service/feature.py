@@ -1,0 +1,81 @@
+"""Features: subjects that the service can do without, each a folder of its own.
+
+Nothing outside the folder of a feature imports it.  Its package holds a `Feature` under the name
+`FEATURE`, which says which modules the feature brings; the rest of the service asks for these:
+
+- `command`: `add(commands)` declares its commands, as a module of `service.cli.commands` does.
+- `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
+  serves; `check(settings)` raises `BadConfiguration` before anything is opened.
+- `routes`: `ROUTERS` are its routes of the API, `POLICIES` their policies by name.
+- `pages`: importing it registers its pages of the console; its templates and scripts lie in the
+  folders `templates` and `static` of the package.
+- `panels`: `PANELS`, the parts that it adds to other pages: a function by the name of a page.
+
+Another package brings a feature by an entry point of the group `acquire.features` that names its
+`Feature`.  `ACQUIRE_FEATURES_OFF` names features that are not to be imported at all.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from types import ModuleType
+
+from service.errors import BadConfiguration, shown_value
+
+SHIPPED = ("follow",)
+"""The features that come with the service, in the order of their routes and commands."""
+
+KINDS = ("command", "serving", "routes", "pages", "panels")
+"""The modules that a feature may bring."""
+
+SETTING = "ACQUIRE_FEATURES_OFF"
+
+
+@dataclass(frozen=True)
+class Feature:
+    """What a feature brings.
+
+    `name` is its name in `ACQUIRE_FEATURES_OFF`; `package` is the package that holds the modules
+    named in `brings`.
+    """
+
+    name: str
+    package: str
+    brings: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if unknown := set(self.brings) - set(KINDS):
+            raise ValueError(f"{self.name}: a feature cannot bring {', '.join(sorted(unknown))}")
+
+
+@cache
+def known_features() -> Mapping[str, Feature]:
+    """Every feature that is installed, by name: those of `SHIPPED`, then those of entry points."""
+    shipped = [import_module(f"service.features.{name}").FEATURE for name in SHIPPED]
+    brought = [entry.load() for entry in entry_points(group="acquire.features")]
+    return {feature.name: feature for feature in (*shipped, *brought)}
+
+
+def features_on(off: str) -> list[Feature]:
+    """The features without those in a list such as `follow,tracks`.
+
+    Raises `BadConfiguration` for the name of no feature.
+    """
+    known = known_features()
+    names_off = {name.strip() for name in off.split(",")} - {""}
+    for name in sorted(names_off - known.keys()):
+        raise BadConfiguration(
+            f"{SETTING}: must be features of {', '.join(known)} (got {shown_value(name)})"
+        )
+    return [feature for name, feature in known.items() if name not in names_off]
+
+
+def feature_modules(kind: str, off: str) -> list[ModuleType]:
+    """The module of a kind from each feature that is not in the list `off`, imported now."""
+    return [
+        import_module(f"{feature.package}.{kind}")
+        for feature in features_on(off)
+        if kind in feature.brings
+    ]

@@ -1,1 +1,0 @@
-"""Telemetry from a message bus: follows a stream of NATS JetStream."""
