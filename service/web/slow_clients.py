@@ -27,6 +27,7 @@ from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol, RequestResp
 from uvicorn.server import ServerState
 
 from service.settings import Network, is_loopback
+from service.web.request_head import refusal_of
 
 RESERVED_FOR_LOOPBACK = 16
 """Connections that only clients on this machine may take, such as an operator's probes."""
@@ -409,6 +410,10 @@ class _Http(HttpToolsProtocol):
     def on_headers_complete(self) -> None:
         if self._is_over:
             return
+        refusal = refusal_of(self.url, self.parser.get_http_version(), self.headers)
+        if refusal is not None:
+            self._refuse(_raw_response(*refusal))
+            return
         super().on_headers_complete()
         self._no_head_since_s = None
         self._in_body = True
@@ -454,8 +459,8 @@ class _Http(HttpToolsProtocol):
 
     # ---- what is refused -----------------------------------------------------------------------
 
-    def _refuse(self) -> None:
-        """Answer 431 where an answer can still be given, and close."""
+    def _refuse(self, response: bytes | None = None) -> None:
+        """Answer where an answer can still be given, by default 431, and close."""
         if self._is_over:
             return
         self._is_over = True
@@ -464,7 +469,8 @@ class _Http(HttpToolsProtocol):
         is_answered = self._in_body and not is_answering
         if not is_answered and (not is_answering or self._can_interrupt()):
             self._disconnect()
-            self.transport.write(RAW_RESPONSES[HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE])
+            too_large = RAW_RESPONSES[HTTPStatus.REQUEST_HEADER_FIELDS_TOO_LARGE]
+            self.transport.write(response or too_large)
         # Closed at once, with bytes unread, it would be reset, and the answer perhaps lost; and
         # a client that connects again at once would cost as much as before.
         self.flow.hold(True)

@@ -112,6 +112,74 @@ def test_what_is_too_long_or_too_many_is_refused_and_the_connection_closed(conne
     assert all(is_closed(connection) for connection in connections)
 
 
+SMALL = b"Content-Type: application/json\r\n"
+POST = b"POST /api/v1/session HTTP/%s\r\n" + SMALL
+ILL_FORMED = {
+    "no Host": (400, b"GET /livez HTTP/1.1\r\n\r\n"),
+    "two Hosts": (400, GET + b"Host: localhost\r\n\r\n"),
+    "two Hosts in HTTP/1.0": (400, GET.replace(b"/1.1", b"/1.0") + b"Host: a\r\n\r\n"),
+    "a Host with a user": (400, b"GET /livez HTTP/1.1\r\nHost: a@localhost\r\n\r\n"),
+    "a Host with a space": (400, b"GET /livez HTTP/1.1\r\nHost: a localhost\r\n\r\n"),
+    "a Host with a path": (400, b"GET /livez HTTP/1.1\r\nHost: localhost/x\r\n\r\n"),
+    "an unknown coding": (501, POST % b"1.1" + b"Host: a\r\nTransfer-Encoding: deflate\r\n\r\n"),
+    "an unknown coding before chunked": (
+        501,
+        POST % b"1.1" + b"Host: a\r\nTransfer-Encoding: gzip, chunked\r\n\r\n2\r\n{}\r\n0\r\n\r\n",
+    ),
+    "an unknown coding after chunked": (
+        400,
+        POST % b"1.1" + b"Host: a\r\nTransfer-Encoding: chunked, x\r\n\r\n2\r\n{}\r\n0\r\n\r\n",
+    ),
+    "chunked in HTTP/1.0": (
+        400,
+        POST % b"1.0" + b"Host: a\r\nTransfer-Encoding: chunked\r\n\r\n2\r\n{}\r\n0\r\n\r\n",
+    ),
+    "chunked twice": (
+        400,
+        POST % b"1.1" + b"Host: a\r\nTransfer-Encoding: chunked, chunked\r\n\r\n0\r\n\r\n",
+    ),
+    "a length and chunked": (
+        400,
+        POST % b"1.1"
+        + b"Host: a\r\nContent-Length: 2\r\nTransfer-Encoding: chunked\r\n\r\n0\r\n\r\n",
+    ),
+    "a target of another host": (
+        400,
+        b"GET http://other.example/livez HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    ),
+    "a target with a user": (
+        400,
+        b"GET http://a@localhost/livez HTTP/1.1\r\nHost: localhost\r\n\r\n",
+    ),
+}
+"""Heads that RFC 9112 has a server refuse, with the status."""
+
+
+@pytest.mark.parametrize(("status", "sent"), ILL_FORMED.values(), ids=ILL_FORMED)
+def test_a_head_that_the_rfc_forbids_is_refused_and_the_connection_closed(connection, status, sent):
+    # What follows in the same connection is no second request.
+    send(connection, sent + GET + b"\r\n")
+    answer = received(connection, b"}" if status == 501 else b"\r\n\r\n")
+    assert answer.startswith(b"HTTP/1.1 %d " % status)
+    assert answer.count(b"HTTP/1.1 ") == 1
+    assert is_closed(connection)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [
+        GET.replace(b"GET /", b"GET http://localhost/") + b"\r\n",
+        GET.replace(b"GET /", b"GET HTTP://LOCALHOST/") + b"\r\n",
+        b"GET /livez HTTP/1.1\r\nHost: 127.0.0.1:80\r\n\r\n",
+        b"GET /livez HTTP/1.1\r\nHost: [::1]:8000\r\n\r\n",
+        b"GET /livez HTTP/1.0\r\n\r\n",
+    ],
+)
+def test_a_head_that_the_rfc_allows_is_answered(connection, sent):
+    send(connection, sent)
+    assert received(connection).startswith((b"HTTP/1.1 200 ", b"HTTP/1.0 200 "))
+
+
 @pytest.mark.parametrize("sent", [GET + b"X-Long: " + 90 * KIB * b"x", GET + FIELDS])
 def test_a_head_that_comes_byte_by_byte_is_refused(connection, sent):
     send(connection, sent, 1)
