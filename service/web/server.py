@@ -1,6 +1,7 @@
 """Serving the app with uvicorn: on the loopback address alone, until there are tokens."""
 
 import asyncio
+import os
 import resource
 import socket
 import sys
@@ -24,6 +25,12 @@ from service.web.middleware import ProbesOnly
 from service.web.slow_clients import Admission, Connection, SharedState
 
 MAX_FILES = 4096
+KEPT_FILES = 96
+"""Files that the service opens later: readers of the database, maps of the sky, pipes of workers.
+
+A service on SQLite with a replay in two processes had 41 more than at its start.
+"""
+LEAST_CONNECTIONS = 32
 
 START_FAILED = 3
 SWITCH_INTERVAL_S = 0.001
@@ -160,12 +167,21 @@ def _listening(host: str, port: int | None) -> socket.socket | None:
 def _connections() -> int:
     """How many connections may be open at once.
 
-    Without a bound idle connections would use up the files that the process may
-    open, and it could accept none.  Half of the files are left to the database.
+    Without a bound idle connections would use up the files that the process may open, and it
+    could accept none.  Raises `BadConfiguration` where too few files are left for connections.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
         soft = wanted
-    return max(16, min(MAX_FILES, wanted if soft == resource.RLIM_INFINITY else soft) // 2)
+    files = wanted if soft == resource.RLIM_INFINITY else min(soft, MAX_FILES)
+    opened = len(os.listdir("/dev/fd"))
+    left = files - opened - KEPT_FILES
+    if left < LEAST_CONNECTIONS:
+        raise BadConfiguration(
+            f"open files: this process may have {files}, has {opened}, and keeps {KEPT_FILES} for "
+            f"the database, the sky and replays; allow at least {files - left + LEAST_CONNECTIONS} "
+            "(ulimit -n, or LimitNOFILE in a unit of systemd)"
+        )
+    return min(left, MAX_FILES // 2)

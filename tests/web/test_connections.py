@@ -1,7 +1,11 @@
 """How many connections there may be, of whom, and which are closed for others."""
 
+import re
 import socket
-from contextlib import ExitStack
+import subprocess
+import sys
+import threading
+from contextlib import ExitStack, contextmanager
 from ipaddress import ip_network
 
 import httpx
@@ -10,8 +14,9 @@ import pytest
 from service.app.factory import open_app
 from service.web.app import create_app
 from service.web.slow_clients import Admission
+from tests.fresh_databases import sqlite_at
 from tests.waiting import wait_until
-from tests.web.serving import Server, free_port, in_process_settings
+from tests.web.serving import Server, free_port, in_process_settings, is_ready
 
 GET = b"GET /livez HTTP/1.1\r\nHost: localhost\r\n\r\n"
 EVENTS = b"GET /api/v1/events HTTP/1.1\r\nHost: localhost\r\n\r\n"
@@ -212,3 +217,40 @@ def test_a_probe_port_that_is_taken_is_named(acquire, monkeypatch, tmp_path):
         code, _, complaint = acquire("serve", "--port", free_port())
     assert code not in (0, None)
     assert f"ACQUIRE_PROBE_PORT: cannot listen on port {port}" in complaint
+
+
+@contextmanager
+def with_files(most, database):
+    """`acquire serve` that may open so many files: the process and its URL."""
+    port = free_port()
+    command = [sys.executable, "-m", "service.cli", "serve", "--port", str(port)]
+    command = ["sh", "-c", f'ulimit -n {most}; exec "$@"', "sh", *command, "--database", database]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        try:
+            yield process, f"http://127.0.0.1:{port}"
+        finally:
+            process.terminate()
+
+
+def test_a_start_with_too_few_files_says_how_many_it_needs(tmp_path):
+    with with_files(64, sqlite_at(tmp_path / "acquire.db")) as (process, _):
+        complaint = process.communicate(timeout=120.0)[1]
+    assert process.returncode == 2
+    (needed,) = re.findall(r"allow at least (\d+)", complaint)
+    assert 64 < int(needed) <= 256
+    assert "may have 64" in complaint
+
+
+def test_half_open_connections_use_up_no_files_of_a_service_with_few(tmp_path):
+    with (
+        with_files(160, sqlite_at(tmp_path / "acquire.db")) as (process, url),
+        ExitStack() as opened,
+    ):
+        # Its log is read, so that the pipe never fills.
+        threading.Thread(target=process.stderr.read, daemon=True).start()
+        wait_until(lambda: is_ready(process, url, "livez"), 120.0)
+        port = httpx.URL(url).port
+        for _ in range(300):
+            half = opened.enter_context(socket.create_connection(("127.0.0.1", port), PATIENCE_S))
+            half.sendall(b"GET /liv")
+        assert httpx.get(f"{url}/livez", timeout=PATIENCE_S).status_code == 200
