@@ -1,8 +1,10 @@
 """The archive: every batch is in the record or in the archive, byte for byte, whatever happens."""
 
 import math
+import resource
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -483,3 +485,17 @@ def test_what_a_running_command_writes_is_not_reported_as_left_over(filled, plac
     with folder.locked(place):
         assert list(verify_archive(place, {})) == []
     assert [each for each in verify_archive(place, {}) if "was not written to its end" in each]
+
+
+def test_a_full_disk_names_the_file_and_the_bytes_that_it_needs(filled, place):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (600, hard))
+    try:
+        with pytest.raises(OSError, match=r"needs [0-9]+ bytes, and [0-9]+ are free") as full:
+            archiving.archive(filled.store, place, LATER)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert Path(full.value.filename).is_relative_to(place)
+    assert not [each for each in place.rglob("*") if each.name.endswith((".part", ".parquet"))]
+    assert archived_ids(filled.store) == set()
+    assert archiving.archive(filled.store, place, LATER).batches

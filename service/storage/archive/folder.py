@@ -15,6 +15,7 @@ import fcntl
 import hashlib
 import io
 import os
+import shutil
 import uuid
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -43,6 +44,8 @@ COMPRESSION_LEVEL = 1
 """The level of zstd: higher ones take longer, and those up to 9 make nothing smaller."""
 ROWS_TOGETHER = 2_048
 """The rows of a row group, the least that is read of a text column."""
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+"""The errors of a full disk, of a used-up quota and of a limit for the size of files."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
 """The errors of file systems without hard links."""
 
@@ -285,6 +288,14 @@ def write_whole(
             part.flush()
             os.fsync(part.fileno())
         move(beside, file)
+    except OSError as error:
+        beside.unlink(missing_ok=True)
+        if error.errno not in _NO_ROOM:
+            raise
+        # The system's own message names no file.
+        free = shutil.disk_usage(file.parent).free
+        needed = f"the file needs {len(content)} bytes, and {free} are free"
+        raise OSError(error.errno, f"{error.strerror}: {needed}", str(file)) from None
     except BaseException:
         beside.unlink(missing_ok=True)
         raise
