@@ -16,6 +16,7 @@ from service.app.context import Context, checked_run_name, known_id
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.gyro import GyroBlock
 from service.ingest.bulk import Bulk, Check
+from service.ingest.memory import require_memory_for_replay
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
@@ -114,6 +115,7 @@ class Replays:
     def new_upload(self, caller: Caller) -> IO[bytes]:
         """A file for an upload; raises `Busy` if the caller cannot start a replay now."""
         self._require_slot(caller.token_id)
+        self._require_memory()
         return self._spool.new_file()
 
     def start_upload(
@@ -156,6 +158,13 @@ class Replays:
         """Continue the uploads that an earlier process has not finished."""
         for about in self._spool.left():
             if about.id in self._given_up:
+                self._spool.release(about.id)
+                continue
+            try:
+                self._require_memory()
+            except Busy as error:
+                # It stays in the spool: what ended the last process may have been this replay.
+                log.warning("replay %s is not continued yet: %s", about.id, error)
                 self._spool.release(about.id)
                 continue
             try:
@@ -231,6 +240,10 @@ class Replays:
         own = sum(each.owner == owner for each in at_work)
         if owner is not None and own >= MAX_OF_ONE_TOKEN:
             raise Busy(f"{own} replays of this token are running", REPLAY_RETRY_S)
+
+    def _require_memory(self) -> None:
+        workers = self.bulk.workers
+        require_memory_for_replay(max(0, workers.count - workers.up))
 
     def cancel(self, id: str, caller: Caller | None = None) -> Replay:
         """End a replay; what it recorded stays.  Returns how far it came.
