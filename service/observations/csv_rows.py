@@ -7,7 +7,6 @@ the same JSON as that of an NDJSON file, so that the same checks hold for it.
 The columns are named after the fields of the JSON object; an empty cell is an absent field.
 """
 
-import csv
 import difflib
 import json
 import math
@@ -411,8 +410,8 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     A Sun vector or position inside an a priori attitude is written as the
     batch's own, which means the same.
     """
-    writer = csv.DictWriter(stream, COLUMNS, restval="", lineterminator="\n")
-    writer.writeheader()
+    writer = _RowWriter(stream)
+    writer.writerow(dict(zip(COLUMNS, COLUMNS, strict=True)))
     for batch in batches:
         common = _neutralised(batch_cells(batch))
         if batch.measurement is not None:
@@ -429,6 +428,27 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
                     **number_cells(numbers.items()),
                 }
                 writer.writerow({**tracker_cells, **cells, **list_cells(star)})
+
+
+class _RowWriter:
+    """Writes rows as `csv.DictWriter` does, and quotes semicolons and tabs as well.
+
+    A spreadsheet of another country takes either for the end of a cell.
+    """
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def writerow(self, cells: Mapping[str, object]) -> None:
+        """Write one row; a column without a cell is empty."""
+        texts = (str(cells.get(name, "")) for name in COLUMNS)
+        quoted = (
+            '"{}"'.format(each.replace('"', '""')) if _TO_QUOTE(each) else each for each in texts
+        )
+        self._stream.write(",".join(quoted) + "\n")
+
+
+_TO_QUOTE = re.compile('[",;\t\r\n]').search
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:

@@ -112,6 +112,14 @@ def is_time(text: str) -> str:
 
 
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
+"""A name that is looked up: records of earlier versions have some that are no `Name`."""
+_UNSEEN = r"\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+_SPACES = r"\x20\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000"
+VISIBLE_PATTERN = f"^[^{_UNSEEN}]+$"
+"""No character of control, of zero width or of the direction of text."""
+NAME_PATTERN = f"^[^{_UNSEEN}{_SPACES}](?:[^{_UNSEEN}]*[^{_UNSEEN}{_SPACES}])?$"
+"""`VISIBLE_PATTERN` without a space at either end."""
+Name = Annotated[str, Field(min_length=1, max_length=128, pattern=NAME_PATTERN)]
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
 ]
@@ -194,7 +202,7 @@ class StarIn(Wire):
 class TrackerIn(Wire):
     """The stars that one tracker observed, or the sums of the lines of its raster."""
 
-    tracker: Key
+    tracker: Name
     stars: Annotated[list[StarIn], Field(max_length=MAX_STARS_PER_TRACKER)]
     column_counts: Lines | None = None
     row_counts: Lines | None = None
@@ -445,9 +453,7 @@ class MeasurementIn(BaseModel):
 
     quaternion: Quaternion
     """Scalar last, inertial to the axes of `tracker`, or to the body without it."""
-    tracker: Annotated[
-        str | None, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")
-    ] = None
+    tracker: Name | None = None
     """Whose axes are meant; the mission's alignment turns them into the body's."""
     sigma_arcsec: Annotated[tuple[Sigma, Sigma, Sigma], AfterValidator(_of_one_tracker)] | None = (
         None
@@ -467,8 +473,8 @@ class MeasurementIn(BaseModel):
 class BatchIn(Wire):
     """A batch of observed stars, or of an attitude that a tracker measured itself."""
 
-    spacecraft: Key
-    batch: Key
+    spacecraft: Name
+    batch: Name
     time: Annotated[str, AfterValidator(is_time)]
     run: RunName = "live"
     measurement: MeasurementIn | None = None

@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 Kind = Literal["number", "integer", "flag", "text", "utc"]
 Page = Sequence[Sequence[Any]]
 """The values of each column, in the order of the columns; None: not known."""
-_NEEDS_QUOTES = re.compile('[",\r\n]')
+_NEEDS_QUOTES = re.compile('[",;\t\r\n]')
+"""A spreadsheet of another country takes a semicolon or a tab for the end of a cell."""
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from service.observations.csv_rows import write_batches_csv
 from service.observations.decompress import Line
 from service.observations.schema import BatchIn, submission_from_json
 from service.observations.telemetry import read_lines, require_telemetry
+from service.products.tables import Column, Table, write_csv
 
 HEADER = "spacecraft,batch,time,tracker,x,y,z,magnitude"
 GYRO = "spacecraft,run,block,time,rate_1_rad_per_s,rate_2_rad_per_s,rate_3_rad_per_s"
@@ -305,6 +306,22 @@ FORMULAS = [
     "'plain",
     "a=b",
 ]
+SEPARATORS = ["a;b", "=1;2", 'a";"b', "a,b;c"]
+
+
+@pytest.mark.parametrize("name", SEPARATORS)
+def test_a_text_with_a_separator_of_any_country_is_one_cell(name: str) -> None:
+    star = {"vector": [-0.6, 0.0, 0.8]}
+    body = {"spacecraft": "XTE", "batch": name, "time": "1996-01-10T12:00:00Z", "a_priori": None}
+    body["observations"] = [{"tracker": name, "stars": [star]}]
+    text = io.StringIO(newline="")
+    write_batches_csv([BatchIn.model_validate(body)], text)
+    cell = '"{}"'.format(neutralised(name).replace('"', '""'))
+    assert f",{cell}," in text.getvalue().splitlines()[1]
+    table = Table([Column("name", "text")], [[[name]]])
+    assert b"".join(write_csv(table)).decode().splitlines() == ["name", cell]
+    (line,) = read(text.getvalue())
+    assert submission_from_json(line.body or b"").batch.batch == name
 
 
 @pytest.mark.parametrize("name", FORMULAS)

@@ -103,6 +103,34 @@ def test_vectors_within_a_thousandth_of_norm_one_are_normalised():
         assert star.tolist() == [0.0, 0.0, 1.0]
 
 
+UNSEEN = [
+    "a\tb",
+    "a\x85b",
+    "a\u200bb",
+    "a\u200db",
+    "a\u202eb",
+    "a\u2066b",
+    "a\ufeffb",
+    "\u00ad",
+    " a",
+    "a ",
+]
+UNSEEN += ["\u00a0a", "a\u3000", " "]
+
+
+@pytest.mark.parametrize("name", UNSEEN, ids=map(ascii, UNSEEN))
+@pytest.mark.parametrize("field", ["batch", "observations.0.tracker"])
+def test_a_name_with_a_character_that_nobody_sees_is_refused(field, name):
+    with pytest.raises(BadBatch) as refused:
+        read(changed(field, name))
+    assert refused.value.faults[0].field.replace("[", ".").replace("]", "") == field
+
+
+@pytest.mark.parametrize("name", ["a", "a b", "é漢😀", "-_.,;'\"<&>", "=1"])
+def test_any_other_name_is_taken(name):
+    assert read(changed("batch", name)).batch.batch == name
+
+
 class TestIdentity:
     def test_white_space_and_the_order_of_keys_make_no_other_body(self):
         turned = dict(reversed(BATCH.items()))

@@ -8,7 +8,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access import Caller
-from service.observations.schema import Key, RunName, Wire
+from service.observations.schema import VISIBLE_PATTERN, Key, RunName, Wire
 from service.storage import webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
@@ -35,7 +35,7 @@ class WebhookIn(Wire):
     name: Annotated[
         str,
         StringConstraints(strip_whitespace=True, min_length=1, max_length=64),
-        Field(pattern=r"^[^\x00-\x1f\x7f]+$", description="For people and for metrics."),
+        Field(pattern=VISIBLE_PATTERN, description="For people and for metrics."),
     ]
     url: Annotated[
         str,
