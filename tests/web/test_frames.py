@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import random
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,8 @@ from PIL import Image
 from service.missions.mission import load_missions
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
+from tests.imaging.hostile_headers import absurd_files, good_files, with_absurd_header
+from tests.scale import draws, size
 from tests.web.test_bodies import raw
 
 URL = "/api/v1/spacecraft/IMAGER/frames"
@@ -281,3 +284,27 @@ def test_a_picture_of_a_camera_that_is_not_there_or_of_another_size_is_refused(
     content = PLEIADES.read_bytes()
     answer = client.post(f"/api/v1/pictures?{query}", content=content, headers=OCTETS)
     assert answer.status_code == status, answer.text
+
+
+ABSURD = absurd_files(np.random.default_rng(4))
+
+
+@pytest.mark.parametrize("route", ["/api/v1/pictures", URL])
+def test_an_absurd_header_is_the_client_s_mistake(client, route):
+    for name, (data, word) in ABSURD.items():
+        answer = client.post(route, content=data, headers=OCTETS)
+        assert answer.status_code == 422, (name, answer.text)
+        (fault,) = answer.json()["errors"]
+        assert fault["field"] == "frame"
+        # A frame of a tracker has to have its size.
+        assert word in fault["message"] + str(fault.get("value")) or route == URL, name
+
+
+@pytest.mark.torture
+def test_no_header_of_a_picture_is_answered_with_a_fault_of_ours(client, seed):
+    draw, files = random.Random(seed), good_files(np.random.default_rng(seed))
+    for name in draw.sample(sorted(files), draws(8, len(files))):
+        for _ in range(size(2_000)):
+            content = with_absurd_header(name, files[name], draw)
+            answer = client.post("/api/v1/pictures", content=content, headers=OCTETS)
+            assert answer.status_code in (200, 422), (name, answer.text)

@@ -10,10 +10,11 @@ import struct
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import replace
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from service.imaging.frames.bounded_file import BoundedFile
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, bad_frame
 
 MAX_EXIF_BYTES = 1 << 20
@@ -50,7 +51,7 @@ class Entry(NamedTuple):
         return int(struct.unpack_from(order + form, self.value)[0])
 
 
-def directory(file: IO[bytes], order: str, at: int, big: bool = False) -> list[Entry]:
+def directory(file: BoundedFile, order: str, at: int, big: bool = False) -> list[Entry]:
     """The entries of a directory of TIFF; raises `struct.error` where the file ends before."""
     file.seek(at)
     (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
@@ -61,7 +62,7 @@ def directory(file: IO[bytes], order: str, at: int, big: bool = False) -> list[E
 
 
 def bytes_beyond(
-    file: IO[bytes], order: str, entries: list[Entry], depth: int = 2, big: bool = False
+    file: BoundedFile, order: str, entries: list[Entry], depth: int = 2, big: bool = False
 ) -> int:
     """The size of all tags in the directories to which entries lead, and these in turn."""
     total = 0
@@ -75,7 +76,7 @@ def bytes_beyond(
     return total
 
 
-def require_small_exif(file: IO[bytes]) -> None:
+def require_small_exif(file: BoundedFile) -> None:
     """Raise `BadFile` for a JPEG with much EXIF, of which Pillow reads some on opening it.
 
     One piece has up to 64 KiB; Pillow joins all that there are.
@@ -153,7 +154,7 @@ def _is_small(image: Any) -> bool:
         return False
     block = exif.removeprefix(_MARK)
     order = "<" if block[:2] == b"II" else ">"
-    file = io.BytesIO(block)
+    file = BoundedFile(io.BytesIO(block))
     try:
         entries = directory(file, order, *struct.unpack(order + "4xL", file.read(8)))
     except struct.error:

@@ -1,8 +1,8 @@
 """Frames from files: FITS, pictures, raw files and numpy arrays, told apart by how they begin.
 
-A file is not to be believed.  Its size in pixels is read from its header and held
-against the limits before anything is decoded; what is read is bounded by that size
-and by the file's own length.  Whatever is wrong raises `BadFile` with the reason.
+A file is not to be believed.  Every reader works on a `BoundedFile`; the size in pixels
+is read from the header and held against the limits before anything is decoded.  Whatever
+is wrong raises `BadFile` with the reason.
 Files of numpy and raw files are read here, the others in modules of their own.
 """
 
@@ -10,7 +10,6 @@ import gzip
 import hashlib
 import importlib.util
 import math
-import os
 import struct
 import tempfile
 import zlib
@@ -23,6 +22,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadFile
+from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 
 _HEADERS = {
@@ -33,7 +33,7 @@ _MAX_HEADER = 4096
 COLOURS = 3
 
 
-def read_npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """A frame from a .npy file of (rows, columns), or of three colours first or last.
 
     Of colours the counts are the sums.  Raises `BadFile`.
@@ -50,11 +50,14 @@ def read_npy(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
         raise bad_frame(f"has no readable .npy header: {str(error)[:200]}") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise bad_frame("must hold numbers of up to 64 bits", str(dtype)[:80])
+    if any(type(side) is not int for side in shape):
+        # A truth value is a whole number of Python.
+        raise bad_frame("must have a shape of whole numbers", str(shape)[:80])
     colours = _colour_axis(shape)
     height_px, width_px = (side for k, side in enumerate(shape) if k != colours)
     limits.require(width_px, height_px)
     count = width_px * height_px * (1 if colours is None else COLOURS)
-    data = exactly(file, count * dtype.itemsize)
+    data = file.exactly(count * dtype.itemsize)
     order = "F" if by_column else "C"
     values = np.frombuffer(data, dtype).reshape(shape, order=order)  # type: ignore[call-overload]
     full_scale = full_scale_of(values.dtype)
@@ -74,31 +77,6 @@ def _colour_axis(shape: tuple[int, ...]) -> int | None:
     raise bad_frame(message, str(shape)[:80])
 
 
-@contextmanager
-def decoding(what: str) -> Iterator[None]:
-    """Turn whatever a decoder raises into `BadFile`: what it reads is no such file.
-
-    A decoder that stumbles over what it reads does so in many ways.
-    """
-    try:
-        yield
-    except BadFile:
-        raise
-    except Exception as error:
-        reason = str(error)[:200] or type(error).__name__
-        raise bad_frame(f"cannot be read as {what}: {reason}") from None
-
-
-def exactly(file: IO[bytes], count: int) -> bytes:
-    """The next bytes of a file; raises `BadFile` where it ends before, and reads nothing."""
-    start = file.tell()
-    left = file.seek(0, os.SEEK_END) - start
-    if left < count:
-        raise bad_frame("is cut off", f"{max(left, 0)} bytes of data where {count} are declared")
-    file.seek(start)
-    return file.read(count)
-
-
 def as_counts(values: npt.NDArray[Any]) -> CountArray:
     """Numbers of any kind as counts: float32 where that is exact, in the machine's own order."""
     exact = values.dtype.itemsize <= 2 or values.dtype.str[1:] == "f4"
@@ -110,7 +88,7 @@ def full_scale_of(dtype: np.dtype[Any]) -> float:
     return float(np.iinfo(dtype).max) if dtype.kind in "iu" else math.inf
 
 
-Reader = Callable[[IO[bytes], FrameLimits, str], Frame]
+Reader = Callable[[BoundedFile, FrameLimits, str], Frame]
 
 FORMATS = "FITS, TIFF, PNG, JPEG, BMP, PGM, a camera's raw file or a numpy array (.npy)"
 _PDS3 = "a PDS3 file; write its image as FITS, TIFF or .npy (with pdr, GDAL or ISIS)"
@@ -136,22 +114,29 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
     Raises `BadFile` for what is no frame, or none that the limits allow.
     """
     digest = digest or frame_digest(file)
-    file.seek(0)
-    start = file.read(_LONGEST_MAGIC)
+    bounded = BoundedFile(file)
+    start = bounded.read(_LONGEST_MAGIC)
     if not start:
         raise bad_frame("is empty; it must hold a file: " + FORMATS)
-    if start.startswith(_GZIP):
-        with _unzipped(file, limits) as unzipped:
-            if unzipped.read(2) == _GZIP:
-                raise bad_frame("is compressed more than once")
-            return read_frame(unzipped, limits, digest)
+    if not start.startswith(_GZIP):
+        return _read_by_magic(bounded, start, limits, digest)
+    with _unzipped(bounded, limits) as unzipped:
+        start = unzipped.read(_LONGEST_MAGIC)
+        if start.startswith(_GZIP):
+            raise bad_frame("is compressed more than once")
+        return _read_by_magic(unzipped, start, limits, digest)
+
+
+def _read_by_magic(file: BoundedFile, start: bytes, limits: FrameLimits, digest: str) -> Frame:
+    """The frame in a file that begins with `start`; raises `BadFile`."""
     if is_raw(file, start):
         file.seek(0)
         return read_raw(file, limits, digest)
     for magics, reader in _READERS.items():
         if start.startswith(magics):
             file.seek(0)
-            return reader(file, limits, digest)
+            with decoding("the picture that its first bytes name"):
+                return reader(file, limits, digest)
     for magic, words in OTHERS.items():
         if start.startswith(magic):
             raise bad_frame(f"is {words}")
@@ -159,7 +144,7 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
 
 
 @contextmanager
-def _unzipped(file: IO[bytes], limits: FrameLimits) -> Iterator[IO[bytes]]:
+def _unzipped(file: BoundedFile, limits: FrameLimits) -> Iterator[BoundedFile]:
     """The content of a gzip file, in a temporary file; raises `BadFile` if larger than a frame."""
     rows, columns = limits.shape or (limits.max_pixels, 1)
     most = MORE_BYTES + BYTES_PER_PIXEL * min(rows * columns, limits.max_pixels)
@@ -173,8 +158,7 @@ def _unzipped(file: IO[bytes], limits: FrameLimits) -> Iterator[IO[bytes]]:
                     target.write(block)
         except (OSError, EOFError, zlib.error) as error:
             raise bad_frame(f"cannot be read as gzip: {str(error)[:100]}") from None
-        target.seek(0)
-        yield target
+        yield BoundedFile(target)
 
 
 def frame_digest(file: IO[bytes]) -> str:
@@ -186,7 +170,7 @@ def frame_digest(file: IO[bytes]) -> str:
 def _later(name: str, *arguments: str) -> Reader:
     """The reader of a name, imported when it is called: the service's start loads none."""
 
-    def read(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+    def read(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         frame: Frame = resolve_name(f"service.imaging.frames.{name}")(
             file, *arguments, limits, digest
         )
@@ -220,7 +204,7 @@ _REDUCED, _SUB_DIRECTORIES, _DNG_VERSION = 254, 330, 50706
 _MAX_TAGS = 256
 
 
-def is_raw(file: IO[bytes], start: bytes) -> bool:
+def is_raw(file: BoundedFile, start: bytes) -> bool:
     """True if a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
     if start.startswith(MAGICS) or start[4:12] == _CR3:
         return True
@@ -229,7 +213,7 @@ def is_raw(file: IO[bytes], start: bytes) -> bool:
     return start[8:10] == _CR2 or _has_tags_of_raw(file, "<" if start[:2] == b"II" else ">")
 
 
-def _has_tags_of_raw(file: IO[bytes], order: str) -> bool:
+def _has_tags_of_raw(file: BoundedFile, order: str) -> bool:
     """A DNG says so; other makers begin with a small picture and have the large one inside."""
     try:
         file.seek(4)
@@ -245,7 +229,7 @@ def _has_tags_of_raw(file: IO[bytes], order: str) -> bool:
     return _DNG_VERSION in tags or inside
 
 
-def read_raw(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+def read_raw(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a camera's raw file; raises `BadFile` with what is wrong with it."""
     if not importlib.util.find_spec("rawpy"):
         raise bad_frame(ABSENT)

@@ -3,6 +3,7 @@
 The first image of a file is taken, of three planes their sum, unless another is chosen.
 """
 
+import math
 from collections.abc import Sequence
 from importlib.util import find_spec
 from typing import IO, Any
@@ -10,8 +11,9 @@ from typing import IO, Any
 import numpy as np
 
 from service.errors import BadFile
-from service.imaging.frames import fits_header
-from service.imaging.frames.files import as_counts, decoding, exactly
+from service.imaging.frames import fits_header, fits_tiles
+from service.imaging.frames.bounded_file import BoundedFile, decoding
+from service.imaging.frames.files import as_counts
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
 ABSENT = (
@@ -24,7 +26,7 @@ COLOURS = 3
 MAX_NAMED = 8
 
 
-def read_fits(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+def read_fits(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a FITS file; raises `BadFile` with what is wrong with it."""
     images, primary = _images(file)
     unit, plane, remarks = _chosen(images, limits.image)
@@ -59,15 +61,12 @@ def write_fits(
         "SIMPLE": True, "BITPIX": 16, "NAXIS": 2, "NAXIS1": width_px, "NAXIS2": height_px,
         "BZERO": 32768, "BSCALE": 1, **cards,
     }  # fmt: skip
-    text = "".join(_card(key, value) for key, value in header.items()) + "END".ljust(
-        fits_header.CARD
-    )
-    file.write(text.encode("ascii").ljust(-(-len(text) // fits_header.BLOCK) * fits_header.BLOCK))
+    fits_header.write_header(file, header)
     data = (counts.astype(np.int32) - 32768).astype(">i2").tobytes()
     file.write(data.ljust(-(-len(data) // fits_header.BLOCK) * fits_header.BLOCK, b"\0"))
 
 
-def _images(file: IO[bytes]) -> tuple[list[fits_header.Unit], fits_header.Header]:
+def _images(file: BoundedFile) -> tuple[list[fits_header.Unit], fits_header.Header]:
     """The units that hold images, and the primary header; raises `BadFile` where there is none."""
     images: list[fits_header.Unit] = []
     primary: fits_header.Header | None = None
@@ -136,7 +135,7 @@ def _scaling(header: fits_header.Header) -> tuple[float, float]:
 class _Plain:
     """The numbers of a unit that is not compressed."""
 
-    def __init__(self, file: IO[bytes], unit: fits_header.Unit) -> None:
+    def __init__(self, file: BoundedFile, unit: fits_header.Unit) -> None:
         self._file, self._unit = file, unit
         self._kind = np.dtype(fits_header.TYPES[unit.header.bitpix])
         self._scaling = _scaling(unit.header)
@@ -154,13 +153,16 @@ class _Plain:
 
     def _read(self, first: int, count: int) -> Any:
         self._file.seek(self._unit.start + first * self._kind.itemsize)
-        return np.frombuffer(exactly(self._file, count * self._kind.itemsize), self._kind)
+        return np.frombuffer(self._file.exactly(count * self._kind.itemsize), self._kind)
 
     def _counts(self, stored: Any, shape: tuple[int, ...]) -> CountArray:
         scale, zero = self._scaling
         header = self._unit.header
         counts = as_counts(stored)
         if (scale, zero) != (1.0, 0.0):
+            if not (scale.is_integer() and zero.is_integer()):
+                # Single precision would leave little of small steps above a large zero.
+                counts = counts.astype(np.float64)
             counts = (counts * scale + zero).astype(counts.dtype, copy=False)
         if self._kind.kind in "iu" and "BLANK" in header.cards:
             counts[stored == header.whole("BLANK", least=-(1 << 40))] = np.nan
@@ -170,24 +172,19 @@ class _Plain:
 class _Compressed:
     """The numbers of an image that is compressed by tiles, through astropy."""
 
-    def __init__(self, file: IO[bytes], unit: fits_header.Unit) -> None:
+    def __init__(self, file: BoundedFile, unit: fits_header.Unit) -> None:
         if find_spec("astropy") is None:
             raise bad_frame(ABSENT)
-        self._file, self._unit = file, unit
-        header = unit.header
+        self._header = header = unit.header
         method = str(header.cards.get("ZCMPTYPE") or "").strip().upper()
         if method not in SAFE_METHODS:
             known = ", ".join(SAFE_METHODS)
             raise bad_frame(f"is compressed by another method than {known}", method[:40])
-        exactly_there(file, unit)
         axes = header.image_axes
-        tile = 1
-        for k, length in enumerate(header.image_axes):
-            side = header.whole(f"ZTILE{k + 1}", length if k == 0 else 1)
-            tile *= min(side, length) if side else length
-        pixels = axes[0] * axes[1] * min(axes[2] if len(axes) > 2 else 1, COLOURS)
-        if tile > pixels:
+        tile = math.prod(fits_tiles.tile_of(header))
+        if tile > axes[0] * axes[1] * min(axes[2] if len(axes) > 2 else 1, COLOURS):
             raise bad_frame("has compressed tiles of more pixels than a picture", str(tile)[:40])
+        self._table = fits_tiles.rewritten(file, unit)
 
     def plane(self, number: int) -> CountArray:
         """One plane (rows, columns), from 0."""
@@ -200,12 +197,12 @@ class _Compressed:
     def _section(self, number: int | None) -> CountArray:
         from astropy.io import fits
 
-        axes = self._unit.header.image_axes
-        self._file.seek(0)
+        axes = self._header.image_axes
+        self._table.seek(0)
         with decoding("compressed FITS"):
-            opened = fits.open(self._file, memmap=False, lazy_load_hdus=True)
+            opened = fits.open(self._table, memmap=False, lazy_load_hdus=True)
             try:
-                section = opened[self._unit.number].section
+                section = opened[1].section
                 shape = tuple(reversed(axes[2:]))
                 place = () if number is None else np.unravel_index(number, shape) if shape else ()
                 extra = len(section.shape) - len(axes)
@@ -213,14 +210,6 @@ class _Compressed:
             finally:
                 opened.close(closed=False)
         return as_counts(np.asarray(values))
-
-
-def exactly_there(file: IO[bytes], unit: fits_header.Unit) -> None:
-    """Raise `BadFile` where a file ends before the data of a unit do."""
-    left = file.seek(0, 2) - unit.start
-    if unit.header.data_bytes > left:
-        declared = f"{max(left, 0)} bytes of data where {unit.header.data_bytes} are declared"
-        raise bad_frame("is cut off", declared)
 
 
 def _full_scale(header: fits_header.Header) -> float:
@@ -239,13 +228,3 @@ def _as_shown(counts: CountArray, header: fits_header.Header) -> tuple[CountArra
         return counts, AS_STORED
     how = "as shown: rows in reverse order (ROWORDER = 'BOTTOM-UP')"
     return np.ascontiguousarray(counts[::-1]), how
-
-
-def _card(key: str, value: bool | int | float | str) -> str:
-    if isinstance(value, bool):
-        shown = f"{'T' if value else 'F':>20}"
-    elif isinstance(value, str):
-        shown = "'" + value.replace("'", "''").ljust(8) + "'"
-    else:
-        shown = f"{value!r:>20}".upper()
-    return f"{key:<8}= {shown}".ljust(fits_header.CARD)[: fits_header.CARD]

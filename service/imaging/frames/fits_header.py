@@ -1,8 +1,7 @@
 """Headers of FITS files (FITS Standard 4.0): cards, images, and the time and exposure they tell."""
 
-import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 from typing import IO
@@ -10,6 +9,7 @@ from typing import IO
 from erfa import ufunc
 
 from service.errors import BadInput
+from service.imaging.frames.bounded_file import BoundedFile
 from service.imaging.frames.frame import bad_frame
 from service.times import DAY_S, Utc, parse_utc, recorded_utc, shifted
 
@@ -124,14 +124,13 @@ class Unit:
     start: int
 
 
-def units_of(file: IO[bytes]) -> Iterator[Unit]:
+def units_of(file: BoundedFile) -> Iterator[Unit]:
     """The units of a file one after another; raises `BadFile` for a broken header."""
-    end = file.seek(0, os.SEEK_END)
     at = 0
     for number in range(MAX_UNITS):
         file.seek(at)
         # What follows the last unit is none (3.5).
-        if at >= end or (number and file.read(8) != b"XTENSION"):
+        if not file.left or (number and file.read(8) != b"XTENSION"):
             return
         file.seek(at)
         header = read_header(file)
@@ -140,7 +139,7 @@ def units_of(file: IO[bytes]) -> Iterator[Unit]:
         at = unit.start + -(-header.data_bytes // BLOCK) * BLOCK
 
 
-def read_header(file: IO[bytes]) -> Header:
+def read_header(file: BoundedFile) -> Header:
     """The header that begins here; the first of equal keywords counts."""
     header = Header({})
     for _ in range(MAX_HEADER_BLOCKS):
@@ -182,6 +181,22 @@ def _value(text: str) -> tuple[Value, str]:
         return float(word.upper().replace("D", "E")), comment
     except ValueError:
         return None, comment
+
+
+def write_header(file: IO[bytes], cards: Mapping[str, bool | int | float | str]) -> None:
+    """Write a header of these cards, in whole blocks."""
+    text = "".join(_card(key, value) for key, value in cards.items()) + "END".ljust(CARD)
+    file.write(text.encode("latin-1").ljust(-(-len(text) // BLOCK) * BLOCK))
+
+
+def _card(key: str, value: bool | int | float | str) -> str:
+    if isinstance(value, bool):
+        shown = f"{'T' if value else 'F':>20}"
+    elif isinstance(value, str):
+        shown = "'" + value.replace("'", "''").ljust(8) + "'"
+    else:
+        shown = f"{value!r:>20}".upper()
+    return f"{key:<8}= {shown}".ljust(CARD)[:CARD]
 
 
 # The time and the exposure that a FITS header tells (FITS Standard 4.0, section 9).

@@ -2,13 +2,14 @@
 
 import re
 import sys
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import TAG, as_shown, exif_of, exposure_of, require_small_exif
-from service.imaging.frames.files import as_counts, decoding, exactly, full_scale_of
+from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
 
@@ -19,7 +20,7 @@ COLORS = ("RGB", "RGBA", "RGBX", "LA", "P", "PA", "CMYK", "YCbCr")
 """Modes that are turned into red, green and blue; how opaque a pixel is is not looked at."""
 
 
-def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest: str) -> Frame:
+def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a file of one of these formats; raises `BadFile` with what is wrong with it.
 
     Of a colour picture the counts are the sums of red, green and blue.
@@ -53,12 +54,12 @@ def read_picture(file: IO[bytes], file_format: str, limits: FrameLimits, digest:
     return Frame(counts, file_format, digest, full_scale, time, exposure_s, orientation=orientation)
 
 
-def _opened(file: IO[bytes], file_format: str) -> Any:
+def _opened(file: BoundedFile, file_format: str) -> Any:
     """A picture of a format, opened by Pillow and not decoded; raises `BadFile` for another one."""
     from PIL import Image, UnidentifiedImageError
 
     try:
-        return Image.open(file, formats=(_PILLOW_NAMES.get(file_format, file_format),))
+        return Image.open(file.stream, formats=(_PILLOW_NAMES.get(file_format, file_format),))
     except UnidentifiedImageError:
         raise bad_frame(f"cannot be read as {file_format}: its header has no known form") from None
 
@@ -76,7 +77,7 @@ def _is_plain(image: Any) -> bool:
     return decoder in ("raw", "ppm")
 
 
-def _plain_light(image: Any, file: IO[bytes]) -> tuple[npt.NDArray[Any], float]:
+def _plain_light(image: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
     """The sums of the colours of a binary PGM or PPM, and the largest that there can be."""
     _, _, at, arguments = image.tile[0]
     is_tuple = isinstance(arguments, tuple)
@@ -87,7 +88,7 @@ def _plain_light(image: Any, file: IO[bytes]) -> tuple[npt.NDArray[Any], float]:
         raise bad_frame("is a portable map of a kind that is not read", str(mode)[:20])
     colours, kind = (3 if mode == "RGB" else 1), np.dtype(">u2" if largest > 255 else "u1")
     file.seek(at)
-    data = exactly(file, image.width * image.height * colours * kind.itemsize)
+    data = file.exactly(image.width * image.height * colours * kind.itemsize)
     values = np.frombuffer(data, kind).reshape(image.height, image.width, colours)
     return values.sum(axis=2, dtype=np.uint32), float(colours * largest)
 
@@ -124,24 +125,24 @@ def is_deep_grey(image: Any) -> bool:
     return bool(image.tile) and all(_raw_mode(tile) == _DEEP_GREY for tile in image.tile)
 
 
-def deep_grey(file: IO[bytes], file_format: str) -> npt.NDArray[np.uint16]:
+def deep_grey(file: BoundedFile, file_format: str) -> npt.NDArray[np.uint16]:
     """The greys (rows, columns) of a picture of 16 bits with opacity, which is not looked at."""
     from PIL import Image
 
     file.seek(0)
-    with Image.open(file, formats=(file_format,)) as image:
+    with Image.open(file.stream, formats=(file_format,)) as image:
         image.tile = [_with_raw_mode(tile, _FOUR_BYTES) for tile in image.tile]
         upper, lower = (np.asarray(image)[:, :, k].astype(np.uint16) for k in (0, 1))
     return np.asarray(upper << 8 | lower)
 
 
-def deep_light(image: Any, file: IO[bytes], file_format: str) -> npt.NDArray[np.uint32]:
+def deep_light(image: Any, file: BoundedFile, file_format: str) -> npt.NDArray[np.uint32]:
     """The sums of red, green and blue (rows, columns), for which the file is decoded twice."""
     from PIL import Image
 
     light = _sums(image) * np.uint32(256)
     file.seek(0)
-    with Image.open(file, formats=(file_format,)) as again:
+    with Image.open(file.stream, formats=(file_format,)) as again:
         again.tile = [_lower(tile) for tile in again.tile]
         return light + _sums(again)
 

@@ -7,14 +7,14 @@ them: it writes no more bytes than asked for, whatever a file holds.
 import io
 import logging
 import math
-import os
 import struct
 from collections.abc import Iterator
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
+from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import (
     MAX_EXIF_BYTES,
     TAG,
@@ -24,7 +24,7 @@ from service.imaging.frames.exif import (
     directory,
     exif_exposure,
 )
-from service.imaging.frames.files import as_counts, decoding, full_scale_of
+from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
 
@@ -46,7 +46,7 @@ logging.getLogger("tifffile").setLevel(logging.CRITICAL)
 """It logs what it finds wrong with a file; this module refuses such files in words."""
 
 
-def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
+def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a TIFF file; raises `BadFile` with what is wrong with it, or not read of it.
 
     Of several samples a pixel the counts are the sums of the colours.
@@ -57,7 +57,7 @@ def read_tiff(file: IO[bytes], limits: FrameLimits, digest: str) -> Frame:
     file.seek(0)
     with (
         decoding("TIFF"),
-        TiffFile(file, name="frame", _multifile=False, is_ndpi=False) as opened,
+        TiffFile(file.stream, name="frame", _multifile=False, is_ndpi=False) as opened,
     ):
         page: Any = opened.pages[number]
         _require_readable(page, limits)
@@ -150,7 +150,7 @@ def _word(value: Any) -> str:
     return str(getattr(value, "name", value))[:60]
 
 
-def _light(page: Any, file: IO[bytes]) -> tuple[npt.NDArray[Any], float]:
+def _light(page: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
     """The sums of the colours (rows, columns) of a page in stored order, and the largest one."""
     colours = _colours(page)
     unpredict = page.predictor == _FLOAT_PREDICTOR
@@ -212,18 +212,17 @@ def _segment_size(page: Any) -> tuple[int, int, int]:
     return tall, wide, down
 
 
-def _segments(page: Any, file: IO[bytes], packed: Any) -> Iterator[tuple[int, bytes]]:
+def _segments(page: Any, file: BoundedFile, packed: Any) -> Iterator[tuple[int, bytes]]:
     """Each strip or tile by its number, unpacked; raises `BadFile` for one of another size."""
     _, _, rows, _, contiguous = page.shaped
     item = contiguous * page.dtype.itemsize
     tiled = page.is_tiled
     tall, wide, down = _segment_size(page)
     offsets, sizes = page.dataoffsets, page.databytecounts
-    end = file.seek(0, os.SEEK_END)
     for index, (at, size) in enumerate(zip(offsets, sizes, strict=True)):
         high = tall if tiled else min(tall, rows - index % down * tall)
         wanted = wide * high * item
-        if size < 1 or at < 8 or at + size > end:
+        if size < 1 or at < 8 or at + size > file.length:
             raise bad_frame("is cut off, or has a strip or tile without data", f"number {index}")
         if (size > 2 * wanted + 65536) if packed else not wanted <= size <= wanted + 3:
             message = "has a strip or tile of another size than its pixels need"
@@ -282,12 +281,12 @@ def _undone(data: bytes, page: Any) -> bytes:
     return numbers.astype(page.parent.byteorder + f"f{item}").tobytes()
 
 
-def _by_pillow(file: IO[bytes], number: int) -> tuple[CountArray, float]:
+def _by_pillow(file: BoundedFile, number: int) -> tuple[CountArray, float]:
     """The sums of red, green and blue of a page of 8 bits, turned by its orientation."""
     from PIL import Image
 
     file.seek(0)
-    with Image.open(file, formats=("TIFF",)) as image:
+    with Image.open(file.stream, formats=("TIFF",)) as image:
         image.seek(number)
         if image.mode == "L":
             return as_counts(np.asarray(image)), 255.0
@@ -295,7 +294,7 @@ def _by_pillow(file: IO[bytes], number: int) -> tuple[CountArray, float]:
     return as_counts(channels.sum(axis=2, dtype=np.uint16)), 3.0 * 255.0
 
 
-def _require_whole_segments(page: Any, file: IO[bytes], limits: FrameLimits) -> None:
+def _require_whole_segments(page: Any, file: BoundedFile, limits: FrameLimits) -> None:
     """Raise `BadFile` for a page whose strips or tiles of JPEG data are damaged or out of place."""
     tables = page.jpegtables[:-2] if page.jpegtables else b"\xff\xd8"
     tall, wide, down = _segment_size(page)
@@ -333,7 +332,7 @@ def _page_exposure(page: Any) -> tuple[str | None, float | None]:
     return exif_exposure(*(exif.get(name) for name in names))
 
 
-def _subfiles(file: IO[bytes]) -> list[Subfile]:
+def _subfiles(file: BoundedFile) -> list[Subfile]:
     """The directories of a TIFF; raises `BadFile` where tags alone would take much memory.
 
     Every tag is read whole before anything can be asked of it; many tags may
@@ -341,7 +340,6 @@ def _subfiles(file: IO[bytes]) -> list[Subfile]:
     """
     file.seek(0)
     start = file.read(16)
-    end = file.seek(0, os.SEEK_END)
     order, big = "<" if start[:2] == b"II" else ">", start[2:4] in (b"+\0", b"\0+")
     subfiles: list[Subfile] = []
     try:
@@ -358,9 +356,11 @@ def _subfiles(file: IO[bytes]) -> list[Subfile]:
             )
             if bytes_beyond(file, order, entries, big=big) > MAX_EXIF_BYTES:
                 raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF")
-    except (struct.error, OverflowError):
+    except struct.error:
         kind = "BigTIFF" if big else "TIFF"
-        raise bad_frame(f"is cut off: its {kind} directory lies beyond its {end} bytes") from None
+        raise bad_frame(
+            f"is cut off: its {kind} directory lies beyond its {file.length} bytes"
+        ) from None
     return subfiles
 
 
