@@ -8,9 +8,16 @@ from typing import IO, Any
 
 import numpy as np
 
-from service.acquire.picture import PictureAttitude, PictureResult, blind_sky, solve_picture
+from service.acquire.picture import (
+    PictureAttitude,
+    PictureResult,
+    blind_sky,
+    doubt_of_exposure,
+    solve_picture,
+)
 from service.identify.blind.lens import Lens
 from service.imaging import submit
+from service.imaging.detection.levels import rounded_counts
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera
@@ -59,6 +66,8 @@ def _of_unknown_lens(
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = submit.time_of(known, frame)
+    if known.exposure_s is None:
+        remarks += submit.exposure_remarks(frame)
     exposure_s = known.exposure_s or frame.exposure_s or camera.exposure_s
     frame = replace(frame, exposure_s=exposure_s)
     read = perf_counter_ns()
@@ -78,7 +87,8 @@ def _of_unknown_lens(
     done = perf_counter_ns()
     timings = {"read": (read - start) // 1000, "detect": (done - read) // 1000, "centroid": 0}
     record = _record(result, chosen, stars, camera, tracker.name, timings)
-    record = replace(record, remarks=[*record.remarks, *remarks, *submit.choices_of(result.frame)])
+    remarks += [*doubt_of_exposure(result, camera.zero_point_mag), *submit.choices_of(result.frame)]
+    record = replace(record, remarks=[*record.remarks, *remarks])
     submission = submission_from_model(model)
     return Submission(
         submission.batch, submission.text, known.fingerprint(mission.name, digest), record
@@ -137,7 +147,7 @@ def _observed(result: PictureResult, chosen: list[int], camera: Camera) -> list[
         directions, focal_px = found.directions(u, v), found.lens.focal_px
         sigma = np.maximum(sigma, LEAST_SIGMA_PX) * max(found.sigma_scale, 1.0)
         sigma = sigma * _scale_of(found, directions, sigma / focal_px)
-        light = np.maximum(points.flux_counts[chosen], 1e-9) / (result.frame.exposure_s or 1.0)
+        light = points.flux_counts[chosen] / (result.frame.exposure_s or 1.0)
         magnitude = found.zero_point_mag - 2.5 * np.log10(light)
     sigma_arcsec = np.clip(sigma / focal_px * ARCSEC_PER_RADIAN, 1e-3, 3600.0)
     return [
@@ -184,8 +194,8 @@ def _record(
         height_px=points.height_px,
         exposure_s=result.frame.exposure_s or camera.exposure_s,
         centroid=camera.centroid,
-        background_counts=round(points.background_counts, 3),
-        noise_counts=round(points.noise_counts, 3),
+        background_counts=rounded_counts(points.background_counts, 3),
+        noise_counts=rounded_counts(points.noise_counts, 3),
         candidates=points.count,
         sharp=[],
         stars=[
@@ -194,7 +204,7 @@ def _record(
                 "v_px": round(float(points.v_px[k]), 4),
                 "sigma_u_px": round(float(points.sigma_px[k]), 5),
                 "sigma_v_px": round(float(points.sigma_px[k]), 5),
-                "flux_counts": round(float(points.flux_counts[k]), 1),
+                "flux_counts": rounded_counts(float(points.flux_counts[k]), 1),
                 "magnitude": star["magnitude"],
                 "signal_ratio": round(float(points.signal_ratio[k]), 1),
                 "flags": [],

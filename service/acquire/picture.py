@@ -372,6 +372,26 @@ def _angle_deg(one: Vector, other: Vector) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other)))
 
 
+def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> list[str]:
+    """A remark where the zero point of a picture is far from that of its camera."""
+    found = result.attitude
+    if found is None or zero_point_mag is None or not math.isfinite(found.zero_point_mag):
+        return []
+    off_mag = found.zero_point_mag - zero_point_mag
+    if abs(off_mag) <= MOST_OFF_MAG:
+        return []
+    frame = result.frame
+    source = frame.exposure_source if frame.exposure_s else "no keyword"
+    remark = (
+        f"exposure_doubtful: with {frame.exposure_s or 1.0:.6g} s, from {source}, the zero point "
+        f"is {found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
+        f"factor of {10.0 ** (0.4 * abs(off_mag)):.3g}"
+    )
+    return [remark]
+
+
+MOST_OFF_MAG = 1.5
+"""The change of a camera's zero point that clouds and another aperture explain."""
 CLIPPED_SHARE = 0.5
 BLURRED_PX = 3.5
 FEW_POINTS = 6

@@ -102,15 +102,16 @@ class Frames:
         """
         self._submissions.require_kernels()
         # Importing this takes a third of the time that the service needs to start.
-        from service.acquire.picture import blind_sky, overlay_of, solve_picture
+        from service.acquire.picture import blind_sky, doubt_of_exposure, overlay_of, solve_picture
         from service.identify.blind.solver import focal_px_of
 
         with file:
-            shape, guess_px = None, None
+            shape, guess_px, zero_point_mag = None, None, None
             if spacecraft is not None:
                 mission = mission_named(self._context.missions, spacecraft)
                 _, camera = mission.camera_tracker(None, "spacecraft")
                 shape, guess_px = camera.shape, camera.focal_length_px
+                zero_point_mag = camera.zero_point_mag
             max_pixels = self._context.settings.frame_megapixels * 1_000_000
             limits = FrameLimits(max_pixels, shape, spacecraft or "the camera", image)
             if not self._picture_turn.acquire(timeout=FRAME_WAIT_S):
@@ -129,7 +130,10 @@ class Frames:
         return replace(
             found,
             # Remarks name options of the command.
-            remarks=[_COMMAND_OPTION.sub("", remark) for remark in found.remarks],
+            remarks=[
+                *(_COMMAND_OPTION.sub("", remark) for remark in found.remarks),
+                *doubt_of_exposure(result, zero_point_mag),
+            ],
             overlay_png=base64.b64encode(drawn).decode() if drawn is not None else None,
         )
 

@@ -18,9 +18,10 @@ from pydantic import AfterValidator, Field
 
 from service.errors import BadBatch, Fault
 from service.imaging.centroids.window import Flag
+from service.imaging.detection.levels import rounded_counts
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame, require_light
-from service.missions.camera import Camera, CentroidMethod
+from service.missions.camera import STARS_TO_MAG, Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
 
 
 LEAST_SIGMA_ARCSEC = 1e-3
+RANKS, LEAST_RANKS = (3, 21), 4
+"""The candidates by brightness whose magnitudes are held against the sky's, and how few may be."""
+MOST_OFF_MAG = 3.0
+"""Fields differ from the average by a factor of five in number: 1.5 mag, and cameras in colour."""
 BLENDED_SHARE = 0.15
 """The share of the image's sigma by which an unseen companion may move a blended star.
 
@@ -97,8 +102,10 @@ def submission_of_frame(
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
-    if known.exposure_s is not None:
-        frame = replace(frame, exposure_s=known.exposure_s)
+    if known.exposure_s is None:
+        remarks += exposure_remarks(frame)
+    else:
+        frame = replace(frame, exposure_s=known.exposure_s, exposure_source="the request")
     clock.append(clock_ns())
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
@@ -121,8 +128,10 @@ def submission_of_frame(
     )
     clock.append(clock_ns())
     used = [star for star in stars if star.left_out is None]
+    doubt = doubt_of_exposure(found, camera, frame)
     if not used:
-        raise bad_frame("shows no star that could be used", f"{found.count} candidates")
+        message = "; ".join(["shows no star that could be used", *doubt])
+        raise bad_frame(message, f"{found.count} candidates")
     model = batch_of_stars(mission.name, known, digest, time, tracker, _observed(used, camera))
     steps = dict(
         zip(
@@ -132,7 +141,7 @@ def submission_of_frame(
         )
     )
     record = _record(frame, found, stars, tracker, camera, known, steps)
-    record = replace(record, remarks=[*remarks, *choices_of(frame)])
+    record = replace(record, remarks=[*remarks, *doubt, *choices_of(frame)])
     submission = schema.submission_from_model(model)
     fingerprint = known.fingerprint(mission.name, digest)
     return schema.Submission(submission.batch, submission.text, fingerprint, record)
@@ -144,9 +153,10 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     Without a time, aberration cannot be corrected: where it is ignored anyway, the time of
     arrival stands in the records.  Raises `BadBatch` where it is not.
     """
-    time = known.time or frame.time
-    if time is not None:
-        return time, []
+    if known.time is not None:
+        return known.time, []
+    if frame.time is not None:
+        return frame.time, time_remarks(frame)
     if known.aberration != "ignore":
         message = f"must be given: {frame.no_time}; it may be absent where aberration is ignored"
         raise BadBatch(Fault("time", message))
@@ -157,10 +167,54 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     return utc_now().text, [remark]
 
 
+def time_remarks(frame: Frame) -> list[str]:
+    """The keywords that the time of a frame is from; nothing without one."""
+    return [f"time: {frame.time}, mid exposure, from {frame.time_source}"] if frame.time else []
+
+
+def exposure_remarks(frame: Frame) -> list[str]:
+    """The keyword that the exposure of a frame is from; nothing without one."""
+    if frame.exposure_s is None:
+        return []
+    return [f"exposure: {frame.exposure_s:.6g} s, from {frame.exposure_source}"]
+
+
 def choices_of(frame: Frame) -> list[str]:
     """The options chosen for a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
+
+
+def doubt_of_exposure(found: "Detections", camera: Camera, frame: Frame) -> list[str]:
+    """A remark on an exposure with which the candidates have not the light of stars.
+
+    Their magnitudes, the brightest two left out, are held against those that as many stars of the
+    sky have on average in a field of this size.
+    """
+    ranks = np.arange(RANKS[0], min(found.count, RANKS[1]))
+    if camera.zero_point_mag is None or len(ranks) < LEAST_RANKS:
+        return []
+    exposure_s = frame.exposure_s or camera.exposure_s
+    field_deg2 = camera.width_px * camera.height_px * math.degrees(1 / camera.focal_length_px) ** 2
+    seen = camera.magnitude(found.flux_counts[ranks - 1], exposure_s)
+    off_mag = float(np.median(seen - usual_magnitude(ranks, field_deg2)))
+    if not abs(off_mag) > MOST_OFF_MAG:
+        return []
+    source = frame.exposure_source if frame.exposure_s else "the mission"
+    remark = (
+        f"exposure_doubtful: with {exposure_s:.6g} s, from {source}, the candidates would be "
+        f"{abs(off_mag):.1f} mag {'fainter' if off_mag > 0.0 else 'brighter'} than the stars of "
+        f"a field of this size: a factor of {10.0 ** (0.4 * abs(off_mag)):.2g}"
+    )
+    return [remark]
+
+
+def usual_magnitude(ranks: npt.NDArray[np.intp], field_deg2: float) -> npt.NDArray[np.floating]:
+    """The magnitude (n,) to which a field holds so many stars on average over the sky."""
+    magnitudes, counts = np.array(STARS_TO_MAG).T
+    # The logarithm of the number is nearly a straight line.
+    slope, level = np.polyfit(magnitudes, np.log10(counts), 1)
+    return np.asarray((np.log10(ranks * 41253.0 / field_deg2) - level) / slope)
 
 
 def batch_of_stars(
@@ -232,8 +286,8 @@ def _record(
         height_px=frame.height_px,
         exposure_s=frame.exposure_s or camera.exposure_s,
         centroid=known.centroid or camera.centroid,
-        background_counts=round(float(np.median(found.background_counts)), 3),
-        noise_counts=round(found.noise_counts, 3),
+        background_counts=rounded_counts(float(np.median(found.background_counts)), 3),
+        noise_counts=rounded_counts(found.noise_counts, 3),
         candidates=found.count,
         sharp=[(round(u, 1), round(v, 1)) for u, v in sharp][:MAX_SHARP_KEPT],
         stars=[_star_fields(star) for star in stars],
@@ -251,7 +305,7 @@ def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
         "v_px": _rounded(record.v_px, 4),
         "sigma_u_px": _rounded(record.sigma_u_px, 5),
         "sigma_v_px": _rounded(record.sigma_v_px, 5),
-        "flux_counts": _rounded(record.flux_counts, 1),
+        "flux_counts": _rounded_counts(record.flux_counts, 1),
         "magnitude": _rounded(star.magnitude_mag, 3),
         "signal_ratio": _rounded(record.signal_ratio, 1),
         "flags": [str(flag) for flag in record.flags],
@@ -262,6 +316,10 @@ def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
 
 def _rounded(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
+
+
+def _rounded_counts(value: float, digits: int) -> float | None:
+    return rounded_counts(value, digits) if math.isfinite(value) else None
 
 
 MAX_SIDE_PX = 1024

@@ -12,7 +12,7 @@ from service.errors import BadBatch, BadFile
 from service.imaging.frames import files
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import FrameLimits
-from service.imaging.submit import FrameIn, time_of
+from service.imaging.submit import FrameIn, exposure_remarks, time_of
 
 ROWS, COLUMNS = 24, 40
 NOON = "2026-03-01T12:00:00"
@@ -84,6 +84,47 @@ TIMES = {
     "TT": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT"}, {}, 0.0),
     "TT(BIPM)": ({"DATE-AVG": "2026-03-01T12:01:09.184", "TIMESYS": "TT(BIPM08)"}, {}, 0.0),
     "GPS": ({"DATE-AVG": "2026-03-01T12:00:18", "TIMESYS": "GPS"}, {}, 0.0),
+    "milliseconds in words": (
+        {"DATE-OBS": NOON, "EXPTIME": (4000, "exposure time in milliseconds")},
+        {},
+        2.0,
+    ),
+    "ms at the end of a comment": ({"DATE-OBS": NOON, "EXPTIME": (4000, "integration, ms")}, {}, 2),
+    "microseconds in words": (
+        {"DATE-OBS": NOON, "EXPTIME": (4e6, "Exposure Time in microseconds")},
+        {},
+        2.0,
+    ),
+    "minutes in parentheses": ({"DATE-OBS": NOON, "EXPOSURE": (0.5, "total (min)")}, {}, 15.0),
+    "a word in parentheses": ({"DATE-OBS": NOON, "EXPTIME": (4.0, "exposure (total)")}, {}, 2.0),
+    "the shutter closes": ({"DATE-OBS": (NOON, "UTC at shutter close"), "EXPTIME": 4.0}, {}, -2.0),
+    "the shutter opens": ({"DATE-OBS": (NOON, "shutter opened"), "EXPTIME": 4.0}, {}, 2.0),
+    "an MJD of the middle": ({"MJD-OBS": (61100.5, "MJD of mid exposure"), "EXPTIME": 4.0}, {}, 0),
+    "local time and its offset": (
+        {
+            "DATE-OBS": ("2026-03-01T21:00:00", "Local time of start of exposure"),
+            "UTCOFFS": 9.0,
+            "EXPTIME": 4.0,
+        },
+        {},
+        2.0,
+    ),
+    "a zone in the comment": (
+        {"DATE-OBS": ("2026-03-01T06:30:00", "start, UTC-05:30"), "EXPTIME": 4.0},
+        {},
+        2.0,
+    ),
+    "local time beside UTC": (
+        {
+            "DATE-OBS": ("2026-03-01T21:00:00", "local time"),
+            "MJD-OBS": (61100.5, "UTC"),
+            "EXPTIME": 4.0,
+        },
+        {},
+        2.0,
+    ),
+    "TAI by the comment": ({"DATE-AVG": ("2026-03-01T12:00:37", "TAI")}, {}, 0.0),
+    "UTC of a receiver of GPS": ({"DATE-AVG": (NOON, "UTC from GPS")}, {}, 0.0),
     "MJD in TT": ({"MJD-AVG": 61100.5 + 69.184 / 86400, "TIMESYS": "TT"}, {}, 0.0),
 }
 
@@ -128,6 +169,54 @@ NO_TIMES = {
     ),
     "an exposure without a number": ({"DATE-OBS": NOON, "EXPTIME": None}, "no exposure"),
     "local time alone": ({"DATE-LOC": NOON, "EXPTIME": 2.0}, "none of DATE-AVG"),
+    "local time by its comment": (
+        {"DATE-OBS": (NOON, "Local time of start of exposure"), "EXPTIME": 1.0},
+        "DATE-OBS is local time by its comment",
+    ),
+    "the time of a zone": ({"DATE-AVG": (NOON, "CEST")}, "is local time by its comment (CEST)"),
+    "local time with a Z": ({"DATE-AVG": (NOON + "Z", "local time")}, "UTC by its Z"),
+    "local time and UTC": ({"DATE-AVG": (NOON, "UTC or local time")}, "not clearly UTC or local"),
+    "local time with an offset in minutes": (
+        {"DATE-AVG": (NOON, "local time"), "UTCOFFS": 540},
+        "no offset from UTC is known",
+    ),
+    "an offset of the other sign": (
+        {"DATE-AVG": (NOON, "local time"), "UTCOFFS": (-9, "hours to add to local time")},
+        "no offset from UTC is known",
+    ),
+    "the time when the file was written": (
+        {"DATE-OBS": (NOON, "when the file was written"), "EXPTIME": 1.0},
+        "not clearly start, middle or end",
+    ),
+    "start and end at once": (
+        {"DATE-OBS": (NOON, "start or end of the exposure"), "EXPTIME": 1.0},
+        "not clearly start, middle or end",
+    ),
+    "GPS by the comment": ({"DATE-AVG": (NOON, "GPS time")}, "TIMESYS is not given"),
+    "another scale in the comment": (
+        {"DATE-AVG": (NOON, "TAI"), "TIMESYS": "UTC"},
+        "TIMESYS is UTC, and the comment of DATE-AVG says TAI",
+    ),
+    "two units in a comment": (
+        {"DATE-OBS": NOON, "EXPTIME": (5, "seconds, or ms in the other mode")},
+        "its comment says otherwise",
+    ),
+    "a unit and another one": (
+        {"DATE-OBS": NOON, "EXPTIME": ("500 s", "in milliseconds")},
+        "EXPTIME is 500 s, and its comment says otherwise: in milliseconds",
+    ),
+    "a unit of all and another one": (
+        {"DATE-OBS": NOON, "XPOSURE": (500, "in ms"), "TIMEUNIT": "s"},
+        "its comment says otherwise",
+    ),
+    "exposures a thousand times apart": (
+        {"DATE-OBS": NOON, "XPOSURE": 0.5, "EXPTIME": 500.0},
+        "XPOSURE is 0.5 s and EXPTIME 500 s, which contradict each other",
+    ),
+    "an exposure of more than an hour": (
+        {"DATE-OBS": NOON, "EXPTIME": 5000},
+        "EXPTIME is 5000 s, and may be from 0 to 3600 s",
+    ),
     "exposure in furlongs": ({"DATE-OBS": NOON, "EXPTIME": (1.0, "[furlong]")}, "no exposure"),
     "a day that is none": ({"DATE-AVG": "2026-02-30T12:00:00"}, "cannot be read"),
 }
@@ -141,6 +230,36 @@ def test_a_header_that_tells_no_time_for_certain_is_asked_for_by_what_it_lacks(c
     with pytest.raises(BadBatch) as refusal:
         time_of(FrameIn(), frame)
     assert word in str(refusal.value)
+
+
+SOURCES = {
+    "an average": ({"DATE-AVG": NOON, "EXPTIME": 2.0}, "DATE-AVG (middle of the exposure)"),
+    "a start": (
+        {"DATE-OBS": NOON, "EXPTIME": (500, "in milliseconds")},
+        "DATE-OBS (start of the exposure) and EXPTIME = 500 in the unit of its comment",
+    ),
+    "start and end": (
+        {"DATE-BEG": NOON, "DATE-END": "2026-03-01T12:00:08"},
+        "DATE-BEG (start of the exposure) and DATE-END (end of the exposure)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", SOURCES)
+def test_the_keywords_of_time_and_exposure_are_named(case):
+    cards, source = SOURCES[case]
+    frame = header_time(cards)
+    _, remarks = time_of(FrameIn(), frame)
+    assert remarks[0].startswith(f"time: {frame.time}, mid exposure, from {source}")
+    (told,) = exposure_remarks(frame) or [""]
+    assert ("EXPTIME" in told) == ("EXPTIME" in cards)
+    assert time_of(FrameIn(time=NOON + "Z"), frame) == (NOON + "Z", [])
+
+
+def test_a_time_that_is_not_taken_is_named_on_a_picture():
+    frame = header_time({"DATE-OBS": (NOON, "local time"), "EXPTIME": 1.0})
+    assert any(remark.startswith("no_time: DATE-OBS is local time") for remark in frame.remarks)
+    assert not any("no_time" in remark for remark in header_time({}).remarks)
 
 
 def test_rows_from_the_bottom_up_are_turned_to_the_way_they_are_shown(values):

@@ -23,6 +23,7 @@ from scipy.ndimage import median_filter
 from service.imaging.centroids.psf import GaussianPsf
 from service.imaging.centroids.window import Detector
 from service.imaging.detection.cosmic_rays import is_sharp, stars_behind
+from service.imaging.detection.levels import count_step
 from service.imaging.detection.star_images import ImageSearch, PsfAt, StarImages, psf_of
 from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.missions.camera import Camera
@@ -52,12 +53,12 @@ Mask = npt.NDArray[np.bool_]
 
 
 def take_background_off(
-    light: CountArray, mask: Mask | None, psf_sigma_px: float
+    light: CountArray, mask: Mask | None, psf_sigma_px: float, step_counts: float = 1.0
 ) -> tuple[CountArray, CountArray]:
     """Subtract the level from light (rows, columns) in place; returns level and noise.
 
     `mask` is True where a pixel holds no number.  Images of stars that are too wide for a fine
-    mesh keep the coarse one.
+    mesh keep the coarse one.  `step_counts` is the difference of neighbouring counts.
     """
     level = sep.Background(light, mask=mask, bw=MESH_PX, bh=MESH_PX).back(dtype=light.dtype)
     light -= level
@@ -68,10 +69,10 @@ def take_background_off(
     if fits and np.count_nonzero(uneven) > UNEVEN_SHARE * uneven.size:
         for _ in range(FINE_ROUNDS):
             level += _take_fine_off(light, mask, fine)
-        noise = _noise_by_blocks(light, mask, fine)
+        noise = _noise_by_blocks(light, mask, fine, step_counts)
     # Where most pixels are equal, as in a frame cut off at its background, a count is the least
     # step.
-    noise[~(noise > 0.0)] = 1.0
+    noise[~(noise > 0.0)] = step_counts
     return level, noise
 
 
@@ -103,20 +104,22 @@ def _take_fine_off(light: CountArray, mask: Mask | None, side: int) -> CountArra
     return level
 
 
-def _noise_by_blocks(light: CountArray, mask: Mask | None, side: int) -> CountArray:
+def _noise_by_blocks(
+    light: CountArray, mask: Mask | None, side: int, step_counts: float
+) -> CountArray:
     """One standard deviation of each pixel, from squares without what stands out in them.
 
     Of a square that a limb crosses the light of the limb is noise, so that no star is seen in it.
     """
     blocks = _blocks(light, mask, side)
     away = np.abs(blocks - _median(blocks)[:, :, None])
-    sigma = np.maximum(MAD_SIGMAS * _median(away), 0.5)
+    sigma = np.maximum(MAD_SIGMAS * _median(away), 0.5 * step_counts)
     squares = away**2
     for _ in range(2):
         kept = away < CLIP_SIGMAS * sigma[:, :, None]
         total = np.sum(squares, axis=2, where=kept)
         mean = total / np.maximum(np.count_nonzero(kept, axis=2), 1)
-        sigma = np.maximum(np.sqrt(mean) / CLIPPED_SHARE, 0.3)
+        sigma = np.maximum(np.sqrt(mean) / CLIPPED_SHARE, 0.3 * step_counts)
     smooth = median_filter(sigma, 3, mode="nearest")
     crossed = sigma > CROSSED * smooth
     return _between(np.where(crossed, sigma, smooth), side, light.shape).astype(light.dtype)
@@ -221,7 +224,8 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
     mask = None if known.all() else ~known
     if mask is not None:
         light[mask] = 0.0
-    level, noise_map = take_background_off(light, mask, camera.psf_sigma_px)
+    step_counts = count_step(frame.counts)
+    level, noise_map = take_background_off(light, mask, camera.psf_sigma_px, step_counts)
     noise = float(np.median(noise_map[::8, ::8]))
     if camera.psf == "gaussian":
         images, left = None, light

@@ -13,6 +13,7 @@ import numpy.typing as npt
 import sep
 from scipy import fft
 
+from service.imaging.detection.levels import count_step, levels_of
 from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.vectors import Vector, read_only
 
@@ -95,9 +96,10 @@ def find_points(
     """
     height, width = counts.shape
     binning = max(1, math.ceil(math.sqrt(counts.size / MAX_WORKING_PIXELS)))
-    working = _filled(_binned(counts, binning))
-    # Counts of a file are integers, and finer than that where they were summed.
-    step = 1.0 / binning if binning > 1 else 1.0
+    levels = levels_of(counts)
+    working = _filled(_binned(levels.scaled(counts), binning))
+    # Means of counts are finer than these.
+    step = levels.step_counts * levels.factor / binning
     background = sep.Background(working, bw=MESH_PX, bh=MESH_PX)
     light = working
     background.subfrom(light)
@@ -118,16 +120,19 @@ def find_points(
     lit = shapes.weighted > 0.0
     ratio = ratio[lit]
     sigma = np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
-    offset = 0.5 * (binning - 1)
+    offset, unit = 0.5 * (binning - 1), 1.0 / levels.factor
+    flux = shapes.weighted[lit] * (1.0 + (psf / weight) ** 2) * binning**2
+    if not levels.is_as_it_is:
+        light *= np.float32(unit)
     return PointSources(
         u_px=read_only(shapes.u_px[lit] * binning + offset),
         v_px=read_only(shapes.v_px[lit] * binning + offset),
         sigma_px=read_only(sigma * binning),
         signal_ratio=read_only(ratio),
-        flux_counts=read_only(shapes.weighted[lit] * (1.0 + (psf / weight) ** 2) * binning**2),
+        flux_counts=read_only(flux * unit),
         psf_sigma_px=psf * binning,
-        noise_counts=max(float(background.globalrms), step / math.sqrt(12.0)),
-        background_counts=float(background.globalback),
+        noise_counts=max(float(background.globalrms), step / math.sqrt(12.0)) * unit,
+        background_counts=float(background.globalback) * unit + levels.zero_counts,
         clipped_share=np.count_nonzero(counts <= np.nanmin(counts)) / counts.size,
         light=light,
         binning=binning,
@@ -151,7 +156,7 @@ class _Shapes:
 def _binned(counts: CountArray, binning: int) -> CountArray:
     """The means of blocks; an incomplete one at the edge is left out."""
     if binning == 1:
-        return np.array(counts, dtype=np.float32)
+        return counts
     rows, columns = (side // binning for side in counts.shape)
     blocks = counts[: rows * binning, : columns * binning]
     shape = (rows, binning, columns, binning)
@@ -325,6 +330,8 @@ def without_dark(frame: Frame, dark: Frame) -> Frame:
 def hot_pixels(dark: CountArray) -> CountArray:
     """The pixels (rows, columns) of a dark frame that stand out, or hold no number."""
     middle = np.nanmedian(dark)
-    # Counts are whole numbers: a quiet sensor may have a spread of none.
-    spread = max(1.48 * float(np.nanmedian(np.abs(dark - middle))), 0.5)
+    # A quiet sensor may have a spread of none: its counts differ by whole steps.
+    spread = max(1.48 * float(np.nanmedian(np.abs(dark - middle))), 0.5 * count_step(dark))
+    # Of counts that are all equal none stands out.
+    spread = spread or 1.0
     return np.asarray(~(dark < middle + HOT_SIGMAS * spread))

@@ -103,6 +103,9 @@ def exif_of(image: Any) -> Mapping[int, Any]:
     return exif
 
 
+TIME_SOURCE, EXPOSURE_SOURCE = "EXIF DateTimeOriginal and OffsetTimeOriginal", "EXIF ExposureTime"
+
+
 def exposure_of(image: Any) -> tuple[str | None, float | None]:
     """The UTC of mid exposure and the exposure in seconds, each None where EXIF does not tell.
 

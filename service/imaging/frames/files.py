@@ -251,4 +251,7 @@ def read_raw(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         full_scale = float(step**2 * raw.white_level)
         shutter_s = float(getattr(raw.other, "shutter", 0.0) or 0.0)
     exposure_s = shutter_s if 0.0 < shutter_s <= 3600.0 else None
-    return Frame(as_counts(counts), "RAW", digest, full_scale, None, exposure_s)
+    return Frame(
+        *(as_counts(counts), "RAW", digest, full_scale, None, exposure_s),
+        exposure_source="the shutter time of the raw file",
+    )

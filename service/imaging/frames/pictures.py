@@ -8,7 +8,15 @@ import numpy as np
 import numpy.typing as npt
 
 from service.imaging.frames.bounded_file import BoundedFile, decoding
-from service.imaging.frames.exif import TAG, as_shown, exif_of, exposure_of, require_small_exif
+from service.imaging.frames.exif import (
+    EXPOSURE_SOURCE,
+    TAG,
+    TIME_SOURCE,
+    as_shown,
+    exif_of,
+    exposure_of,
+    require_small_exif,
+)
 from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
@@ -51,7 +59,12 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
             require_whole(file.read(), limits.max_pixels)
     counts, orientation = as_shown(as_counts(values), tag)
     limits.require(counts.shape[1], counts.shape[0])
-    return Frame(counts, file_format, digest, full_scale, time, exposure_s, orientation=orientation)
+    return Frame(
+        *(counts, file_format, digest, full_scale, time, exposure_s),
+        orientation=orientation,
+        time_source=TIME_SOURCE,
+        exposure_source=EXPOSURE_SOURCE,
+    )
 
 
 def _opened(file: BoundedFile, file_format: str) -> Any:

@@ -16,8 +16,10 @@ import numpy.typing as npt
 
 from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import (
+    EXPOSURE_SOURCE,
     MAX_EXIF_BYTES,
     TAG,
+    TIME_SOURCE,
     Entry,
     as_shown,
     bytes_beyond,
@@ -77,6 +79,8 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         *(counts, "TIFF", digest, full_scale, time, exposure_s),
         orientation=orientation,
         remarks=remarks,
+        time_source=TIME_SOURCE,
+        exposure_source=EXPOSURE_SOURCE,
     )
 
 
