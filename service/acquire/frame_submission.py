@@ -66,8 +66,6 @@ def _of_unknown_lens(
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = submit.time_of(known, frame)
-    if known.exposure_s is None:
-        remarks += submit.exposure_remarks(frame)
     exposure_s = known.exposure_s or frame.exposure_s or camera.exposure_s
     frame = replace(frame, exposure_s=exposure_s)
     read = perf_counter_ns()

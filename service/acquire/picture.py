@@ -27,6 +27,7 @@ from service.imaging.detection.points import (
 from service.imaging.frames.exif import is_by_rows, mirrored
 from service.imaging.frames.frame import Frame, require_light
 from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
+from service.imaging.submit import exposure_stated
 from service.sky.catalog.proper_names import PROPER_NAMES
 from service.sky.catalog.star_catalog import Catalog
 from service.sky.ephemeris import apparent, observer_velocity
@@ -380,11 +381,9 @@ def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> li
     off_mag = found.zero_point_mag - zero_point_mag
     if abs(off_mag) <= MOST_OFF_MAG:
         return []
-    frame = result.frame
-    source = frame.exposure_source if frame.exposure_s else "no keyword"
     remark = (
-        f"exposure_doubtful: with {frame.exposure_s or 1.0:.6g} s, from {source}, the zero point "
-        f"is {found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
+        f"exposure_doubtful: with {exposure_stated(result.frame)}, the zero point is "
+        f" {found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
         f"factor of {10.0 ** (0.4 * abs(off_mag)):.3g}"
     )
     return [remark]

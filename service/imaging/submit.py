@@ -102,10 +102,10 @@ def submission_of_frame(
     frame = read_frame(file, limits, digest)
     require_light(frame, camera.saturation_counts)
     time, remarks = time_of(known, frame)
-    if known.exposure_s is None:
-        remarks += exposure_remarks(frame)
-    else:
-        frame = replace(frame, exposure_s=known.exposure_s, exposure_source="the request")
+    stated = exposure_stated(frame)
+    if known.exposure_s is not None:
+        frame = replace(frame, exposure_s=known.exposure_s)
+        stated = f"{known.exposure_s:.6g} s, as given"
     clock.append(clock_ns())
     # What these import takes a third of the service's start, which no frame may follow.
     from service.imaging.detection.detect import detect
@@ -128,7 +128,7 @@ def submission_of_frame(
     )
     clock.append(clock_ns())
     used = [star for star in stars if star.left_out is None]
-    doubt = doubt_of_exposure(found, camera, frame)
+    doubt = doubt_of_exposure(found, camera, frame.exposure_s, stated)
     if not used:
         message = "; ".join(["shows no star that could be used", *doubt])
         raise bad_frame(message, f"{found.count} candidates")
@@ -153,10 +153,9 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     Without a time, aberration cannot be corrected: where it is ignored anyway, the time of
     arrival stands in the records.  Raises `BadBatch` where it is not.
     """
-    if known.time is not None:
-        return known.time, []
-    if frame.time is not None:
-        return frame.time, time_remarks(frame)
+    time = known.time or frame.time
+    if time is not None:
+        return time, []
     if known.aberration != "ignore":
         message = f"must be given: {frame.no_time}; it may be absent where aberration is ignored"
         raise BadBatch(Fault("time", message))
@@ -167,25 +166,22 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
     return utc_now().text, [remark]
 
 
-def time_remarks(frame: Frame) -> list[str]:
-    """The keywords that the time of a frame is from; nothing without one."""
-    return [f"time: {frame.time}, mid exposure, from {frame.time_source}"] if frame.time else []
-
-
-def exposure_remarks(frame: Frame) -> list[str]:
-    """The keyword that the exposure of a frame is from; nothing without one."""
-    if frame.exposure_s is None:
-        return []
-    return [f"exposure: {frame.exposure_s:.6g} s, from {frame.exposure_source}"]
-
-
 def choices_of(frame: Frame) -> list[str]:
     """The options chosen for a file, and how its pixels were turned, where they were."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
 
 
-def doubt_of_exposure(found: "Detections", camera: Camera, frame: Frame) -> list[str]:
+def exposure_stated(frame: Frame) -> str:
+    """The exposure of a frame in words, with the keyword that states it."""
+    mark = "exposure_of_file: "
+    stated = (remark.removeprefix(mark) for remark in frame.remarks if remark.startswith(mark))
+    return next(stated, "1 s" if frame.exposure_s is None else f"{frame.exposure_s:.6g} s")
+
+
+def doubt_of_exposure(
+    found: "Detections", camera: Camera, exposure_s: float | None, stated: str
+) -> list[str]:
     """A remark on an exposure with which the candidates have not the light of stars.
 
     Their magnitudes, the brightest two left out, are held against those that as many stars of the
@@ -194,15 +190,15 @@ def doubt_of_exposure(found: "Detections", camera: Camera, frame: Frame) -> list
     ranks = np.arange(RANKS[0], min(found.count, RANKS[1]))
     if camera.zero_point_mag is None or len(ranks) < LEAST_RANKS:
         return []
-    exposure_s = frame.exposure_s or camera.exposure_s
+    if exposure_s is None:
+        exposure_s, stated = camera.exposure_s, f"{camera.exposure_s:.6g} s, from the mission"
     field_deg2 = camera.width_px * camera.height_px * math.degrees(1 / camera.focal_length_px) ** 2
     seen = camera.magnitude(found.flux_counts[ranks - 1], exposure_s)
     off_mag = float(np.median(seen - usual_magnitude(ranks, field_deg2)))
     if not abs(off_mag) > MOST_OFF_MAG:
         return []
-    source = frame.exposure_source if frame.exposure_s else "the mission"
     remark = (
-        f"exposure_doubtful: with {exposure_s:.6g} s, from {source}, the candidates would be "
+        f"exposure_doubtful: with {stated}, the candidates would be "
         f"{abs(off_mag):.1f} mag {'fainter' if off_mag > 0.0 else 'brighter'} than the stars of "
         f"a field of this size: a factor of {10.0 ** (0.4 * abs(off_mag)):.2g}"
     )

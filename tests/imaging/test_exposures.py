@@ -45,7 +45,7 @@ def remarks_of(frame, exposure_s, missions, sky):
 def test_a_right_exposure_is_not_doubted(frame, missions, sky):
     _, camera = missions["IMAGER"].camera_tracker(None, "tracker")
     remarks = remarks_of(frame, camera.exposure_s, missions, sky)
-    assert f"exposure: {camera.exposure_s:.6g} s, from EXPTIME" in remarks
+    assert f"exposure_of_file: {camera.exposure_s:.6g} s, from EXPTIME" in remarks
     assert not any("doubtful" in remark for remark in remarks)
 
 

@@ -103,7 +103,15 @@ def exif_of(image: Any) -> Mapping[int, Any]:
     return exif
 
 
-TIME_SOURCE, EXPOSURE_SOURCE = "EXIF DateTimeOriginal and OffsetTimeOriginal", "EXIF ExposureTime"
+def timing_remarks(time: str | None, exposure_s: float | None) -> list[str]:
+    """Remarks that name the tags of a time and an exposure, as far as there are any."""
+    remarks = []
+    if time is not None:
+        source = "EXIF DateTimeOriginal (start of the exposure)"
+        remarks.append(f"time_of_file: {time}, mid exposure, from {source}")
+    if exposure_s is not None:
+        remarks.append(f"exposure_of_file: {exposure_s:.6g} s, from EXIF ExposureTime")
+    return remarks
 
 
 def exposure_of(image: Any) -> tuple[str | None, float | None]:

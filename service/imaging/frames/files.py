@@ -23,6 +23,7 @@ import numpy.typing as npt
 
 from service.errors import BadFile
 from service.imaging.frames.bounded_file import BoundedFile, decoding
+from service.imaging.frames.exif import timing_remarks
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 
 _HEADERS = {
@@ -253,5 +254,5 @@ def read_raw(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     exposure_s = shutter_s if 0.0 < shutter_s <= 3600.0 else None
     return Frame(
         *(as_counts(counts), "RAW", digest, full_scale, None, exposure_s),
-        exposure_source="the shutter time of the raw file",
+        remarks=tuple(timing_remarks(None, exposure_s)),
     )

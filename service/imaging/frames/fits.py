@@ -14,7 +14,7 @@ from service.errors import BadFile
 from service.imaging.frames import fits_header, fits_tiles
 from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.files import as_counts
-from service.imaging.frames.fits_time import NOTHING_STATED, time_of_header
+from service.imaging.frames.fits_time import NOTHING_STATED, time_of_header, timing_remarks
 from service.imaging.frames.frame import AS_STORED, CountArray, Frame, FrameLimits, bad_frame
 
 ABSENT = (
@@ -45,12 +45,11 @@ def read_fits(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     timing = time_of_header(header, primary)
     if timing.reason and not timing.reason.startswith(NOTHING_STATED):
         remarks = (*remarks, f"no_time: {timing.reason}")
+    remarks = (*remarks, *timing_remarks(timing))
     counts, orientation = _as_shown(counts, header.behind(primary))
     return Frame(
         *(counts, "FITS", digest, full_scale, timing.time, timing.exposure_s),
         no_time=f"the file has no time of exposure: {timing.reason}",
-        time_source=timing.time_source,
-        exposure_source=timing.exposure_source,
         orientation=orientation,
         remarks=remarks,
     )

@@ -107,6 +107,18 @@ class HeaderExposure:
     is_contradictory: bool = False
 
 
+def timing_remarks(timing: HeaderTime) -> list[str]:
+    """Remarks that name the keywords of a time and an exposure, as far as there are any."""
+    remarks = []
+    if timing.time is not None:
+        remarks.append(f"time_of_file: {timing.time}, mid exposure, from {timing.time_source}")
+    if timing.exposure_s is not None:
+        remarks.append(
+            f"exposure_of_file: {timing.exposure_s:.6g} s, from {timing.exposure_source}"
+        )
+    return remarks
+
+
 def time_of_header(header: Header, primary: Header) -> HeaderTime:
     """The time and exposure of an image's header, else of the primary header of its file."""
     own = [header, primary]
@@ -345,9 +357,9 @@ class _DateCards:
         if _IS_UTC.search(comment):
             raise _LocalTime(f"{key} is not clearly UTC or local time ({comment[:60]})")
         for offset in UTC_OFFSETS:
-            hours = self._offset_h(offset)
-            if hours is not None:
-                return hours
+            ahead_h = self._offset_h(offset)
+            if ahead_h is not None:
+                return ahead_h
         raise _LocalTime(f"{message}, and no offset from UTC is known")
 
     def _offset_h(self, key: str) -> float | None:

@@ -25,8 +25,7 @@ class Frame:
 
     `full_scale` is the largest count that the file's numbers can hold, infinite for
     floating ones.  `time` is the UTC of mid exposure as text and `exposure_s` the
-    exposure, each None where the file does not tell; `no_time` is then the reason, and
-    the sources name the keywords that they were taken from.
+    exposure, each None where the file does not tell; `no_time` is then the reason.
     `orientation` is how the counts were turned from the order in which the file stores
     them, and `remarks` name what else was chosen.
     """
@@ -38,8 +37,6 @@ class Frame:
     time: str | None = None
     exposure_s: float | None = None
     no_time: str = "the file has no time of exposure"
-    time_source: str = ""
-    exposure_source: str = ""
     orientation: str = AS_STORED
     is_mirrored: bool = False
     """True if the sky fits only the mirror image, which the counts then are."""

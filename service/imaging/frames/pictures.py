@@ -9,13 +9,12 @@ import numpy.typing as npt
 
 from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import (
-    EXPOSURE_SOURCE,
     TAG,
-    TIME_SOURCE,
     as_shown,
     exif_of,
     exposure_of,
     require_small_exif,
+    timing_remarks,
 )
 from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
@@ -62,8 +61,7 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
     return Frame(
         *(counts, file_format, digest, full_scale, time, exposure_s),
         orientation=orientation,
-        time_source=TIME_SOURCE,
-        exposure_source=EXPOSURE_SOURCE,
+        remarks=tuple(timing_remarks(time, exposure_s)),
     )
 
 

@@ -16,15 +16,14 @@ import numpy.typing as npt
 
 from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import (
-    EXPOSURE_SOURCE,
     MAX_EXIF_BYTES,
     TAG,
-    TIME_SOURCE,
     Entry,
     as_shown,
     bytes_beyond,
     directory,
     exif_exposure,
+    timing_remarks,
 )
 from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
@@ -78,9 +77,7 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     return Frame(
         *(counts, "TIFF", digest, full_scale, time, exposure_s),
         orientation=orientation,
-        remarks=remarks,
-        time_source=TIME_SOURCE,
-        exposure_source=EXPOSURE_SOURCE,
+        remarks=(*remarks, *timing_remarks(time, exposure_s)),
     )
 
 

@@ -4,7 +4,6 @@ import math
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from service.imaging.detection.levels import rounded_counts
-from service.imaging.submit import exposure_remarks, time_remarks
 from service.storage.models.base import Components, Count, Quaternion, Record, doc
 
 if TYPE_CHECKING:
@@ -87,12 +86,7 @@ def picture_of(result: "PictureResult") -> Picture:
         noise_counts=rounded_counts(points.noise_counts, 3),
         attitude=_attitude(found) if found else None,
         orientation=frame.orientation,
-        remarks=[
-            *result.remarks,
-            *frame.remarks,
-            *time_remarks(frame),
-            *exposure_remarks(frame),
-        ],
+        remarks=[*result.remarks, *frame.remarks],
         time=frame.time,
         exposure_s=frame.exposure_s,
         lens=_lens(found) if found else None,
