@@ -30,7 +30,7 @@ from service.missions.mission import SHIPPED_FOLDER, load_missions
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from service.storage.projections import projector
+from service.storage import progress
 from tests import fresh_databases, scale
 from tests.fresh_databases import sqlite_at
 from tests.torture import FIGURES
@@ -215,7 +215,7 @@ def memory_given_back():
 @pytest.fixture(autouse=True)
 def projections_waited_for(monkeypatch):
     """Readers wait for the projections as long as it takes, however busy the machine is."""
-    monkeypatch.setattr(projector, "WAIT_S", 60.0)
+    monkeypatch.setattr(progress, "WAIT_S", 60.0)
 
 
 @pytest.fixture

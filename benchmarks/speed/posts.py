@@ -364,14 +364,14 @@ def _parse_and_insert(lines: Sequence[bytes], database: Path) -> float:
     try:
         made = [submission_from_json(line, run="bulk") for line in lines]
         unsaved_results = [app.submissions.solver.solve(each) for each in made]
-        app.store.writer.change(lambda connection: None).result()
+        app.store.writer.change(lambda connection: None)
         spent = 0.0
         for first in range(0, len(lines), CHUNK):
             started = time.perf_counter()
             for line in lines[first : first + CHUNK]:
                 submission_from_json(line, run="bulk")
             part = unsaved_results[first : first + CHUNK]
-            app.store.writer.record(part).result()
+            app.store.writer.record(part)
             spent += time.perf_counter() - started
     finally:
         app.close()

@@ -147,7 +147,7 @@ class Alarms:
         if due:
             self._context.store.writer.project(
                 lambda connection: evaluate_by_clock(connection, self._context.missions, moment)
-            ).result()
+            )
         return due
 
     def _act(

@@ -101,7 +101,7 @@ class Context:
 
     def change(self, change: Callable[[Connection], T]) -> T:
         """Change the database in one transaction, and wait until it is committed."""
-        return self.store.writer.change(change).result()
+        return self.store.writer.change(change)
 
     def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
         """`change` with its entry in the audit list, in one transaction.
@@ -109,7 +109,7 @@ class Context:
         The projector evaluates all earlier batches first: an operator acts on alarms as the page
         showed them, and a new limit holds from the next batch on.
         """
-        self.store.before_reading()
+        self.store.progress.wait()
 
         def audited(connection: Connection) -> T:
             changed = change(connection)

@@ -57,7 +57,10 @@ class App:
             utc_now,
         )
         self.tokens = Tokens(context, context.missions)
-        self.submissions = SubmissionService(context.missions, context.sky, context.store, kernels)
+        self.adoptions = CalibrationAdoptions(context, lambda: self.replays.bulk.workers.restart())
+        self.submissions = SubmissionService(
+            context.missions, context.sky, context.store, kernels, self.adoptions
+        )
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
@@ -71,12 +74,11 @@ class App:
         self.alarms = Alarms(context)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
-        self.replays = Replays(context, self.submissions, self.gyro.begin)
+        self.replays = Replays(context, self.submissions, self.gyro.record_many)
         self.zones = Zones(context)
         self.advice = AdviceService(context, self.submissions, self.zones)
         self.comparisons = Comparisons(context, self.submissions)
         self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
-        self.adoptions = CalibrationAdoptions(context, self.replays.bulk.workers.restart)
         self.events = Events(context)
         self.expiries = ExpiryDates(context.reading_record)
         self.webhooks = Webhooks(context, self.access)
@@ -151,8 +153,6 @@ def open_app(
             _register(app.context)
             if store.lock is None:
                 _end_left_work(app, serving)
-        if store.lock is not None:
-            app.submissions.before_solving = app.adoptions.follow_in
         app.single_projector.start(app.adoptions.follow)
         app.projector.start()
     except BaseException:

@@ -14,8 +14,7 @@ from sqlalchemy import Connection
 from service.access import Caller, Entry
 from service.app.context import Context, checked_run_name, known_id
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
-from service.gyro import GyroBlock
-from service.ingest.bulk import Bulk, Check
+from service.ingest.bulk import Bulk, Check, RecordBlocks
 from service.ingest.memory import require_memory_for_replay
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
@@ -23,7 +22,6 @@ from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.decompress import Coding, unpacked_lines
 from service.packets.reader import PacketLines
-from service.storage.gyro import Recorded
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries import replays
 from service.storage.recording.ids import unguessable_ulid
@@ -75,7 +73,7 @@ class Replays:
         self,
         context: Context,
         submissions: SubmissionService,
-        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
+        record_blocks: RecordBlocks,
     ) -> None:
         self._context = context
         config = WorkerConfig(
@@ -86,7 +84,7 @@ class Replays:
         )
         self.bulk = Bulk(
             submissions,
-            begin_block,
+            record_blocks,
             context.store,
             config,
             context.settings.replay_processes,

@@ -3,7 +3,7 @@
 import gc
 import logging
 import threading
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 from msgspec import structs
 
@@ -84,7 +84,7 @@ class Service:
             finally:
                 gc.enable()
                 self._warming.release()
-        self._context.store.writer.require()
+        self._submissions.require_alive()
         self._context.store.writer.require_written()
         with self._context.reading_record() as connection:
             connection.exec_driver_sql("SELECT 1")
@@ -181,7 +181,7 @@ class Service:
 
 
 class Events:
-    """Reads events, and calls listeners when something was written."""
+    """Reads events."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -197,11 +197,3 @@ class Events:
         """The events after a number, oldest first; None where some of them are no longer kept."""
         with self._context.reading_record() as connection:
             return events.events_after(connection, last, limit)
-
-    def listen(self, listener: Callable[[], object]) -> None:
-        """Call a function, from any thread, after each commit that has events."""
-        self._context.store.writer.after_events.append(listener)
-
-    def unlisten(self, listener: Callable[[], object]) -> None:
-        """Stop calling a function after each commit that has events."""
-        self._context.store.writer.after_events.remove(listener)

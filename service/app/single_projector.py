@@ -132,9 +132,9 @@ class SingleProjector:
             ids = unfinished_replays(connection) | unfinished_calibrations(connection)
         others = ids - self._store.at_work
         project = self._store.writer.project
-        left = project(partial(left_behind, ids=others)).result() if others else set()
+        left = project(partial(left_behind, ids=others)) if others else set()
         ended, self._suspected = left & self._suspected, left
         if ended:
             now = utc_now().text
-            project(lambda connection: mark_interrupted(connection, now, only=ended)).result()
-            project(lambda connection: interrupt_calibrations(connection, now, ended)).result()
+            project(lambda connection: mark_interrupted(connection, now, only=ended))
+            project(lambda connection: interrupt_calibrations(connection, now, ended))

@@ -3,7 +3,7 @@
 Also their gyro blocks: recorded once, however often they are sent, and read back.
 """
 
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from functools import partial
 from itertools import chain
 from typing import Any, Unpack
@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 
 from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
 from service.app.context import Context, PageOfPeriod, known_id
-from service.errors import BadBatch, Fault, shown_value
+from service.errors import AcquisitionError, BadBatch, Fault, shown_value
 from service.gyro import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission, mission_named
@@ -30,6 +30,7 @@ from service.storage.queries.trends import worst_batches
 from service.storage.recording.ids import Ulids
 from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.unsaved_result import LIVE
+from service.storage.sql.columns import Row
 from service.times import Utc, utc_now, utc_of_unix
 
 
@@ -285,33 +286,39 @@ class Gyro:
         return self.record(block_from_json(sent, name))
 
     def record(self, block: GyroBlock) -> blocks.Recorded:
-        """Record a block, and wait for that; a repeat of the same body gets the recorded one.
-
-        See `begin` for what is refused.
-        """
-        return self.begin(block)()
-
-    def begin(self, block: GyroBlock) -> Callable[[], blocks.Recorded]:
-        """Queue a block for the writer; to call what it gives waits until it is recorded.
+        """Record a block; a repeat of the same body gets the recorded one.
 
         Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
-        mission, `Busy` where too much is waiting.  Both raise `Conflict` where another body has
-        its name, and `SampleTaken` where another block of the spacecraft and the run holds one
-        of its times.
+        mission, `Conflict` where another body has its name, and `SampleTaken` where another block
+        of the spacecraft and the run holds one of its times.
         """
-        mission = mission_in_input(self._context.missions, block.spacecraft)
-        require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
-        row = blocks.row_of(block, self._ids.new(), utc_now())
-        store = self._context.store
-        # Looked up here as well: an error in the writer's transaction would make it begin anew.
-        with store.reading_record() as connection:
-            found = blocks.find_block(connection, block, row)
-        if found is not None:
-            recorded = blocks.Recorded(found, replayed=True)
-            return lambda: recorded
-        return store.writer.change(
-            lambda connection: blocks.record_block(connection, block, row)
-        ).result
+        (recorded,) = self.record_many([block])
+        if isinstance(recorded, AcquisitionError):
+            raise recorded
+        return recorded
+
+    def record_many(self, group: Sequence[GyroBlock]) -> list[blocks.Recorded | AcquisitionError]:
+        """Record blocks in one transaction; a refused one has its error in the list."""
+        received = utc_now()
+        found: dict[int, blocks.Recorded | AcquisitionError] = {}
+        rows: dict[int, Row] = {}
+        for place, block in enumerate(group):
+            try:
+                mission = mission_in_input(self._context.missions, block.spacecraft)
+                require_rates_within(block, largest_rate_deg_per_s(mission.gyro))
+            except AcquisitionError as error:
+                found[place] = error
+            else:
+                rows[place] = blocks.row_of(block, self._ids.new(), received)
+
+        def change(connection: Connection) -> dict[int, blocks.Recorded | AcquisitionError]:
+            return {
+                place: blocks.record_or_refuse(connection, group[place], row)
+                for place, row in rows.items()
+            }
+
+        found |= self._context.change(change) if rows else {}
+        return [found[place] for place in range(len(group))]
 
     def page(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[GyroBlockRow]:
         """The blocks of a period without their samples, the earliest first."""

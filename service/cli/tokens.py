@@ -109,7 +109,7 @@ class _Direct:
                 entry.add_to(connection)
             return changed
 
-        return self._store.writer.change(audited).result()
+        return self._store.writer.change(audited)
 
 
 class _InDatabase:

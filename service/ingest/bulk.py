@@ -147,6 +147,9 @@ Decided = UnsavedResult | GyroBlock | TrackedLine | Answered | AcquisitionError
 Check = Callable[[str], None]
 """Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
 
+RecordBlocks = Callable[[Sequence[GyroBlock]], list[Recorded | AcquisitionError]]
+"""Records gyro blocks in one transaction."""
+
 Require = Callable[[], object]
 """Raises an `AcquisitionError` where no more is to be computed."""
 
@@ -168,15 +171,16 @@ class Bulk:
     def __init__(
         self,
         submissions: SubmissionService,
-        begin_block: Callable[[GyroBlock], Callable[[], Recorded]],
+        record_blocks: RecordBlocks,
         store: Store,
         config: WorkerConfig,
         workers: int,
     ) -> None:
-        """`begin_block` queues a gyro block; see `Gyro.begin`."""
+        """`record_blocks` records gyro blocks; see `Gyro.record_many`."""
         self.submissions = submissions
-        self.begin_block = begin_block
+        self.record_blocks = record_blocks
         self._store = store
+        self.later = store.writer.later
         self.workers: LocalWorkers[TelemetryLines, LineResult] = LocalWorkers(
             config, solve_lines, workers
         )
@@ -259,8 +263,8 @@ class BulkChunk:
         self._bulk, self._lines, self._check = bulk, lines, check
         self._require = require
         self._registry, self._stored = registry, stored
-        self._begun: dict[int, Callable[[], LineAnswer]] = {}
-        """The gyro blocks that are queued for the writer, by the places of their lines."""
+        self._blocks: Future[list[Recorded | AcquisitionError]] | None = None
+        """What becomes of the gyro blocks, in the order of their lines."""
         self._computed = bulk.compute(lines, require)
 
     def is_computed(self, within_s: float) -> bool:
@@ -269,20 +273,11 @@ class BulkChunk:
 
     def queue_write(self) -> None:
         """Queue what was computed for the writer; raises `Busy` where it must be called again."""
-        for place, each in enumerate(self._decided):
-            if isinstance(each, GyroBlock) and place not in self._begun:
-                self._begun[place] = self._begin_block(each)
+        blocks = [each for each in self._decided if isinstance(each, GyroBlock)]
+        if blocks and self._blocks is None:
+            self._blocks = self._bulk.later(partial(self._bulk.record_blocks, blocks))
         unsaved_results = [each for each in self._decided if isinstance(each, UnsavedResult)]
         self._finish = self._bulk.submissions.begin_writing(unsaved_results)
-
-    def _begin_block(self, block: GyroBlock) -> Callable[[], LineAnswer]:
-        try:
-            return self._bulk.begin_block(block)
-        except Busy:
-            raise
-        except AcquisitionError as error:
-            refused = error
-            return lambda: refused
 
     def cancel(self) -> None:
         """Let it not be computed, where that has not begun."""
@@ -291,28 +286,31 @@ class BulkChunk:
     def answers(self) -> list[LineAnswer]:
         """The answer to each line, or what is wrong with it, when all is recorded."""
         written = iter(self._finish())
+        blocks = iter(self._recorded_blocks())
         return [
             next(written)
             if isinstance(each, UnsavedResult)
-            else self._recorded(place)
+            else next(blocks)
             if isinstance(each, GyroBlock)
             else self._tracked(each)
             if isinstance(each, TrackedLine)
             else each
-            for place, each in enumerate(self._decided)
+            for each in self._decided
         ]
 
     def _tracked(self, line: TrackedLine) -> LineAnswer:
         self._require()
         return self._bulk.submit_tracked(line)
 
-    def _recorded(self, place: int) -> LineAnswer:
-        try:
-            return self._begun[place]()
-        except Busy:
-            raise
-        except AcquisitionError as error:
-            return error
+    def _recorded_blocks(self) -> list[Recorded | AcquisitionError]:
+        if self._blocks is None:
+            return []
+        found = self._blocks.result()
+        for each in found:
+            if isinstance(each, Busy):
+                # Says nothing about the block.
+                raise each
+        return found
 
     @cached_property
     def _decided(self) -> list[Decided]:

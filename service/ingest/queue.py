@@ -1,7 +1,8 @@
-"""The queue of submissions: looked up, solved and recorded in groups by one thread.
+"""The queue of submissions, and the thread that takes them from there to their answers.
 
-    submit ──► writer's thread: look up, solve, record in one transaction ──► futures
-                      │ those that take long ──► solver pool ──┘
+    put ──► take ──► known? ──► compute ──► record ──► answer
+                                  │            ▲
+                                  └► solver pool, for those that take long
 
 The thread takes whatever waits, so that look-ups and commits are shared under load and
 nothing waits for a timer.  A batch that takes long goes to a thread of the pool, and delays
@@ -13,49 +14,61 @@ import heapq
 import logging
 import threading
 import time
-from collections.abc import Callable, Hashable, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 from sqlalchemy import Connection
 
-from service.errors import BeingBuilt, Busy, Stopping
-from service.ingest.solver_pool import WAIT_S, SolverPool, SolverTask
+from service.errors import AcquisitionError, BeingBuilt, Busy, Stopping
+from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, SolverTask
+from service.ingest.tracking import last_results, with_prediction
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
-from service.storage.recording.identity import Identity, OwnKey, PredictionOutdated
-from service.storage.recording.unsaved_result import Answered, UnsavedResult
-from service.storage.recording.writer import (
-    RETRY_AFTER_S,
-    QueuedJob,
-    WriteOutcome,
-    WriteOutcomes,
-    Writer,
-    WriterState,
+from service.storage.recording.identity import (
+    ExistingResult,
+    Identity,
+    OwnKey,
+    PredictionOutdated,
+    look_up,
+    remember_key,
 )
+from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
+from service.storage.recording.writer import RETRY_AFTER_S, WriteOutcome, WriterState
+from service.storage.store import Store
 from service.times import Utc, utc_now
 
+OUTCOMES = ("unique", "ambiguous", "unmatched")
 MAX_WAITING = 2_000
+TOGETHER = 64
+"""The most batches of one transaction."""
 DRAIN_S = 8.0
 """The longest wait for submissions to be answered when the service stops."""
-
-Found = Answered | Exception | Callable[[Connection], Answered] | None
-"""The outcome of a look-up: answer, error, a change that gives the answer, or nothing."""
+STALLED_S = 20.0
+"""A look-up takes at most five seconds, and computing a group much less."""
 
 log = logging.getLogger(__name__)
+
+
+class Adoptions(Protocol):
+    """The calibrations that operators adopt, through any of the services on a database."""
+
+    def follow_in(self, connection: Connection) -> None:
+        """Use what another service has adopted since."""
 
 
 @dataclass(eq=False, slots=True)
 class PendingBatch:
     """A submission that waits for its answer, which is set on `future`.
 
-    `make` gives the submission, which of a frame takes long; what it is called and the
-    fingerprint of its body are known before that.  `client` is the client and spacecraft between
-    whose batches the pool shares its threads.
+    `make` builds the submission, slowly for a frame; its identity and fingerprint are known
+    earlier.  `client` is the client and spacecraft between whose batches the pool shares its
+    threads.
     """
 
     identity: Identity
@@ -76,6 +89,9 @@ class PendingBatch:
     """The result, once a thread has computed it."""
 
 
+Answer = Answered | Exception
+
+
 @dataclass(frozen=True)
 class QueueState:
     """How many submissions wait for their answers, and the age of the oldest."""
@@ -93,40 +109,37 @@ class Backlog:
 
 
 class IngestQueue:
-    """Takes submissions from any thread."""
+    """Takes submissions from any thread; a thread of its own answers them."""
 
     def __init__(
         self,
-        look_up: Callable[[Sequence[PendingBatch]], Sequence[Found]],
-        solve: Callable[[PendingBatch], UnsavedResult],
-        solve_together: Callable[[Sequence[PendingBatch]], Sequence[UnsavedResult | Exception]],
-        recorded: Callable[[UnsavedResult, WriteOutcome], object],
-        writer: Writer,
+        solver: Solver,
+        store: Store,
         pool: SolverPool,
+        counts: "RecordedCounts",
+        adoptions: Adoptions | None = None,
     ) -> None:
-        """`look_up` answers what is recorded; `recorded` is called with each outcome of a write.
-
-        `solve_together` gives the error where a batch has no result, `NotAtHand` of one that takes
-        long.
-        """
-        self._look_up, self._note_outcome = look_up, recorded
-        self._solve, self._solve_together = solve, solve_together
-        self._writer, self._pool = writer, pool
-        self._lock = threading.Lock()
+        """Where services share a database, `adoptions` are followed before each group."""
+        self._solver, self._store, self._pool = solver, store, pool
+        self._counts = counts
+        self._adoptions = adoptions if store.lock is not None else None
+        self._changed = threading.Condition()
+        self._waiting: deque[PendingBatch] = deque()
+        """Those that the thread has to take: new ones, and those that the pool has computed."""
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """The batches that are being computed or recorded, each with its repeats."""
         self._sequences: Sequences[PendingBatch] = Sequences()
         self._unanswered: dict[PendingBatch, None] = {}
-        self._written: list[tuple[PendingBatch, WriteOutcome]] = []
         self._closing = False
         self._empty = threading.Event()
         self._empty.set()
-        writer.solve_posts = self._begin
-        writer.after_jobs.append(self._answer_written)
+        self._solving_since_s: float | None = None
+        self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
+        self._thread.start()
 
     def put(self, pending: PendingBatch) -> None:
         """Queue a submission; raises `Busy` where too many wait, `Stopping` after `close`."""
-        with self._lock:
+        with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
             if len(self._unanswered) >= MAX_WAITING:
@@ -134,67 +147,168 @@ class IngestQueue:
                 raise Busy(message, RETRY_AFTER_S)
             self._unanswered[pending] = None
             self._empty.clear()
-        self._queue(pending)
+            self._waiting.append(pending)
+            self._changed.notify_all()
 
     def state(self) -> QueueState:
         """The submissions that wait for their answers."""
-        with self._lock:
+        with self._changed:
             oldest = next(iter(self._unanswered), None)
             age_s = 0.0 if oldest is None else time.monotonic() - oldest.since_s
             return QueueState(len(self._unanswered), age_s)
+
+    def require(self) -> None:
+        """Raise `Stopping` where submissions are not worked on any more."""
+        since_s = self._solving_since_s
+        is_stalled = since_s is not None and time.monotonic() - since_s > STALLED_S
+        if self._closing or is_stalled or not self._thread.is_alive():
+            raise Stopping("nothing is recorded any more: restart the service")
 
     def wait_until_empty(self, seconds: float) -> None:
         """Wait until every submission is answered, at most `seconds`."""
         self._empty.wait(seconds)
 
     def close(self) -> None:
-        """Refuse new submissions, and answer those that wait."""
-        with self._lock:
+        """Refuse new submissions, answer those that wait, and end the thread."""
+        with self._changed:
             self._closing = True
-        self._empty.wait(DRAIN_S)
-        with self._lock:
+        self.wait_until_empty(DRAIN_S)
+        with self._changed:
             left = list(self._unanswered)
-        self._answer([(each, Stopping("the service is stopping")) for each in left])
+            self._changed.notify_all()
+        self._answer([(pending, Stopping("the service is stopping")) for pending in left])
+        self._thread.join(DRAIN_S)
 
-    def _queue(self, pending: PendingBatch) -> None:
+    # ---- the thread --------------------------------------------------------------------------
+
+    def _run(self) -> None:
         try:
-            self._writer.put(QueuedJob(partial(self._note_written, pending), pending=pending))
-        except Busy as error:
-            self._answer([(pending, error)])
+            while group := self._take():
+                self._work_on(group)
+        finally:
+            # Empty after closing in order; otherwise nothing that waits will be answered.
+            with self._changed:
+                self._closing = True
+                left = list(self._unanswered)
+            self._answer([(pending, Stopping("the queue has ended")) for pending in left])
 
-    # ---- the writer's thread, before a transaction --------------------------------------------
+    def _take(self) -> list[PendingBatch]:
+        """Those that wait, at most `TOGETHER`; none after `close` when all are answered."""
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._waiting or (self._closing and not self._unanswered)
+            )
+            return [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
 
-    def _begin(self, jobs: Sequence[QueuedJob]) -> list[QueuedJob]:
-        """Answer recorded and expired submissions; compute the others, each once."""
+    def _work_on(self, group: Sequence[PendingBatch]) -> None:
+        """Answer what is recorded already; compute and record the others, each once."""
+        computed = [pending for pending in group if pending.unsaved is not None]
+        fresh = self._in_time([pending for pending in group if pending.unsaved is None])
+        if fresh:
+            self._solving_since_s = time.monotonic()
+            try:
+                unknown = [
+                    pending for pending in self._not_recorded(fresh) if self._begins(pending)
+                ]
+                computed += self._computed(unknown)
+            finally:
+                self._solving_since_s = None
+        if computed:
+            self._record(computed)
+
+    def _in_time(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
+        """Refuse those that have waited too long for their turn; the others remain."""
         now_s = time.monotonic()
-        late = [job.pending for job in jobs if now_s - job.pending.since_s > job.pending.wait_s]
-        for pending in late:
-            error = Busy(f"it has waited {pending.wait_s:g} s for its turn", RETRY_AFTER_S)
-            self._answer([(pending, error)])
-        jobs = [job for job in jobs if job.pending not in late]
-        if not jobs:
-            return []
-        found: Sequence[Found]
+        late = [pending for pending in group if now_s - pending.since_s > pending.wait_s]
+        if not late:
+            return list(group)
+        self._answer(
+            [(p, Busy(f"it has waited {p.wait_s:g} s for its turn", RETRY_AFTER_S)) for p in late]
+        )
+        return [pending for pending in group if pending not in late]
+
+    def _not_recorded(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
+        """Answer those that are recorded, or whose identity or key is taken; the others remain."""
         try:
-            found = self._look_up([job.pending for job in jobs])
+            known = self._recorded_before(group)
         except Exception as error:
             # Each client gets the error: nothing is decided about its batch.
-            found = [error] * len(jobs)
-        known, to_write = [], []
-        for job, each in zip(jobs, found, strict=True):
-            if isinstance(each, Answered | Exception):
-                known.append((job.pending, each))
-            else:
-                job.change = each
-                to_write.append(job)
-        self._answer(known)
-        self._compute([job for job in to_write if job.change is None and self._is_for_now(job)])
-        return [job for job in to_write if job.change is not None or job.unsaved_results]
+            known = dict.fromkeys(group, error)
+        if known:
+            self._answer(list(known.items()))
+        return [pending for pending in group if pending not in known]
 
-    def _is_for_now(self, job: QueuedJob) -> bool:
-        """True if a batch is to be computed now; False if later, or if one like it is already."""
-        pending: PendingBatch = job.pending
-        with self._lock:
+    def _recorded_before(self, group: Sequence[PendingBatch]) -> dict[PendingBatch, Answer]:
+        """The stored answers of those that are recorded, and errors where another body is."""
+        # Identities before keys, each as of its moment: a batch recorded in between is found by
+        # its key, or seems new, and then the transaction finds it.
+        try:
+            with self._store.lookup() as connection:
+                registry = look_up(
+                    connection,
+                    {pending.identity for pending in group},
+                    {pending.key for pending in group if pending.key is not None},
+                )
+                if self._adoptions is not None:
+                    self._adoptions.follow_in(connection)
+        except Busy:
+            # Batches that cannot be looked up cannot be written either.
+            self._store.writer.note_failure(len(group))
+            raise
+        known: dict[PendingBatch, Answer] = {}
+        repeats: dict[PendingBatch, ExistingResult] = {}
+        for pending in group:
+            holder = registry.holder(pending.identity, pending.key, pending.fingerprint)
+            if isinstance(holder, ExistingResult):
+                repeats[pending] = holder
+            elif holder is not None:
+                known[pending] = holder
+        if not repeats:
+            return known
+        ids = {first.result_id for first in repeats.values()}
+        with self._store.reading_record() as connection:
+            stored = self._store.archive.answers_or_faults(connection, ids)
+        for pending, first in repeats.items():
+            answer = stored.get(first.result_id)
+            if isinstance(answer, AcquisitionError):
+                known[pending] = answer
+            elif answer is not None:
+                # One that was pruned in between is as new as any other.
+                known[pending] = Answered(first.result_id, answer, replayed=True)
+        # The keys of archived batches are in the archive.
+        new_keys = {
+            pending: first
+            for pending, first in repeats.items()
+            if pending.key is not None
+            and pending.key not in registry.keys
+            and not first.archived
+            and isinstance(known.get(pending), Answered)
+        }
+        return known | (self._keep_keys(new_keys) if new_keys else {})
+
+    def _keep_keys(
+        self, repeats: Mapping[PendingBatch, ExistingResult]
+    ) -> dict[PendingBatch, Exception]:
+        """Let the keys of repeats belong to their bodies from now on; those that are refused."""
+
+        def change(connection: Connection) -> dict[PendingBatch, Exception]:
+            refused: dict[PendingBatch, Exception] = {}
+            for pending, first in repeats.items():
+                assert pending.key is not None
+                try:
+                    remember_key(connection, pending.identity, pending.key, first)
+                except AcquisitionError as error:
+                    refused[pending] = error
+            return refused
+
+        try:
+            return self._store.writer.change(change)
+        except Exception as error:
+            return dict.fromkeys(repeats, error)
+
+    def _begins(self, pending: PendingBatch) -> bool:
+        """True for a batch to compute now; the others go to the pool, or wait for one like them."""
+        with self._changed:
             repeats = self._in_flight.get(pending.identity)
             if repeats is not None:
                 repeats.append(pending)
@@ -210,31 +324,62 @@ class IngestQueue:
             return False
         return True
 
-    def _compute(self, jobs: Sequence[QueuedJob]) -> None:
-        """Compute batches together; those that take long go to the pool."""
-        several: Sequence[UnsavedResult | Exception]
+    def _computed(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
+        """Compute batches together; those that take long go to the pool, the others get results."""
+        submissions: dict[PendingBatch, Submission] = {}
+        failed: dict[PendingBatch, Exception] = {}
+        for pending in group:
+            try:
+                submissions[pending] = pending.make()
+            except Exception as error:
+                failed[pending] = error
         try:
-            several = self._solve_together([job.pending for job in jobs])
+            batches = [submission.batch for submission in submissions.values()]
+            acquired = self._solver.acquired(batches, at_once=True) if batches else []
         except Exception as error:
             log.exception("batches that waited together failed")
-            several = [error] * len(jobs)
-        for job, found in zip(jobs, several, strict=True):
-            pending: PendingBatch = job.pending
-            if isinstance(found, NotAtHand):
+            acquired = [error] * len(submissions)
+        for (pending, submission), found in zip(submissions.items(), acquired, strict=True):
+            try:
+                pending.unsaved = self._solver.unsaved(
+                    submission, found, pending.received, pending.key
+                )
+            except NotAtHand:
                 self._start(pending)
-            elif isinstance(found, Exception):
+            except Exception as error:
                 # It concerns this batch alone, and its client gets it.
-                self._finish([(pending, found)])
+                failed[pending] = error
             else:
-                pending.unsaved = found
-                job.unsaved_results = [found]
-                # Only from now on does it wait to be written.
-                job.since_s = time.monotonic()
+                pending.unsaved.handed_over_ns = time.perf_counter_ns()
+        if failed:
+            self._finish(list(failed.items()))
+        return [pending for pending in group if pending.unsaved is not None]
+
+    def _record(self, group: Sequence[PendingBatch]) -> None:
+        """Record results in one transaction, and answer."""
+        unsaved_results = [pending.unsaved for pending in group if pending.unsaved is not None]
+        outcomes: Sequence[WriteOutcome]
+        try:
+            outcomes = self._store.writer.record(unsaved_results)
+        except Exception as error:
+            outcomes = [error] * len(group)
+        self._counts.add(unsaved_results, outcomes)
+        done: list[tuple[PendingBatch, Answer]] = []
+        for pending, outcome in zip(group, outcomes, strict=True):
+            if isinstance(outcome, PredictionOutdated):
+                # Until its time is over it is computed from the attitude that is the last one now.
+                pending.unsaved = None
+                self._start(pending)
+            else:
+                done.append((pending, outcome))
+        self._finish(done)
+
+    # ---- a thread of the pool ----------------------------------------------------------------
 
     def _start(self, pending: PendingBatch) -> None:
         """Queue a batch for the pool."""
         task = SolverTask(
-            partial(self._solve_and_record, pending),
+            partial(self._solve, pending),
             lambda error: self._finish([(pending, error)]),
             pending.since_s + pending.wait_s,
         )
@@ -243,59 +388,62 @@ class IngestQueue:
         except Stopping as error:
             self._finish([(pending, error)])
 
-    # ---- a thread of the pool ----------------------------------------------------------------
-
-    def _solve_and_record(self, pending: PendingBatch) -> None:
+    def _solve(self, pending: PendingBatch) -> None:
+        """Compute a batch, and let the queue's thread record it."""
         try:
-            pending.unsaved = self._solve(pending)
-            settle = partial(self._note_written, pending)
-            self._writer.put(QueuedJob(settle, [pending.unsaved]))
+            pending.unsaved = self._solved_alone(pending)
         except BeingBuilt:
             raise  # the pool tries again
         except Exception as error:
             self._finish([(pending, error)])
+            return
+        with self._changed:
+            self._waiting.append(pending)
+            self._changed.notify_all()
 
-    # ---- the writer's thread, after a transaction ---------------------------------------------
+    def _solved_alone(self, pending: PendingBatch) -> UnsavedResult:
+        submission = pending.make()
+        is_outdated: Callable[[Connection], bool] | None = None
+        if self._solver.asks_for_last(batch := submission.batch):
+            mission = self._solver.missions[batch.spacecraft]
+            with self._store.reading_record() as connection:
+                submission = with_prediction(connection, submission, mission)
+                if self._store.lock is not None:
+                    # Other services record attitudes of this spacecraft, too.
+                    last = last_results(connection, batch, mission)
 
-    def _note_written(
-        self, pending: PendingBatch, outcome: WriteOutcomes | Answered | Exception
-    ) -> None:
-        one = outcome[0] if isinstance(outcome, list) else outcome
-        if pending.unsaved is not None:
-            self._note_outcome(pending.unsaved, one)
-        self._written.append((pending, one))
+                    def is_outdated(connection: Connection) -> bool:
+                        return last_results(connection, batch, mission) != last
 
-    def _answer_written(self) -> None:
-        written, self._written = self._written, []
-        for pending, outcome in written:
-            if isinstance(outcome, PredictionOutdated):
-                # Until its time is over it is computed from the attitude that is the last one now.
-                self._start(pending)
-        done = [each for each in written if not isinstance(each[1], PredictionOutdated)]
-        if done:
-            self._finish(done)
+        unsaved = self._solver.solve(submission, pending.received, pending.key)
+        unsaved.is_outdated = is_outdated
+        unsaved.handed_over_ns = time.perf_counter_ns()
+        return unsaved
 
     # ---- answers -----------------------------------------------------------------------------
 
-    def _finish(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
+    def _finish(self, outcomes: Sequence[tuple[PendingBatch, Answer]]) -> None:
         """Answer what was computed; its repeats are looked up, for it may have failed."""
-        with self._lock:
+        with self._changed:
             repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
             ended = [p.sequence for p, _ in outcomes if p.sequence is not None]
             following = [each for key in ended if (each := self._sequences.leave(key)) is not None]
         self._answer(outcomes)
-        for each in repeats:
-            self._queue(each)
-        for each in following:
-            self._start(each)
+        if repeats:
+            with self._changed:
+                self._waiting.extend(repeats)
+                self._changed.notify_all()
+        for pending in following:
+            self._start(pending)
 
-    def _answer(self, outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
-        by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, WriteOutcome]]] = {}
-        with self._lock:
+    def _answer(self, outcomes: Sequence[tuple[PendingBatch, Answer]]) -> None:
+        by_loop: dict[asyncio.AbstractEventLoop, list[tuple[PendingBatch, Answer]]] = {}
+        with self._changed:
             for pending, _ in outcomes:
                 self._unanswered.pop(pending, None)
             if not self._unanswered:
                 self._empty.set()
+                self._changed.notify_all()
         for pending, outcome in outcomes:
             if isinstance(pending.future, Future):
                 _set_futures([(pending, outcome)])
@@ -307,7 +455,7 @@ class IngestQueue:
                 loop.call_soon_threadsafe(_set_futures, group)
 
 
-def _set_futures(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
+def _set_futures(outcomes: Sequence[tuple[PendingBatch, Answer]]) -> None:
     for pending, outcome in outcomes:
         if pending.future.done():
             continue  # the client has gone
@@ -315,6 +463,39 @@ def _set_futures(outcomes: Sequence[tuple[PendingBatch, WriteOutcome]]) -> None:
             pending.future.set_exception(outcome)
         else:
             pending.future.set_result(outcome)
+
+
+class RecordedCounts:
+    """How many new batches and stars were recorded since the start; the metrics read it."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self.batches: Counter[tuple[str, bool, bool]] = Counter()
+        """Batches by spacecraft, whether they are live, and whether they have an attitude."""
+        self.stars: Counter[tuple[str, bool, str]] = Counter()
+        """Their stars by spacecraft, whether the batch is live, and outcome."""
+
+    def add(
+        self, unsaved_results: Sequence[UnsavedResult], outcomes: Sequence[WriteOutcome]
+    ) -> None:
+        """Count the batches that are new; a what-if holds the stars of one that is known."""
+        with self._lock:
+            for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
+                is_new = isinstance(outcome, Answered) and not outcome.replayed
+                if not is_new or unsaved.batch is None:
+                    continue
+                spacecraft, run, _ = unsaved.identity
+                owner = spacecraft, run == LIVE
+                self.batches[*owner, unsaved.solution is not None] += 1
+                for name in OUTCOMES:
+                    self.stars[*owner, name] += unsaved.counts[name]
+
+    def copy(self) -> "RecordedCounts":
+        """The counts of this moment."""
+        copied = RecordedCounts()
+        with self._lock:
+            copied.batches, copied.stars = self.batches.copy(), self.stars.copy()
+        return copied
 
 
 T = TypeVar("T")

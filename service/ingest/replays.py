@@ -10,6 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, TypeVar
 
 import msgspec
@@ -101,7 +102,7 @@ class ProgressRecorder:
             also(connection)
             events.add_event(connection, "replay", progress, run=self.run)
 
-        self._store.writer.change(store).result()
+        self._store.writer.change(store)
 
     def count(self, answered: Answered | Recorded) -> None:
         """Count the answer to one line."""
@@ -147,7 +148,7 @@ class ProgressRecorder:
         self.require_saved()
         self._errors_changed, self._is_saved = False, True
         try:
-            self._saving = self._store.writer.change(store)
+            self._saving = self._store.writer.later(partial(self._store.writer.change, store))
         except AcquisitionError as error:
             self._not_saved(error)
 

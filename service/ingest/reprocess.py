@@ -163,7 +163,7 @@ def begin_run(store: Store, plan: ReprocessPlan) -> None:
         noted = update(runs).where(runs.c.name == plan.run)
         connection.execute(noted.values(tracked=plan.track))
 
-    store.writer.change(change).result()
+    store.writer.change(change)
 
 
 def _has_results(connection: Connection, run: str) -> bool:
@@ -233,8 +233,8 @@ def _record(
 ) -> None:
     unsaved_results = [each for each in found if isinstance(each, UnsavedResult)]
     refused = [each for each in found if isinstance(each, RefusedBatch)]
-    store.hold_back()
-    outcomes = store.writer.record(unsaved_results).result() if unsaved_results else []
+    store.progress.hold_back()
+    outcomes = store.writer.record(unsaved_results) if unsaved_results else []
     for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
         if isinstance(outcome, Answered):
             progress.recorded += 1

@@ -11,7 +11,6 @@ from functools import partial
 from typing import Annotated, Any, TypeVar
 
 import msgspec
-from msgspec import Struct
 from pydantic import Field, TypeAdapter
 from pydantic_core import to_json
 from sqlalchemy import Connection
@@ -21,9 +20,8 @@ from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.acquire.kernel_build import KernelBuild
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
-from service.ingest.queue import Backlog, Found, IngestQueue, PendingBatch
+from service.ingest.queue import Adoptions, Backlog, IngestQueue, PendingBatch, RecordedCounts
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
-from service.ingest.tracking import last_results, with_prediction
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, Submission, checked_by, submission_from_json
@@ -33,10 +31,8 @@ from service.storage.recording.answer import answer_of
 from service.storage.recording.identity import (
     ExistingResult,
     Identity,
-    Registry,
     identity_of,
     look_up,
-    remember_key,
 )
 from service.storage.recording.results import record
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
@@ -64,18 +60,6 @@ Answers = list[Answered | AcquisitionError]
 Outcome = Answered | BaseException
 
 
-class Recorded(Struct, frozen=True, eq=False):
-    """A newly recorded batch, as observers receive it."""
-
-    spacecraft: str
-    run: str
-    batch: str
-    counts: Mapping[str, int]
-    """Its stars: observed, and of them unique, ambiguous and unmatched."""
-    has_attitude: bool
-
-
-Observer = Callable[[Recorded], None]
 AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answered]")
 
 
@@ -92,6 +76,7 @@ class SubmissionService:
         sky: SkyModel,
         store: Store,
         kernels: KernelBuild | None = None,
+        adoptions: Adoptions | None = None,
     ) -> None:
         """With `kernels`, batches are refused until those that they need are compiled."""
         self.pool = SolverPool()
@@ -99,15 +84,9 @@ class SubmissionService:
         self._store = store
         self._kernels = kernels
         self._reader = ThreadPoolExecutor(1, "read")
-        self._queue = IngestQueue(
-            *(self._recorded_before, self._solve, self._solve_together, self._note_outcome),
-            *(store.writer, self.pool),
-        )
+        self.counts = RecordedCounts()
+        self._queue = IngestQueue(self.solver, store, self.pool, self.counts, adoptions)
         self._single_s = -float("inf")
-        self.observers: list[Observer] = []
-        """Called with every batch that is new, after its commit."""
-        self.before_solving: Callable[[Connection], object] | None = None
-        """Called before each group of submissions is solved, with a connection for look-ups."""
 
     def require_kernels(self, *, of_zones: bool = False) -> None:
         """Raise `Busy` while kernels are compiled: no answer depends on which ones exist.
@@ -333,7 +312,7 @@ class SubmissionService:
         if entry is not None:
             unsaved.audit = entry.row()
         unsaved.handed_over_ns = time.perf_counter_ns()
-        (outcome,) = decided(self._store.writer.record([unsaved]).result())
+        (outcome,) = decided(self._store.writer.record([unsaved]))
         if isinstance(outcome, AcquisitionError):
             raise outcome
         return outcome
@@ -363,15 +342,8 @@ class SubmissionService:
 
         Connections are opened and statements prepared that the first batch would wait for.
         """
-        pending = PendingBatch(
-            identity_of(submission.batch),
-            submission.fingerprint,
-            None,
-            lambda: submission,
-            client=None,
-            is_long=False,
-        )
-        self._recorded_before([pending])
+        with self._store.lookup() as connection:
+            look_up(connection, {identity_of(submission.batch)})
         unsaved = self.solver.solve(submission)
 
         def record_and_roll_back(connection: Connection) -> None:
@@ -379,7 +351,7 @@ class SubmissionService:
             raise _WarmedUp
 
         with suppress(_WarmedUp):
-            self._store.writer.change(record_and_roll_back).result()
+            self._store.writer.change(record_and_roll_back)
 
     # ---- bulk --------------------------------------------------------------------------------
 
@@ -401,16 +373,16 @@ class SubmissionService:
         """Queue many results for a transaction; to call what it gives waits for the answers."""
         if not unsaved_results:
             return list
-        self._store.hold_back()
+        self._store.progress.hold_back()
         moment_ns = time.perf_counter_ns()
         for unsaved in unsaved_results:
             unsaved.handed_over_ns = moment_ns
-        future = self._store.writer.record(unsaved_results, low_priority=True)
+        writer = self._store.writer
+        future = writer.later(partial(writer.record, unsaved_results, low_priority=True))
 
         def finish() -> Answers:
             outcomes = future.result()
-            for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
-                self._note_outcome(unsaved, outcome)
+            self.counts.add(unsaved_results, outcomes)
             return decided(outcomes)
 
         return finish
@@ -432,6 +404,7 @@ class SubmissionService:
 
     def require_alive(self) -> None:
         """Raise `Stopping` where submissions are not worked on any more."""
+        self._queue.require()
         self._store.writer.require()
 
     def close(self) -> None:
@@ -439,122 +412,6 @@ class SubmissionService:
         self._reader.shutdown(cancel_futures=True)
         self._queue.close()
         self.pool.close()
-
-    # ---- steps of the queue ------------------------------------------------------------------
-
-    def _solve_together(self, group: Sequence[PendingBatch]) -> list[UnsavedResult | Exception]:
-        """The results of batches that wait together; `NotAtHand` of one that takes long."""
-        found: dict[int, UnsavedResult | Exception] = {}
-        submissions: dict[int, Submission] = {}
-        for place, pending in enumerate(group):
-            try:
-                submissions[place] = pending.make()
-            except Exception as error:
-                found[place] = error
-        several = self.solver.acquired([e.batch for e in submissions.values()], at_once=True)
-        for (place, submission), acquired in zip(submissions.items(), several, strict=True):
-            pending = group[place]
-            try:
-                unsaved = self.solver.unsaved(submission, acquired, pending.received, pending.key)
-            except Exception as error:
-                found[place] = error
-            else:
-                unsaved.handed_over_ns = time.perf_counter_ns()
-                found[place] = unsaved
-        return [found[place] for place in range(len(group))]
-
-    def _solve(self, pending: PendingBatch) -> UnsavedResult:
-        submission = pending.make()
-        is_outdated: Callable[[Connection], bool] | None = None
-        if self.solver.asks_for_last(batch := submission.batch):
-            mission = self.solver.missions[batch.spacecraft]
-            with self._store.reading_record() as connection:
-                submission = with_prediction(connection, submission, mission)
-                if self._store.lock is not None:
-                    # Other services record attitudes of this spacecraft, too.
-                    last = last_results(connection, batch, mission)
-
-                    def is_outdated(connection: Connection) -> bool:
-                        return last_results(connection, batch, mission) != last
-
-        unsaved = self.solver.solve(submission, pending.received, pending.key)
-        unsaved.is_outdated = is_outdated
-        unsaved.handed_over_ns = time.perf_counter_ns()
-        return unsaved
-
-    def _recorded_before(self, group: Sequence[PendingBatch]) -> list[Found]:
-        """For each: the stored answer, the error where another body has its identity, or None.
-
-        In place of an answer whose key is new: the change that keeps the key, and gives the answer.
-        """
-        # Identities before keys, each as of its moment: a batch recorded in between is found by
-        # its key, or seems new, and then the transaction finds it.
-        try:
-            with self._store.lookup() as connection:
-                registry = look_up(
-                    connection,
-                    {each.identity for each in group},
-                    {each.key for each in group if each.key is not None},
-                )
-                if self.before_solving is not None:
-                    self.before_solving(connection)
-        except Busy:
-            # Batches that cannot be looked up cannot be written either.
-            self._store.writer.note_failure(len(group))
-            raise
-        holders = [registry.holder(e.identity, e.key, e.fingerprint) for e in group]
-        repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
-        stored: Mapping[str, bytes | AcquisitionError] = {}
-        if repeats:
-            with self._store.reading_record() as connection:
-                stored = self._store.archive.answers_or_faults(connection, repeats)
-        return [
-            self._repeat(pending, holder, stored, registry)
-            if isinstance(holder, ExistingResult)
-            else holder
-            for pending, holder in zip(group, holders, strict=True)
-        ]
-
-    def _repeat(
-        self,
-        pending: PendingBatch,
-        first: ExistingResult,
-        stored: Mapping[str, bytes | AcquisitionError],
-        registry: Registry,
-    ) -> Found:
-        """The stored answer; a key that came with it belongs to its body from now on."""
-        answer = stored.get(first.result_id)
-        if answer is None:
-            # It was pruned in between: the batch is as new as any other.
-            return None
-        if isinstance(answer, AcquisitionError):
-            return answer
-        identity, key = pending.identity, pending.key
-        # The keys of archived batches are in the archive.
-        repeated = Answered(first.result_id, answer, replayed=True)
-        if key is None or key in registry.keys or first.archived:
-            return repeated
-
-        def keep_key(connection: Connection) -> Answered:
-            remember_key(connection, identity, key, first)
-            return repeated
-
-        return keep_key
-
-    def _note_outcome(self, unsaved: UnsavedResult, outcome: Answered | Exception) -> None:
-        """Tell the observers of a new batch; a what-if holds the stars of one that is known."""
-        is_new = isinstance(outcome, Answered) and not outcome.replayed
-        if not is_new or unsaved.batch is None or not self.observers:
-            return
-        recorded = Recorded(
-            *unsaved.identity, counts=unsaved.counts, has_attitude=unsaved.solution is not None
-        )
-        for observer in self.observers:
-            try:
-                observer(recorded)
-            except Exception:
-                # The batch is recorded and its answer due, whatever an observer does.
-                log.exception("an observer failed")
 
 
 def _portions(submissions: Sequence[Submission]) -> Iterator[list[Submission]]:

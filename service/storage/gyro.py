@@ -10,7 +10,7 @@ import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service import gyro
-from service.errors import BadBatch, Conflict, Fault, NotFound, shown_value
+from service.errors import AcquisitionError, BadBatch, Conflict, Fault, NotFound, shown_value
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage.models.base import Page
@@ -132,6 +132,16 @@ def record_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> Rec
     new = shown(row)
     events.add_event(connection, "gyro", new, run=block.run, spacecraft=block.spacecraft)
     return Recorded(new, replayed=False)
+
+
+def record_or_refuse(
+    connection: Connection, block: gyro.GyroBlock, row: Row
+) -> Recorded | AcquisitionError:
+    """Record a block, or give the error of `find_block`, before which nothing is inserted."""
+    try:
+        return record_block(connection, block, row)
+    except AcquisitionError as error:
+        return error
 
 
 def list_blocks(

@@ -1,7 +1,7 @@
 """An open database: one writer and many readers."""
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
@@ -11,6 +11,7 @@ from sqlalchemy.exc import DBAPIError, TimeoutError
 from service import logs
 from service.errors import Busy
 from service.storage.archive.reading import Archive
+from service.storage.progress import Progress
 from service.storage.recording.events import HeardEvents
 from service.storage.recording.writer import RETRY_AFTER_S, Writer, may_pass, remove_probe
 from service.storage.sql import engines
@@ -153,15 +154,13 @@ class Store(Readers):
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
-        self.before_reading: Callable[[], float] = lambda: 0.0
-        """Waits for the projections, and tells by how many seconds they are still behind."""
-        self.hold_back: Callable[[], object] = lambda: None
-        """Waits while too much is to be projected; called before much is recorded at once."""
+        self.progress = Progress(self.lookup, lambda: self.writer.commits, is_shared=file is None)
+        """How far the projections are; readers wait for them."""
         self._heard: HeardEvents | None = None
         if serving and self.file_lock is not None:
-            self.writer.change(remove_probe).result()
+            self.writer.change(remove_probe)
         elif serving:
-            self._heard = HeardEvents(self.url, self.writer.tell_of_events)
+            self._heard = HeardEvents(self.url, self.writer.bell)
 
     @property
     def is_projecting(self) -> bool:
@@ -172,10 +171,10 @@ class Store(Readers):
     def reading(self) -> Iterator[Connection]:
         """A connection whose snapshot has the projections of what is recorded now.
 
-        They are waited for, at most a second: see `Projector.wait`.  What they then still are
+        They are waited for, at most a second: see `Progress.wait`.  What they then still are
         behind is noted for the answer of the request.
         """
-        behind_s = self.before_reading()
+        behind_s = self.progress.wait()
         if behind_s and (request := logs.request.get()) is not None:
             request.behind_s = behind_s
         with self.reading_record() as connection:

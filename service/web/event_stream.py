@@ -154,14 +154,11 @@ class Live:
         self._stopping = False
         self._swept_s = 0.0
         self._threads = CapacityLimiter(4)
-        self._on_commit: Callable[[], object] = lambda: None
 
     async def start(self) -> None:
         """Begin to follow the records."""
-        loop = asyncio.get_running_loop()
+        self._poke = self._app.store.writer.bell.subscribe()
         self._last = await self._read(self._app.events.last)
-        self._on_commit = lambda: loop.call_soon_threadsafe(self._poke.set)
-        self._app.events.listen(self._on_commit)
         self._tasks = [
             asyncio.create_task(each) for each in (self._follow(), self._end_what_is_revoked())
         ]
@@ -175,7 +172,7 @@ class Live:
         """Stop following."""
         self.stop()
         if self._tasks:
-            self._app.events.unlisten(self._on_commit)
+            self._app.store.writer.bell.unsubscribe(self._poke)
             for task in self._tasks:
                 task.cancel()
             await asyncio.gather(*self._tasks, return_exceptions=True)

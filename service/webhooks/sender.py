@@ -105,13 +105,11 @@ class WebhookSender:
         )
         self._thread.start()
         self._started.wait()
-        self._store.writer.after_events.append(self._poke)
 
     def stop(self) -> None:
         """Wait a little for the attempts under way, and note those that have succeeded."""
         if self._thread is None:
             return
-        self._store.writer.after_events.remove(self._poke)
         with suppress(RuntimeError):
             self._loop.call_soon_threadsafe(self._task.cancel)
         self._thread.join()
@@ -146,7 +144,7 @@ class WebhookSender:
     # ---- the sender's thread -----------------------------------------------------------------
 
     async def _main(self) -> None:
-        self._loop, self._news = asyncio.get_running_loop(), asyncio.Event()
+        self._loop, self._news = asyncio.get_running_loop(), self._store.writer.bell.subscribe()
         task = asyncio.current_task()
         assert task is not None
         self._task = task
@@ -155,6 +153,7 @@ class WebhookSender:
             with suppress(asyncio.CancelledError):
                 await self._go_on()
         finally:
+            self._store.writer.bell.unsubscribe(self._news)
             self._is_stopping = True
             under_way = list(self._under_way.values())
             if under_way:
@@ -352,7 +351,7 @@ class WebhookSender:
         return await self._loop.run_in_executor(self._readers, ask, *arguments)
 
     async def _change(self, change: Callable[[Connection], T]) -> T:
-        return await asyncio.wrap_future(self._store.writer.change(change))
+        return await asyncio.to_thread(self._store.writer.change, change)
 
     def _list(self) -> Sequence[Registered]:
         with self._store.reading_record() as connection:
@@ -435,7 +434,7 @@ class Turn:
     async def _hold(self, name: str | None) -> bool:
         asked_s = time.monotonic()
         change = partial(webhooks.hold_sender, holder=name, beat=self._beat)
-        if not await asyncio.wrap_future(self._store.writer.change(change)):
+        if not await asyncio.to_thread(self._store.writer.change, change):
             return False
         self._beat += 1
         self._beaten_s = asked_s

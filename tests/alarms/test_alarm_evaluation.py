@@ -157,7 +157,7 @@ def test_what_another_process_kept_of_the_latest_values_is_gone_on_with(tight, m
     def forget(connection):
         connection.execute(update(watches).values(state="{}"))
 
-    tight.store.writer.change(forget).result()
+    tight.store.writer.change(forget)
     send(tight, make, ["good"], start=2)
     with tight.context.reading() as connection:
         kept = json.loads(connection.scalar(select(watches.c.state)))
@@ -323,7 +323,7 @@ def test_every_limit_that_was_set_stays_in_the_history(app):
 def test_what_happens_to_alarms_and_limits_is_told(tight, make):
     send(tight, make, ["spurious"] * 2)
     tight.alarms.acknowledge(only(tight).id, "jb")
-    tight.projector.catch_up()
+    tight.store.progress.catch_up()
     told = [(each.kind, json.loads(each.data).get("state")) for each in tight.events.after(0, 100)]
     assert [each for each in told if each[0] != "batches"] == [
         ("limit", None),

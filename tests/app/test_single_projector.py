@@ -59,7 +59,7 @@ def test_what_one_service_has_recorded_the_other_answers_and_shows_at_once(servi
         assert again.body == new.body
         # The projections of the first are waited for by both.
         assert rates(second) == rates(first) == number + 1
-    assert second.projector.lag().results == 0
+    assert second.store.progress.lag().results == 0
 
 
 def test_events_of_one_service_wake_the_other(services, sky, missions):

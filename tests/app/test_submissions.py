@@ -87,11 +87,10 @@ def everything(app):
 def test_batches_run_to_warm_up_are_not_kept(app, make, caplog):
     app.submissions.submit(make("b1", kind="suspect"))
     app.submissions.submit(make("s1", spacecraft="SWAS"))
-    before, observed = everything(app), []
-    app.submissions.observers.append(observed.append)
+    before, counted = everything(app), app.submissions.counts.batches.total()
     app.service.ready()
     assert everything(app) == before
-    assert observed == []
+    assert app.submissions.counts.batches.total() == counted
     assert "could not be run again" not in caplog.text
     assert not app.submissions.submit(make("b2")).replayed
 
@@ -138,19 +137,12 @@ def test_nothing_at_once_is_nothing(app):
     assert app.submissions.submit_many([]) == []
 
 
-def test_observers_see_every_new_batch_once_and_neither_repeats_nor_what_ifs(app, make):
-    seen = []
-    app.submissions.observers.append(lambda recorded: seen.append(recorded.batch))
+def test_every_new_batch_is_counted_once_and_neither_repeats_nor_what_ifs(app, make):
     first = app.submissions.submit(make("b1"))
     app.submissions.submit(make("b1"))
     app.results.what_if(first.id, OptionsIn(), adopt=True)
     app.submissions.submit_many([make("b1"), make("b2"), make("b2"), make("b3")])
-    assert seen == ["b1", "b2", "b3"]
-
-
-def test_an_observer_that_fails_takes_no_answer_away(app, make):
-    app.submissions.observers.append(lambda recorded: 1 / 0)
-    assert not app.submissions.submit(make()).replayed
+    assert app.submissions.counts.batches == {("XTE", True, True): 3}
 
 
 def test_a_warm_service_stays_warm(app, monkeypatch):

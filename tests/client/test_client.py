@@ -302,7 +302,7 @@ def test_a_token_is_needed_and_sent(chosen_database):
             expires=shifted(now, 3600).text,
             **reading,
         )
-    ).result()
+    )
     with Server(create_app(app)) as url:
         with Client(url) as stranger, pytest.raises(Unauthenticated):
             stranger.session()

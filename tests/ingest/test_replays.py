@@ -142,7 +142,7 @@ def test_what_a_killed_process_left_running_is_marked_interrupted_on_opening(ope
     id = app.replays.start(lines, "pass-1")
     finished(app, id)
     left = update(replays).values(state="running", finished=None)
-    app.store.writer.change(lambda connection: connection.execute(left)).result()
+    app.store.writer.change(lambda connection: connection.execute(left))
     app.close()
     assert opened().replays.get(id).state == "interrupted"
 

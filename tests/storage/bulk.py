@@ -64,7 +64,7 @@ def put(app, rows):
         insert_all(connection, results, [result for _, result in rows])
         rollups.add(connection, [(_hour(batch), result) for batch, result in rows])
 
-    app.store.writer.change(write).result()
+    app.store.writer.change(write)
 
 
 def _hour(batch):

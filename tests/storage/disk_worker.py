@@ -40,7 +40,7 @@ def main(database, file, faults, seed):
     disk.faulty_struck.restype = ctypes.c_char_p
     app = open_app(Settings(database=database))
     # The connection that is open, and those that come after a failure.
-    app.store.writer.change(lambda c: _checkpoint_often(driver_of(c))).result()
+    app.store.writer.change(lambda c: _checkpoint_often(driver_of(c)))
     event.listen(app.store._writing, "connect", _checkpoint_often)
     lines = Path(file).read_bytes().splitlines()
     acknowledged, told_busy, kinds, reads_failed = {}, 0, Counter(), 0

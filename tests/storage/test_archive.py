@@ -207,7 +207,7 @@ def test_a_batch_that_is_archived_between_look_up_and_insert_is_not_recorded_aga
     late = make("b1", kind="suspect", after_s=20_000.0)
     archiving.archive(filled.store, place, LATER)
     unsaved = filled.submissions.solver.solve(late)
-    (outcome,) = filled.store.writer.record([unsaved]).result()
+    (outcome,) = filled.store.writer.record([unsaved])
     assert isinstance(outcome, Busy)
     with filled.store.reading() as connection:
         same = batches.c.batch == "b1", batches.c.run == "live"
@@ -466,7 +466,7 @@ def test_numbers_are_compared_bit_by_bit():
 def test_a_restored_run_is_still_tracked(filled, place, opened, tmp_path):
     """Else it could be continued without tracking, and would mix both."""
     noted = update(runs).where(runs.c.name == "r").values(tracked=True)
-    filled.store.writer.change(lambda connection: connection.execute(noted)).result()
+    filled.store.writer.change(lambda connection: connection.execute(noted))
     archiving.archive(filled.store, place, LATER)
     again = Store(f"sqlite:///{tmp_path / 'again.db'}")
     try:

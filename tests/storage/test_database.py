@@ -300,6 +300,6 @@ def test_who_has_glanced_holds_no_moment_and_the_log_can_begin_anew(app, make):
 @pytest.mark.parametrize("database", ["sqlite"], indirect=True)
 def test_a_table_that_is_missing_is_no_passing_trouble(app):
     rename = text("ALTER TABLE runs RENAME TO elsewhere")
-    app.store.writer.change(lambda connection: connection.execute(rename).close()).result()
+    app.store.writer.change(lambda connection: connection.execute(rename).close())
     with pytest.raises(DBAPIError, match="no such table"):
         app.runs.all()

@@ -44,7 +44,7 @@ def holder(file):
 
 
 def change(store):
-    store.writer.change(lambda connection: connection.exec_driver_sql("SELECT 1")).result()
+    store.writer.change(lambda connection: connection.exec_driver_sql("SELECT 1"))
 
 
 @pytest.mark.parametrize("name", ["acquire.db", "symbolic.db", "folder/hard.db"])

@@ -26,7 +26,7 @@ def modes(folder):
 def test_a_database_its_backup_and_its_copy_are_its_owners_alone(tmp_path):
     store = Store(f"sqlite:///{tmp_path / 'acquire.db'}")
     try:
-        store.writer.change(lambda connection: connection.exec_driver_sql("SELECT 1")).result()
+        store.writer.change(lambda connection: connection.exec_driver_sql("SELECT 1"))
         back_up(f"sqlite:///{tmp_path / 'acquire.db'}", tmp_path / "backup.db")
         restore(f"sqlite:///{tmp_path / 'restored.db'}", tmp_path / "backup.db")
         found = modes(tmp_path)

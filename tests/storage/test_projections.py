@@ -78,7 +78,7 @@ def rebuilt(store, file, monkeypatch):
             if rows:
                 connection.execute(insert(table), sorted(rows, key=lambda row: str(row.get("id"))))
 
-    made.writer.change(copy).result()
+    made.writer.change(copy)
     with monkeypatch.context() as patch:
         patch.setattr(projecting, "MOST_AT_ONCE", 1)
         again = Projector(made)
@@ -154,7 +154,7 @@ def test_they_equal_a_rebuild_after_each_kind_of_change(
         connection.execute(update(rollups_hourly).values(batches=7))
         connection.execute(delete(rollups_daily))
 
-    watched.store.writer.change(spoil).result()
+    watched.store.writer.change(spoil)
     assert verify(url) != []
     rebuild_trends(watched.store, lambda done, total: None)
     assert_right(watched, "counted anew", alarms_again=False)
@@ -179,8 +179,8 @@ def test_changes_beside_what_is_not_projected_yet_count_nothing_twice(app, make,
         app.results.what_if(ids[7], OTHER, adopt=True)
         forget(app.store, ForgetFilter("live", batches=("b0", "b1")), None)
         assert verify(app.settings.database) == []
-        assert app.projector.lag().results == 7
-    wait_until(lambda: app.projector.lag().results == 0)
+        assert app.store.progress.lag().results == 7
+    wait_until(lambda: app.store.progress.lag().results == 0)
     with app.store.reading() as connection:
         assert_equal_to_a_recount(connection)
         assert_passed(connection)
@@ -215,7 +215,7 @@ def test_a_transaction_that_commits_late_is_neither_left_out_nor_projected_twice
     app.submissions.submit_many([make(f"b{k}", after_s=60.0 * k) for k in range(3)])
     # Three looks of the projector, at least, at what it can see of the record.
     time.sleep(0.3)
-    assert app.projector.lag().results == 3
+    assert app.store.progress.lag().results == 3
     go_on.set()
     slow.result(30)
     other.close()

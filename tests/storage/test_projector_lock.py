@@ -22,14 +22,12 @@ def opened(database):
 
 def run(store, sql):
     """Run a statement in a transaction of the writer; its value."""
-    return store.writer.change(lambda connection: connection.exec_driver_sql(sql).scalar()).result()
+    return store.writer.change(lambda connection: connection.exec_driver_sql(sql).scalar())
 
 
 def project(store, sql):
     """The same in a step of the projector."""
-    return store.writer.project(
-        lambda connection: connection.exec_driver_sql(sql).scalar()
-    ).result()
+    return store.writer.project(lambda connection: connection.exec_driver_sql(sql).scalar())
 
 
 def test_nothing_is_projected_before_the_lock_is_taken_and_both_record(opened):
@@ -88,7 +86,7 @@ def test_work_that_a_service_is_at_is_not_left_behind_until_it_has_ended(opened)
 
     def left():
         ids = {"one", "two", "three"}
-        return first.writer.project(lambda connection: left_behind(connection, ids)).result()
+        return first.writer.project(lambda connection: left_behind(connection, ids))
 
     assert left() == {"three"}
     second.at_work.discard("one")

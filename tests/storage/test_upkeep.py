@@ -86,7 +86,7 @@ def counts(app):
 def change(app, change):
     """Make a change, given as a statement or as a function of a connection."""
     made = change if callable(change) else lambda connection: connection.execute(change)
-    app.store.writer.change(made).result()
+    app.store.writer.change(made)
 
 
 def replace_in_input(connection, id, old, new):
@@ -148,7 +148,7 @@ def test_of_a_sound_database_nothing_is_wrong(filled, database):
 def test_every_kind_of_damage_is_named(app, make, database, fault, told):
     id = app.submissions.submit(make()).id
     # Some faults are in projections, which follow a moment later.
-    app.store.before_reading()
+    app.store.progress.wait()
     assert verify(database) == []
     change(app, fault(id))
     assert any(told in problem for problem in verify(database))
@@ -304,7 +304,7 @@ def test_results_that_were_removed_or_added_are_found(filled, database):
             connection.execute(delete(table).where(table.c.result_id == removed))
         connection.execute(delete(results).where(results.c.id == removed))
 
-    filled.store.writer.change(remove).result()
+    filled.store.writer.change(remove)
     (found,) = verify(database)
     assert "results were removed, added or exchanged" in found
     exchanged = row | {"id": "0" * 26}
@@ -328,7 +328,7 @@ def test_a_pruned_hour_is_told_from_one_of_which_a_result_was_taken(filled, data
         connection.execute(delete(results).where(results.c.id == taken))
         connection.execute(delete(batches).where(batches.c.id == taken))
 
-    filled.store.writer.change(take).result()
+    filled.store.writer.change(take)
     rebuild_trends(filled.store, lambda done, total: None)
     told = "run late, the hour from 1996-01-20T22:59:30.000Z: results were removed"
     (found,) = verify(database)

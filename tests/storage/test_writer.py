@@ -1,18 +1,18 @@
-"""The writer: shared commits, and failures that reach those they concern."""
+"""The writer: one transaction after another, and failures that reach those they concern."""
 
 import threading
-import time
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import pytest
 from sqlalchemy import Engine, event, func, insert, inspect, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
-from service.storage.recording.writer import PROBE_TABLE, Writer
+from service.storage.recording.writer import PROBE_TABLE
 from service.storage.sql.tables import results, runs
 from service.storage.store import Store
 from tests.storage.recount import assert_equal_to_a_recount
+from tests.waiting import wait_until
 
 pytestmark = pytest.mark.both_databases
 
@@ -24,7 +24,13 @@ def store(database):
     opened.close()
 
 
-def held_up(writer):
+@pytest.fixture
+def threads():
+    with ThreadPoolExecutor(24) as pool:
+        yield pool
+
+
+def held_up(writer, threads):
     """Keep the writer busy until the event that is given back is set."""
     begun, go_on = threading.Event(), threading.Event()
 
@@ -32,7 +38,7 @@ def held_up(writer):
         begun.set()
         go_on.wait(30)
 
-    writer.change(wait)
+    threads.submit(writer.change, wait)
     begun.wait(30)
     return go_on
 
@@ -59,51 +65,58 @@ def names(store):
         return sorted(connection.scalars(select(runs.c.name)))
 
 
-def test_what_waits_together_is_committed_together(store, monkeypatch):
-    commits = []
-    before_commit(store, monkeypatch, commits.append)
-    go_on = held_up(store.writer)
-    waiting = [store.writer.change(new_run(f"run{i:02d}")) for i in range(20)]
+def waiting_for_their_turn(writer, count):
+    wait_until(lambda: writer.state().queued == count, why=f"{count} records do not wait")
+
+
+def test_changes_are_made_in_the_order_in_which_they_came(store, threads):
+    made, writer = [], store.writer
+    go_on = held_up(writer, threads)
+    waiting = []
+    for k in range(10):
+        waiting.append(threads.submit(writer.change, lambda _, k=k: made.append(k)))
+        waiting_for_their_turn(writer, k + 1)
     go_on.set()
-    for each in waiting:
-        each.result(30)
-    assert len(names(store)) == 20
-    assert len(commits) == 2
+    wait(waiting, 30)
+    assert made == list(range(10))
 
 
-def test_what_has_time_lets_others_pass_for_one_transaction(store):
+def test_what_has_time_lets_others_pass_for_one_transaction(store, threads):
     """Chunks of a bulk load neither hold up single posts nor wait for them for ever."""
     done, writer = [], store.writer
 
-    def later(future, name):
-        future.add_done_callback(lambda _: done.append(name))
-        return future
-
     def post_meanwhile(_connection):
-        later(writer.change(lambda _: None), "a post that came meanwhile")
+        done.append("a post")
+        waiting.append(threads.submit(writer.change, lambda _: done.append("a later post")))
+        waiting_for_their_turn(writer, 3)
 
-    go_on = held_up(writer)
-    chunks = [later(writer.record([], low_priority=True), f"chunk {k}") for k in (1, 2)]
-    later(writer.change(post_meanwhile), "a post")
+    go_on = held_up(writer, threads)
+    waiting = []
+    for k in (1, 2):
+        chunk = threads.submit(writer.project, lambda _, k=k: done.append(f"chunk {k}"))
+        waiting.append(chunk)
+        waiting_for_their_turn(writer, k)
+    waiting.append(threads.submit(writer.change, post_meanwhile))
+    waiting_for_their_turn(writer, 3)
     go_on.set()
-    for each in chunks:
-        each.result(30)
-    assert done == ["a post", "chunk 1", "a post that came meanwhile", "chunk 2"]
+    wait(waiting[:3], 30)
+    wait(waiting, 30)
+    assert done == ["a post", "chunk 1", "a later post", "chunk 2"]
 
 
 def test_results_that_waited_too_long_are_refused_and_what_waits_with_them_is_written(
-    app, make, monkeypatch
+    app, make, monkeypatch, threads
 ):
     writer = app.store.writer
     monkeypatch.setattr(writer, "_wait_s", 0.05)
     unsaved = app.submissions.solver.solve(make("late"))
-    go_on = held_up(writer)
-    late, change = writer.record([unsaved]), writer.change(new_run("kept"))
-    in_bulk = writer.record([unsaved], low_priority=True)
-    time.sleep(0.1)
-    go_on.set()
+    go_on = held_up(writer, threads)
+    late = threads.submit(writer.record, [unsaved])
+    change = threads.submit(writer.change, new_run("kept"))
+    in_bulk = threads.submit(writer.record, [unsaved], low_priority=True)
     with pytest.raises(Busy, match="not written yet"):
         late.result(30)
+    go_on.set()
     change.result(30)
     assert "kept" in names(app.store)
     (outcome,) = in_bulk.result(30)
@@ -112,16 +125,16 @@ def test_results_that_waited_too_long_are_refused_and_what_waits_with_them_is_wr
 
 def test_an_answer_comes_after_its_commit(store):
     for index in range(20):
-        store.writer.change(new_run(f"run{index:02d}")).result(30)
+        store.writer.change(new_run(f"run{index:02d}"))
         assert len(names(store)) == index + 1
 
 
-def test_one_change_that_fails_spoils_none_of_its_neighbours(store):
-    go_on = held_up(store.writer)
-    waiting = [store.writer.change(new_run(name)) for name in ("a", "b", "a", "c")]
-    go_on.set()
-    assert isinstance(waiting[2].exception(30), IntegrityError)
-    assert names(store) == ["a", "b", "c"]
+def test_a_change_that_fails_is_told_to_its_caller_and_to_no_other(store):
+    store.writer.change(new_run("a"))
+    with pytest.raises(IntegrityError):
+        store.writer.change(new_run("a"))
+    store.writer.change(new_run("b"))
+    assert names(store) == ["a", "b"]
 
 
 @pytest.mark.parametrize("database", ["sqlite"], indirect=True)
@@ -135,49 +148,32 @@ def test_a_change_that_fails_with_an_answer_half_read_keeps_no_lock(store):
         connection.execute(insert(runs).values(name="lost", created="now"))
         raise OperationalError("SELECT", {}, Exception("disk I/O error"))
 
-    store.writer.change(new_run("before")).result(30)
-    assert isinstance(store.writer.change(fail).exception(30), Busy)
-    store.writer.change(new_run("after")).result(5)
+    store.writer.change(new_run("before"))
+    with pytest.raises(Busy):
+        store.writer.change(fail)
+    store.writer.change(new_run("after"))
     assert names(store) == ["after", "before"]
 
 
-def test_one_draft_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
-    go_on = held_up(app.store.writer)
+def test_one_result_that_cannot_be_kept_spoils_none_of_its_neighbours(app, make):
     unsaved_results = [app.submissions.solver.solve(make(name)) for name in ("b1", "b2", "b3")]
     unsaved_results[1].result["mission_digest"] = "sha256:of nothing that is there"
-    waiting = app.store.writer.record(unsaved_results)
-    go_on.set()
-    first, second, third = waiting.result(30)
+    first, second, third = app.store.writer.record(unsaved_results)
     assert isinstance(second, IntegrityError)
     assert [app.results.get(each.id).answer.batch for each in (first, third)] == ["b1", "b3"]
     assert [each.batches for each in app.spacecraft.rates("XTE")] == [2]
 
 
-def test_a_full_queue_is_busy_and_takes_work_again_once_it_is_written(store):
-    writer = Writer(store._writing, max_queued=3)
-    go_on = held_up(writer)
-    waiting = [writer.change(new_run(name)) for name in "abc"]
-    with pytest.raises(Busy, match="3 records are waiting"):
-        writer.change(new_run("d"))
+def test_closing_writes_what_waits_and_refuses_the_rest(store, threads):
+    go_on = held_up(store.writer, threads)
+    waiting = [threads.submit(store.writer.change, new_run(name)) for name in "abc"]
+    waiting_for_their_turn(store.writer, 3)
+    closing = threads.submit(store.writer.close)
+    wait_until(lambda: store.writer._turns.is_closing)
+    with pytest.raises(Busy, match="stopping"):
+        store.writer.change(new_run("d"))
     go_on.set()
-    for each in waiting:
-        each.result(30)
-    writer.change(new_run("d")).result(30)
-    writer.close()
-    assert names(store) == ["a", "b", "c", "d"]
-
-
-def test_closing_writes_what_is_queued_and_refuses_the_rest(store):
-    go_on = held_up(store.writer)
-    waiting = [store.writer.change(new_run(name)) for name in "abc"]
-    with ThreadPoolExecutor(1) as thread:
-        closing = thread.submit(store.writer.close)
-        while not store.writer._closing:
-            pass
-        with pytest.raises(Busy, match="stopping"):
-            store.writer.change(new_run("d"))
-        go_on.set()
-        closing.result(30)
+    closing.result(30)
     assert all(each.done() for each in waiting)
     assert names(store) == ["a", "b", "c"]
 
@@ -258,7 +254,7 @@ def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make, reques
     def pages(most):
         bound["pages"] = most
         command = f"PRAGMA max_page_count = {most}"
-        writer.change(lambda connection: connection.exec_driver_sql(command).scalar()).result()
+        writer.change(lambda connection: connection.exec_driver_sql(command).scalar())
 
     def used():
         with app.store.reading() as connection:
@@ -272,7 +268,7 @@ def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make, reques
             break
     assert not writer.state().succeeded
     # A small change still finds room, and says nothing of posts.
-    writer.change(new_run("small")).result()
+    writer.change(new_run("small"))
     for _ in range(2):
         with pytest.raises(Busy):
             writer.require_written()
@@ -288,23 +284,21 @@ def test_it_is_ready_again_only_when_there_is_room_for_a_batch(app, make, reques
         assert not inspect(connection).has_table(PROBE_TABLE)
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_writer_that_ends_leaves_nobody_waiting_and_is_not_ready(app):
-    writer = app.store.writer
+@pytest.mark.parametrize("ends", [SystemExit, KeyboardInterrupt])
+def test_a_change_that_ends_its_thread_is_rolled_back_and_holds_up_no_other(store, ends):
+    def end(connection):
+        new_run("lost")(connection)
+        raise ends
 
-    def end(_connection):
-        begun.set()
-        go_on.wait(30)
-        raise SystemExit
+    with pytest.raises(ends):
+        store.writer.change(end)
+    store.writer.change(new_run("later"))
+    assert names(store) == ["later"]
 
-    begun, go_on = threading.Event(), threading.Event()
-    ended = writer.change(end)
-    begun.wait(30)
-    later = writer.change(new_run("late"))
-    go_on.set()
-    for each in (ended, later):
-        assert isinstance(each.exception(30), Stopping)
+
+def test_a_writer_that_is_closed_is_not_ready(app):
+    app.store.writer.close()
     with pytest.raises(Stopping):
-        writer.change(new_run("later still"))
+        app.store.writer.change(new_run("late"))
     with pytest.raises(Busy, match="restart the service"):
         app.service.ready()

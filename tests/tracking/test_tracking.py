@@ -112,7 +112,7 @@ def test_a_flip_is_said_and_its_states_are_events(app, flown):
         *["zone"] * 3,
     ]
     assert any("rolled by 17" in each or "rolled by 180" in each for each in answers[6]["warnings"])
-    app.projector.catch_up()
+    app.store.progress.catch_up()
     events = [
         json.loads(each.data) for each in app.events.after(first, 100) if each.kind == "tracking"
     ]

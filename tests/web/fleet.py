@@ -80,7 +80,7 @@ def fill(app: App, size: int, run: str = "live", silent: str | None = None) -> N
         insert_all(connection, solutions, solved)
         connection.execute(insert(alarms), raised)
 
-    app.store.writer.change(write).result()
+    app.store.writer.change(write)
 
 
 def _batches(app: App, name: str, is_bad: bool, run: str) -> Iterator[tuple[Any, Any]]:
@@ -165,7 +165,7 @@ def put_alarm(
         connection.execute(insert(alarms), [alarm])
         connection.execute(insert(alarm_actions), rows)
 
-    app.store.writer.change(write).result()
+    app.store.writer.change(write)
 
 
 def _place(which: str, time: Utc) -> dict[str, Any]:

@@ -60,13 +60,13 @@ class Guarded:
                 expires=shifted(created, days * 86400).text,
                 **{"spacecraft": None, "rate_per_s": None} | more,
             )
-        ).result()
+        )
         return secret
 
     def revoke(self, name):
         self.app.store.writer.change(
             lambda connection: access.revoke_token(connection, name, utc_now().text)
-        ).result()
+        )
 
 
 @pytest.fixture(scope="module")

@@ -16,6 +16,7 @@ from sqlalchemy import text
 
 from service.app.factory import open_app
 from service.errors import Busy, Stopping
+from service.storage import progress
 from service.storage.projections import projector
 from service.web.app import create_app
 from service.web.middleware import warm_request
@@ -62,7 +63,7 @@ def test_answers_say_how_far_trends_are_behind_the_record(client, post, batch, m
         return samples(client)["starid_queue_depth", ("queue", "projections")]
 
     monkeypatch.setattr(projector, "PROJECTIONS", (held_up, *projector.PROJECTIONS))
-    monkeypatch.setattr(projector, "WAIT_S", 0.2)
+    monkeypatch.setattr(progress, "WAIT_S", 0.2)
     trends = "/api/v1/spacecraft/XTE/rates"
     before = sum(each["batches"] for each in client.get(trends).json()["items"])
     post(batch)
@@ -162,7 +163,7 @@ def test_where_the_records_cannot_be_followed_it_does_not_start_and_ends(tmp_pat
         asyncio.run(start())
     assert not [thread for thread in threading.enumerate() if thread.name == "warm-up"]
     with pytest.raises(Stopping):
-        app.store.writer.require()
+        app.submissions.require_alive()
 
 
 def test_a_fault_of_ours_is_logged_and_says_nothing_of_what_is_inside(tmp_path, caplog):

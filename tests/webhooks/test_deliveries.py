@@ -275,7 +275,7 @@ def test_a_webhook_that_another_process_moved_on_goes_on_from_there(service, rec
     service.note("n0")
     receiver.next()
     moved = update(webhooks).values(position=webhooks.c.position + 1)
-    service.app.store.writer.change(lambda writing: writing.execute(moved).rowcount).result()
+    service.app.store.writer.change(lambda writing: writing.execute(moved).rowcount)
     service.note("n1")
     service.note("n2")
     wait_until(lambda: texts(receiver)[-1:] == ["n2"])

@@ -72,6 +72,9 @@ class LimitEvaluator:
         self._connection = connection
         self._spacecraft, self._run = spacecraft, run
         self._new = new
+        self._latest: dict[Subject, tuple[int, BatchRef]] = {}
+        """The latest batch of a window and its time, as far as the new batches tell."""
+        self._earlier: dict[int, BatchRef | None] = {}
         mission = recorded_mission(connection, new[0].result["mission_digest"])
         self._limits = limits_of(connection, mission)
         row = _locked(connection, spacecraft, run)
@@ -144,10 +147,13 @@ class LimitEvaluator:
             if self._active.is_out(name) or not window.add_if_within(samples, limits):
                 due.append((name, limits))
             elif self._active.has(name) and (value := window.value(limits)) is not None:
-                present = (each.result for each, one in zip(self._new, every, strict=True) if one)
-                batch = max(present, key=lambda result: int(result["time_ns"]))
-                point = Point(value, *self._latest_in_window(batch, window.samples[-1][0]))
-                self._active.observe(name, None, limits, point, batch["received"])
+                present = [each.result for each, one in zip(self._new, every, strict=True) if one]
+                latest_ns = window.samples[-1][0]
+                for batch in present:
+                    if batch["time_ns"] >= latest_ns:
+                        self._latest[name] = latest_ns, _reference(batch)
+                point = Point(value, *self._latest_in_window(name, present[-1], latest_ns))
+                self._active.observe(name, None, limits, point, present[-1]["received"])
         return due
 
     @staticmethod
@@ -158,25 +164,37 @@ class LimitEvaluator:
             trackers = each.trackers and _by_tracker(each)
             yield sample_of(each.result, trackers or {})
 
-    def _latest_in_window(self, batch: Row, latest_ns: int) -> BatchRef:
-        """The latest batch of a window: the one given, unless it comes late."""
+    def _latest_in_window(self, subject: Subject, batch: Row, latest_ns: int) -> BatchRef:
+        """The latest batch of a subject's window: the one given, unless it comes late."""
         if batch["time_ns"] >= latest_ns:
+            self._latest[subject] = latest_ns, _reference(batch)
             return _reference(batch)
-        query = (
-            select(batches.c.time, batches.c.id)
-            .join_from(results, batches, results.c.batch_id == batches.c.id)
-            .where(
-                results.c.spacecraft == batch["spacecraft"],
-                results.c.run == batch["run"],
-                results.c.time_ns == latest_ns,
-                results.c.current,
+        known_ns, known = self._latest.get(subject, (None, None))
+        if known is None or known_ns != latest_ns:
+            # It came before these batches, or has been pruned since.
+            known = self._recorded_at(latest_ns) or _reference(batch)
+            self._latest[subject] = latest_ns, known
+        return known
+
+    def _recorded_at(self, time_ns: int) -> BatchRef | None:
+        """The last batch of a time that was recorded before the new ones; asked once."""
+        if time_ns not in self._earlier:
+            query = (
+                select(batches.c.time, batches.c.id)
+                .join_from(results, batches, results.c.batch_id == batches.c.id)
+                .where(
+                    results.c.spacecraft == self._spacecraft,
+                    results.c.run == self._run,
+                    results.c.time_ns == time_ns,
+                    results.c.current,
+                    results.c.seq < self._new[0].seq,
+                )
+                .order_by(results.c.seq.desc())
+                .limit(1)
             )
-            .order_by(batches.c.id.desc())
-            .limit(1)
-        )
-        found = self._connection.execute(query).first()
-        # It may have been pruned.
-        return (found[0], found[1]) if found else _reference(batch)
+            found = self._connection.execute(query).first()
+            self._earlier[time_ns] = (found[0], found[1]) if found else None
+        return self._earlier[time_ns]
 
     def _evaluate_batch(
         self, new: RecordedResult, due: Sequence[tuple[Subject, LimitSettings]]
@@ -187,7 +205,7 @@ class LimitEvaluator:
                 continue
             window = self._windows[name]
             latest_ns = window.samples[-1][0] if window.samples else 0
-            latest = self._latest_in_window(new.result, latest_ns)
+            latest = self._latest_in_window(name, new.result, latest_ns)
             found = window.add(sample, limits, latest)
             if found and (found.severity is not None or self._active.has(name)):
                 point = Point(found.value, *latest)

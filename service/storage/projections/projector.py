@@ -95,31 +95,14 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
 MOST_AT_ONCE = 500
 LONGEST_S = 0.05
 """The duration of one transaction; the next one takes fewer results where this one took longer."""
-EVERY_S = 0.1
-"""The time between the beginnings of two transactions, unless a reader waits."""
-LOOK_S = 1.0
-"""The time between two looks for what other processes recorded, and for another projector."""
-SHARED_LOOK_S = 0.1
-"""The same on PostgreSQL in the process that projects: other services record all the time."""
-POLL_S = 0.02
-"""The time between two looks of a reader for where another process projects."""
-GIVE_WAY_S = 0.01
-"""The pause after a commit that woke the projector: the answers to its posts go out first."""
+EVERY_S = 0.2
+"""The time between the beginnings of two turns, unless a reader waits."""
 GAP_S = 0.01
 """The pause before a gap in the record is looked at again."""
-WAIT_S = 1.0
-"""The longest wait of a reader for the projections."""
-MOST_BEHIND = 20_000
-"""Results; bulk loads, replays and reprocessing wait while there are more."""
 HOURS_AT_ONCE = 24
 """The hours of trends that are counted anew in one transaction."""
 CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
-
-_BEHIND = "SELECT count(*) FROM results WHERE seq > (SELECT seq FROM projector)"
-_NEWEST_AND_POSITION = (
-    "SELECT (SELECT coalesce(max(seq), 0) FROM results), (SELECT seq FROM projector)"
-)
 
 
 @dataclass(frozen=True)
@@ -142,181 +125,72 @@ class _Gap:
     next: int
 
 
-@dataclass(frozen=True)
-class Lag:
-    """How far the projections are behind the record: results, and seconds since they were not."""
-
-    results: int
-    seconds: float
-
-
 class Projector:
-    """A thread that projects what the writer records."""
+    """A thread that projects what the writer records, some of it in each turn."""
 
     def __init__(self, store: Store) -> None:
         """Readers of the store wait for the projections once the thread is started."""
-        self._store, self._writer = store, store.writer
-        self._is_shared = store.file is None
-        """Other processes record and project, too."""
-        self._is_closing = False
-        self._changed = threading.Condition()
-        self._position = 0
-        self._readers = 0
+        self._store, self._progress = store, store.progress
+        self._closing = threading.Event()
         self._most = MOST_AT_ONCE
-        self._projected = -1
-        """The writer's count of transactions up to which all is projected."""
-        self._up_to_date_s = time.monotonic()
+        self._position = 0
         self._gap: _Gap | None = None
-        self._is_projecting, self._is_idle = True, False
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
         """Keep the projections up from now on."""
+        self._progress.begin()
         self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
         self._thread.start()
-        self._writer.after_jobs.append(self._wake)
-        self._store.before_reading = self.wait
-        self._store.hold_back = partial(self.catch_up, MOST_BEHIND)
-
-    def wait(self) -> float:
-        """Return when all that is recorded now is projected, or after `WAIT_S`.
-
-        The seconds that the projections are behind then; zero where they are not.
-        """
-        if not self._is_shared and (
-            self._projected >= self._writer.commits or not self._is_projecting
-        ):
-            return 0.0
-        try:
-            return self._waited()
-        except Busy:
-            # The database does not give the record now; the projections may still be readable.
-            return time.monotonic() - self._up_to_date_s
-
-    def _waited(self) -> float:
-        commits = self._writer.commits
-        newest, position = self._places()
-        if position >= newest:
-            return 0.0
-        if not self._is_projecting:
-            # Another process projects.
-            end_s = time.monotonic() + WAIT_S
-            while time.monotonic() < end_s and not self._is_closing:
-                time.sleep(POLL_S)
-                if self._places()[1] >= newest:
-                    return 0.0
-            return time.monotonic() - self._up_to_date_s
-
-        def has_passed() -> bool:
-            # Of others' results the writer's count says nothing.
-            is_own = not self._is_shared and self._projected >= commits
-            return self._position >= newest or is_own or self._is_closing
-
-        with self._changed:
-            self._readers += 1
-            self._changed.notify_all()
-            is_passed = self._changed.wait_for(has_passed, WAIT_S)
-            self._readers -= 1
-            return 0.0 if is_passed else time.monotonic() - self._up_to_date_s
-
-    def catch_up(self, most: int = 0) -> None:
-        """Wait while more than so many results are to be projected."""
-        while not self._is_closing and (self._is_projecting or self._is_shared):
-            if self._count_behind(most) <= most:
-                return
-            self.wait()
-
-    def lag(self) -> Lag:
-        """How far behind the projections are."""
-        behind = self._count_behind(0)
-        return Lag(behind, time.monotonic() - self._up_to_date_s if behind else 0.0)
 
     def close(self) -> None:
         """Project what is recorded, and end the thread."""
-        with self._changed:
-            self._is_closing = True
-            self._changed.notify_all()
+        self._closing.set()
+        self._progress.end()
         if self._thread is not None:
             self._thread.join()
 
-    def _count_behind(self, most: int) -> int:
-        """How many results are to be projected; counted only if there may be more than so many."""
-        if not self._is_shared and self._projected >= self._writer.commits:
-            return 0
-        newest, position = self._places()
-        if newest - position <= most:
-            return max(0, newest - position)
-        with self._store.lookup() as connection:
-            ((behind,),) = execute(connection, _BEHIND)
-        return int(behind)
-
-    def _places(self) -> tuple[int, int]:
-        """The places of the newest result and of the projector in the record."""
-        asked_s = time.monotonic()
-        with self._store.lookup() as connection:
-            ((newest, position),) = execute(connection, _NEWEST_AND_POSITION)
-        if position >= newest:
-            self._up_to_date_s = max(self._up_to_date_s, asked_s)
-        return newest, position
-
     # ---- the projector's thread --------------------------------------------------------------
 
-    def _wake(self) -> None:
-        # To wake a thread that then waits on is expensive.
-        if self._is_idle:
-            with self._changed:
-                self._changed.notify_all()
-
     def _run(self) -> None:
-        closing_s = float("inf")
-        while True:
+        while not self._closing.is_set():
             begun_s = time.monotonic()
-            commits = self._writer.commits
-            step = self._try_step() if self._may_step() else None
-            with self._changed:
-                if step is not None:
-                    self._position = step.position
-                    if step.is_all:
-                        self._projected, self._up_to_date_s = commits, time.monotonic()
-                self._changed.notify_all()
-                if self._is_closing:
-                    closing_s = min(closing_s, begun_s + CLOSE_S)
-                    if step is None or step.is_all or time.monotonic() > closing_s:
-                        return
-                    continue
-                if step is None or step.is_all:
-                    self._is_idle = True
-                    is_alert = self._is_shared and self._is_projecting
-                    self._changed.wait_for(self._has_work, SHARED_LOOK_S if is_alert else LOOK_S)
-                    self._is_idle = False
-                    self._changed.wait_for(lambda: self._readers or self._is_closing, GIVE_WAY_S)
-                elif step.is_blocked:
-                    self._changed.wait(GAP_S)
-                pause_s = begun_s + EVERY_S - time.monotonic()
-                if pause_s > 0.0 and (step is None or step.is_all):
-                    self._changed.wait_for(lambda: self._readers or self._is_closing, pause_s)
+            step = self._turn()
+            if step is None or step.is_all:
+                self._progress.wait_for_reader(begun_s + EVERY_S - time.monotonic())
+            elif step.is_blocked:
+                time.sleep(GAP_S)
+        end_s = time.monotonic() + CLOSE_S
+        while (step := self._turn()) is not None and not step.is_all:
+            if time.monotonic() > end_s:
+                return
 
-    def _has_work(self) -> bool:
-        is_behind = self._projected < self._writer.commits
-        is_asked = self._is_shared and self._readers > 0
-        return self._is_closing or (self._is_projecting and (is_behind or is_asked))
+    def _turn(self) -> _Step | None:
+        """Project some results, where there are any to project, and tell the readers."""
+        commits = self._store.writer.commits
+        step = self._try_step() if self._may_step(commits) else None
+        if step is not None:
+            self._position = step.position
+            self._progress.report(step.position, commits if step.is_all else None)
+        return step
 
-    def _may_step(self) -> bool:
-        """False if nothing is to be projected, or by another process; asked only on PostgreSQL.
+    def _may_step(self, commits: int) -> bool:
+        """False if nothing is to be projected, or by another process.
 
         A transaction of the projector locks its row, even where it finds nothing.
         """
-        if not self._is_shared:
-            return True
-        commits = self._writer.commits
-        self._is_projecting = self._store.is_projecting
+        progress = self._progress
+        if not progress.is_shared:
+            return progress.is_behind()
+        progress.is_projecting = self._store.is_projecting
         try:
-            newest, self._position = self._places()
+            newest, position = progress.places()
         except Busy:
             return False
-        if self._position < newest:
-            return self._is_projecting
-        self._projected = commits
+        if position < newest:
+            return progress.is_projecting
+        self._position = position
+        progress.report(position, commits)
         return False
 
     def _try_step(self) -> _Step | None:
@@ -333,15 +207,15 @@ class Projector:
 
     def _write(self, step: Callable[[Connection], _Step]) -> _Step | None:
         try:
-            done = self._writer.project(step).result()
+            done = self._store.writer.project(step)
         except (NotProjecting, BadConfiguration):
             # Another process projects.
-            self._is_projecting = False
+            self._progress.is_projecting = False
             return None
         except Busy:
             # The writer has logged it.
             return None
-        self._is_projecting = True
+        self._progress.is_projecting = True
         return done
 
     def _step(self, connection: Connection) -> _Step:
@@ -407,7 +281,7 @@ def projected(store: Store) -> Iterator[None]:
     projector = Projector(store)
     projector.start()
     try:
-        projector.catch_up()
+        store.progress.catch_up()
         yield
     finally:
         projector.close()
@@ -422,7 +296,7 @@ def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
         hours = sorted(rollups.hours_of_all(connection))
     for first in range(0, len(hours), HOURS_AT_ONCE):
         chunk = hours[first : first + HOURS_AT_ONCE]
-        store.writer.change(partial(rollups.renew, hours=chunk)).result()
+        store.writer.change(partial(rollups.renew, hours=chunk))
         step(first + len(chunk), len(hours))
     return len(hours)
 

@@ -6,11 +6,22 @@ in the transaction that deletes or inserts the results.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Connection, delete, func, select
+from sqlalchemy import (
+    BigInteger,
+    ColumnElement,
+    Connection,
+    Executable,
+    bindparam,
+    delete,
+    func,
+    select,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 
 from service.storage.projections.rollups import RecordedResult, lock_position
+from service.storage.sql.statements import Prepared
 from service.storage.sql.tables import projector, results, seals
 
 HOUR_NS = 3_600_000_000_000
@@ -24,18 +35,23 @@ _OWN = (results.c.spacecraft, results.c.run, results.c.time_ns // HOUR_NS)
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
     """Add new results."""
-    add(connection, results.c.seq.between(new[0].seq, new[-1].seq))
+    _ADD_RANGE.run(connection, [{"first_seq": new[0].seq, "last_seq": new[-1].seq}])
 
 
 def add(connection: Connection, chosen: ColumnElement[bool], sign: int = 1) -> None:
     """Add results to the seals of their hours, or take them out with a `sign` of -1."""
     dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
+    connection.execute(_adding(dialect, chosen, sign))
+
+
+def _adding(dialect: Any, chosen: ColumnElement[bool], sign: int = 1) -> Executable:
     summed = select(*_OWN, *(sign * each for each in _sums())).where(chosen).group_by(*_OWN)
     statement = dialect.insert(seals).from_select([each.name for each in seals.columns], summed)
     merged = {name: seals.c[name] + statement.excluded[name] for name in ("results", "digests")}
-    connection.execute(
-        statement.on_conflict_do_update(index_elements=list(seals.primary_key), set_=merged)
+    found: Executable = statement.on_conflict_do_update(
+        index_elements=list(seals.primary_key), set_=merged
     )
+    return found
 
 
 def take_out(connection: Connection, batch_ids: Sequence[str]) -> None:
@@ -61,3 +77,10 @@ def _sums() -> tuple[ColumnElement[int], ColumnElement[int]]:
     bits = results.c.digest.op("&")(SUMMED_BITS)
     # PostgreSQL's sum of integers is a decimal number.
     return func.count(), func.coalesce(func.sum(bits), 0).cast(BigInteger)
+
+
+_ADD_RANGE = Prepared(
+    lambda dialect: _adding(
+        dialect, results.c.seq.between(bindparam("first_seq"), bindparam("last_seq"))
+    )
+)

@@ -5,10 +5,11 @@ comes from one row whose lock is held until the commit: in no process does an
 event become visible after one with a higher number, and no number is left out.
 """
 
+import asyncio
 import logging
 import threading
-from collections.abc import Callable, Collection, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -157,6 +158,35 @@ def events_between(connection: Connection, since: Utc, until: Utc) -> Sequence[E
     return [Event(**row) for row in rows_of(connection, query)]
 
 
+class Bell:
+    """Wakes those in event loops who wait for events; rung from any thread after a commit."""
+
+    def __init__(self) -> None:
+        self._subscribed: dict[asyncio.Event, asyncio.AbstractEventLoop] = {}
+        self._lock = threading.Lock()
+
+    def subscribe(self) -> asyncio.Event:
+        """An event of the running loop that is set after each commit with recorded events."""
+        news = asyncio.Event()
+        with self._lock:
+            self._subscribed[news] = asyncio.get_running_loop()
+        return news
+
+    def unsubscribe(self, news: asyncio.Event) -> None:
+        """Stop setting an event."""
+        with self._lock:
+            self._subscribed.pop(news, None)
+
+    def ring(self) -> None:
+        """Set the events of all subscribers."""
+        with self._lock:
+            subscribed = list(self._subscribed.items())
+        for news, loop in subscribed:
+            # The loop may be closed: its subscriber is gone.
+            with suppress(RuntimeError):
+                loop.call_soon_threadsafe(news.set)
+
+
 _SHOWN = ("id", "spacecraft", "start", "end", "text", "who", "created")
 
 
@@ -238,9 +268,9 @@ class HeardEvents:
     reads the table each second all the same.
     """
 
-    def __init__(self, url: URL, heard: Callable[[], object]) -> None:
-        """`heard` is called from the thread after commits with events, also those of this one."""
-        self._url, self._heard = url, heard
+    def __init__(self, url: URL, bell: Bell) -> None:
+        """The `bell` is rung after commits with events, also those of this service."""
+        self._url, self._bell = url, bell
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heard-events", daemon=True)
         self._thread.start()
@@ -262,11 +292,7 @@ class HeardEvents:
                     driver.execute(f"LISTEN {CHANNEL}")
                     while not self._closed.is_set():
                         if list(driver.notifies(timeout=WAIT_S, stop_after=1)):
-                            self._heard()
+                            self._bell.ring()
             except (SQLAlchemyError, psycopg.Error) as error:
                 log.info("events of other services are read each second: %s", error)
-                self._closed.wait(RECONNECT_S)
-            except Exception:
-                # An error of a listener must not end the thread that wakes all event streams.
-                log.exception("a listener of events failed")
                 self._closed.wait(RECONNECT_S)

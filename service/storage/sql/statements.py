@@ -37,12 +37,16 @@ class Prepared:
         self._make = make
         self._ready: dict[str, tuple[str, tuple[str, ...]]] = {}
         self._of_many: dict[int, str] = {}
+        self._constants: Row = {}
+        """Values that are part of the statement itself."""
 
     def run(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
         """Run the statement with the values of every row, by name."""
         if not rows:
             return
         sql, names = self._sql(connection.dialect.name)
+        if self._constants:
+            rows = [self._constants | row for row in rows]
         if connection.dialect.name != "sqlite":
             connection.exec_driver_sql(sql, list(rows))
             return
@@ -82,6 +86,7 @@ class Prepared:
     def read(self, connection: sa.Connection, values: Row) -> list[Row]:
         """The rows that the statement gives."""
         sql, names = self._sql(connection.dialect.name)
+        values = self._constants | values
         if connection.dialect.name != "sqlite":
             found = connection.exec_driver_sql(sql, values)
             return [dict(row) for row in found.mappings()]
@@ -97,6 +102,9 @@ class Prepared:
             kind, style = _STYLES[dialect]
             compiled: Any = self._make(kind)
             compiled = compiled.compile(dialect=kind.dialect(paramstyle=style))
+            self._constants = {
+                name: value for name, value in compiled.params.items() if value is not None
+            }
             ready = self._ready[dialect] = str(compiled), tuple(compiled.positiontup or ())
         return ready
 

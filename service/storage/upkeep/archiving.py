@@ -210,7 +210,7 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
         path = path_of(folder, manifest, part)
         written = from_partition(read_partition(content))
         take_out = partial(_take_out, day=day, part=part, path=path, written=written)
-        if store.writer.change(take_out).result():
+        if store.writer.change(take_out):
             return part
         # Changed since it was read, by a what-if for example: written again as it is now.
         remove_part(folder, manifest, part)
@@ -391,7 +391,7 @@ def restore(
             rows = read_part(folder, path, part.sha256)
             record_again = partial(put_back, folder=folder, part=part, rows=rows)
             try:
-                is_new = store.writer.change(record_again).result()
+                is_new = store.writer.change(record_again)
             except IntegrityError as error:
                 raise BadConfiguration(
                     f"{folder / path}: the database has other batches of these names: {error.orig}"

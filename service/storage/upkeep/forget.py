@@ -117,16 +117,16 @@ def forget(
         note(connection, total)
 
     # What is computed from the batches goes first: it is computed again from what is left.
-    store.writer.change(forget_days).result()
+    store.writer.change(forget_days)
     done = 0
     if total.archived_batches and archive is not None:
         done += _forget_archived(store, archive, selected)
         step(done, total)
-    while forgotten := store.writer.change(partial(_forget_batches, selected=selected)).result():
+    while forgotten := store.writer.change(partial(_forget_batches, selected=selected)):
         done += forgotten
         step(done, total)
     blocks = partial(delete_blocks, chosen=selected.of_blocks())
-    while total.gyro_blocks and store.writer.change(blocks).result():
+    while total.gyro_blocks and store.writer.change(blocks):
         pass
     if selected.is_whole and selected.spacecraft is None and selected.run != LIVE:
         _forget_run(store, selected.run)
@@ -242,10 +242,10 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
         for path, (manifest, part) in named.items():
             row = known[path]
             if counts[row["id"]] == row["batches"]:
-                store.writer.change(partial(forget_whole, row=row)).result()
+                store.writer.change(partial(forget_whole, row=row))
             else:
                 rows = read_part(folder, path, part.sha256)
-                store.writer.change(partial(forget_some, part=part, rows=rows)).result()
+                store.writer.change(partial(forget_some, part=part, rows=rows))
             # After the record: a file too many is named by `archive verify`, a missing one lost.
             remove_part(folder, manifest_of(folder, manifest.spacecraft, manifest.day), part)
     return sum(counts.values())
@@ -255,4 +255,4 @@ def _forget_run(store: Store, run: str) -> None:
     """Delete the settings of a run, unless something was recorded in it meanwhile."""
     deletion = delete(runs).where(runs.c.name == run)
     with suppress(IntegrityError):
-        store.writer.change(lambda connection: connection.execute(deletion)).result()
+        store.writer.change(lambda connection: connection.execute(deletion))

@@ -88,12 +88,12 @@ def prune(
         )
         deleted = MOST_BATCHES
         while deleted == MOST_BATCHES:
-            deleted = store.writer.change(deletion).result()
+            deleted = store.writer.change(deletion)
             pruned.batches += deleted
             step(pruned)
-    while deleted := store.writer.change(partial(delete_blocks, chosen=old_blocks)).result():
+    while deleted := store.writer.change(partial(delete_blocks, chosen=old_blocks)):
         pruned.gyro_blocks += deleted
-    while deleted := store.writer.change(partial(delete_days, chosen=old_days)).result():
+    while deleted := store.writer.change(partial(delete_days, chosen=old_days)):
         pruned.graded_days += deleted
     return pruned
 

@@ -107,7 +107,7 @@ def merge(store: Store, folder: Path, path: str, made: RunPart) -> None:
     Raises `BadConfiguration` where the run has other batches of the same names.
     """
     try:
-        store.writer.change(partial(_merge, folder=folder, path=path, made=made)).result()
+        store.writer.change(partial(_merge, folder=folder, path=path, made=made))
     except IntegrityError as error:
         raise _taken(made, str(error.orig)) from None
 
@@ -203,4 +203,4 @@ def restore_newest(store: Store, folder: Path, spacecraft: str, run: str) -> Non
         manifest = manifest_of(folder, spacecraft, Path(path).parent.name.removeprefix("day="))
         part = next(each for each in manifest.parts if each.file == Path(path).name)
         rows = read_part(folder, path, sha256)
-        store.writer.change(partial(put_back, folder=folder, part=part, rows=rows)).result()
+        store.writer.change(partial(put_back, folder=folder, part=part, rows=rows))

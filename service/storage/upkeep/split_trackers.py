@@ -97,9 +97,7 @@ class TrackerSplitter:
             for digest in {row["mission_digest"] for row in rows} - self._recorded.keys():
                 self._recorded[digest] = recorded_mission(connection, digest)
         split = {row["id"]: self._split(row) for row in rows}
-        self.store.writer.change(
-            lambda connection: _write(connection, owner, place, rows, split)
-        ).result()
+        self.store.writer.change(lambda connection: _write(connection, owner, place, rows, split))
         return len(rows)
 
     def _split(self, row: Row) -> list[Row]:
@@ -295,8 +293,8 @@ class OlderDigests:
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> int:
         """Make all that are missing; how many results got one, see `_in_steps`."""
-        self.store.writer.change(_give_to_settings).result()
-        work = [lambda: self.store.writer.change(_give).result()]
+        self.store.writer.change(_give_to_settings)
+        work = [lambda: self.store.writer.change(_give)]
         return _in_steps(work, step, pause_s, is_stopped)
 
 

@@ -10,7 +10,7 @@ from starlette.responses import PlainTextResponse, Response
 
 from service.app.factory import App
 from service.errors import Busy
-from service.storage.projections.projector import WAIT_S, Lag
+from service.storage.progress import WAIT_S, Lag
 from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import AppDep, MetricsDep
 
@@ -58,7 +58,7 @@ async def readyz(request: Request, app: AppDep) -> Response:
 def _ready(app: App) -> Lag:
     """How far projections are behind, once the service is ready."""
     app.service.ready()
-    return app.projector.lag()
+    return app.store.progress.lag()
 
 
 @router.serves("GET /metrics", Returns("The counters.", media_type=TEXT))

@@ -25,11 +25,10 @@ from starlette.types import Scope
 from service import __version__
 from service.alarms.limits import Severity
 from service.app.factory import App
-from service.ingest.queue import Backlog
-from service.ingest.submit import Recorded
+from service.ingest.queue import OUTCOMES, Backlog, RecordedCounts
 from service.storage.models.alarms import Alarm
 from service.storage.models.spacecraft import ZoneCache
-from service.storage.projections.projector import Lag
+from service.storage.progress import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.storage.webhooks import Webhook
@@ -40,7 +39,6 @@ log = logging.getLogger(__name__)
 
 WAIT_S = 1.0
 """The deadline of all reads: the scrape is due within two seconds."""
-OUTCOMES = ("unique", "ambiguous", "unmatched")
 RESULTS = ("attitude", "no_attitude")
 ALARM_STATES = ("open", "acknowledged", "shelved")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
@@ -95,7 +93,7 @@ class _GaugeCollector(Collector):
             processes=app.replays.processes,
             alarms=app.alarms.active,
             backlog=app.submissions.backlog,
-            lag=app.projector.lag,
+            lag=app.store.progress.lag,
             expiries=app.expiries.dates,
             webhooks=app.webhooks.all,
         )
@@ -295,7 +293,8 @@ class Metrics:
         self.close = gauges.close
         """Ends the threads that read gauges; to be called after the last scrape."""
         self.registry.register(gauges)
-        app.submissions.observers.append(self.count_batch)
+        self._counts, self._counted = app.submissions.counts, RecordedCounts()
+        self._counting = threading.Lock()
         for name in app.missions:
             # A counter that exists from the start shows its first increase.
             for outcome in OUTCOMES:
@@ -303,14 +302,20 @@ class Metrics:
             for result in RESULTS:
                 self._batches.labels(name, LIVE, result)
 
-    def count_batch(self, recorded: Recorded) -> None:
-        """Count one newly recorded batch."""
-        spacecraft, live = recorded.spacecraft, recorded.run == LIVE
-        result = RESULTS[0] if recorded.has_attitude else RESULTS[1]
-        self._batches.labels(spacecraft, LIVE if live else "named", result).inc()
-        if live:
-            for outcome in OUTCOMES:
-                self._stars.labels(spacecraft, outcome).inc(recorded.counts[outcome])
+    def _count_recorded(self) -> None:
+        """Bring the counters up to what the submissions count."""
+        with self._counting:
+            now, before = self._counts.copy(), self._counted
+            for (spacecraft, is_live, has_attitude), count in now.batches.items():
+                result = RESULTS[0] if has_attitude else RESULTS[1]
+                run = LIVE if is_live else "named"
+                more = count - before.batches[spacecraft, is_live, has_attitude]
+                self._batches.labels(spacecraft, run, result).inc(more)
+            for (spacecraft, is_live, outcome), count in now.stars.items():
+                if is_live:
+                    more = count - before.stars[spacecraft, is_live, outcome]
+                    self._stars.labels(spacecraft, outcome).inc(more)
+            self._counted = now
 
     def count_repeat(self) -> None:
         """Count one submission that was recorded before."""
@@ -330,4 +335,5 @@ class Metrics:
 
     def text(self) -> bytes:
         """The exposition text."""
+        self._count_recorded()
         return generate_latest(self.registry)

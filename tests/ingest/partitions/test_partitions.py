@@ -109,7 +109,7 @@ def test_bytes_follow_from_the_input_alone(archived, place, processes):
     for manifest in folder.manifests(place):
         kept = [part for part in manifest.parts if part.run != "again"]
         folder.write_manifest(place, folder.Manifest(**(asdict(manifest) | {"parts": kept})))
-    archived.store.writer.change(forget("again")).result()
+    archived.store.writer.change(forget("again"))
     again(archived, place, processes=processes)
     assert files_of(place, "again") == made
     assert_whole(archived, place)

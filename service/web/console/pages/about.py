@@ -10,7 +10,7 @@ from starlette.responses import Response
 
 from service.app.factory import App
 from service.errors import AcquisitionError
-from service.storage.projections.projector import WAIT_S
+from service.storage.progress import WAIT_S
 from service.times import recorded_utc, utc_now
 from service.web.console.formatting import age, count, plural, size
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
@@ -46,7 +46,7 @@ def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 def _checks(context: PageContext) -> Iterator[Check]:
     app = context.app
     yield _readiness(app)
-    backlog, lag = app.submissions.backlog(), app.projector.lag()
+    backlog, lag = app.submissions.backlog(), app.store.progress.lag()
     posts, writes = backlog.posts, backlog.writes
     yield Check(
         "batches that wait to be answered",
