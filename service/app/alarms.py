@@ -145,9 +145,8 @@ class Alarms:
         with self._context.reading() as connection:
             due = is_due_by_clock(connection, self._context.missions, moment)
         if due:
-            self._context.store.writer.project(
-                lambda connection: evaluate_by_clock(connection, self._context.missions, moment)
-            )
+            with self._context.store.writer.projection() as connection:
+                evaluate_by_clock(connection, self._context.missions, moment)
         return due
 
     def _act(

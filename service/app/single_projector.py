@@ -9,7 +9,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable
-from functools import partial
 
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -131,10 +130,13 @@ class SingleProjector:
         with self._store.reading_record() as connection:
             ids = unfinished_replays(connection) | unfinished_calibrations(connection)
         others = ids - self._store.at_work
-        project = self._store.writer.project
-        left = project(partial(left_behind, ids=others)) if others else set()
+        left: set[str] = set()
+        if others:
+            with self._store.writer.projection() as connection:
+                left = left_behind(connection, others)
         ended, self._suspected = left & self._suspected, left
         if ended:
             now = utc_now().text
-            project(lambda connection: mark_interrupted(connection, now, only=ended))
-            project(lambda connection: interrupt_calibrations(connection, now, ended))
+            with self._store.writer.projection() as connection:
+                mark_interrupted(connection, now, only=ended)
+                interrupt_calibrations(connection, now, ended)

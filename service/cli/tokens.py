@@ -16,10 +16,11 @@ from service.access import MAX_DAYS, Entry, NewToken, Token, Tokens
 from service.cli.arguments import http_client, print_json, refusal_of, service_url, settings_of
 from service.missions.mission import load_missions
 from service.settings import Settings
+from service.storage.readers import Readers
 from service.storage.recording.ids import Ulids
 from service.storage.sql.database_file import is_written
 from service.storage.sql.engines import database_file, database_url
-from service.storage.store import Readers, Store
+from service.storage.store import Store
 from service.storage.upkeep.expiries import SOON_DAYS
 from service.times import DAY_S, shifted, utc_now
 

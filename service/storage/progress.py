@@ -2,13 +2,11 @@
 
 import threading
 import time
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 
-from sqlalchemy import Connection
-
 from service.errors import Busy
+from service.storage.readers import Readers
+from service.storage.recording.writer import Writer
 from service.storage.sql.statements import execute
 
 POLL_S = 0.02
@@ -37,17 +35,12 @@ class Progress:
 
     def __init__(
         self,
-        lookup: Callable[[], AbstractContextManager[Connection]],
-        commits: Callable[[], int],
-        *,
-        is_shared: bool,
+        readers: Readers,
+        writer: Writer,
     ) -> None:
-        """`commits` counts the writer's transactions.
-
-        With `is_shared` other processes record and project in the same database, too.
-        """
-        self._lookup, self._commits = lookup, commits
-        self.is_shared = is_shared
+        self._database, self._writer = readers, writer
+        self.is_shared = readers.file is None
+        """True for a database in which other processes record and project, too."""
         self._changed = threading.Condition()
         self._is_followed = False
         """True while this process has a projector, for which readers wait."""
@@ -89,12 +82,12 @@ class Progress:
 
     def is_behind(self) -> bool:
         """True if the writer has committed a transaction that is not projected."""
-        return self._projected < self._commits()
+        return self._projected < self._writer.commits
 
     def places(self) -> tuple[int, int]:
         """The places of the newest result and of the projector in the record."""
         asked_s = time.monotonic()
-        with self._lookup() as connection:
+        with self._database.lookup() as connection:
             ((newest, position),) = execute(connection, _NEWEST_AND_POSITION)
         if position >= newest:
             self._up_to_date_s = max(self._up_to_date_s, asked_s)
@@ -119,7 +112,7 @@ class Progress:
             return time.monotonic() - self._up_to_date_s
 
     def _waited(self) -> float:
-        commits = self._commits()
+        commits = self._writer.commits
         newest, position = self.places()
         if position >= newest:
             return 0.0
@@ -167,6 +160,6 @@ class Progress:
         newest, position = self.places()
         if newest - position <= most:
             return max(0, newest - position)
-        with self._lookup() as connection:
+        with self._database.lookup() as connection:
             ((behind,),) = execute(connection, _BEHIND)
         return int(behind)

@@ -1,103 +1,21 @@
 """An open database: one writer and many readers."""
 
-import logging
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
-from sqlalchemy import Connection, event
-from sqlalchemy.exc import DBAPIError, TimeoutError
+from sqlalchemy import Connection
 
 from service import logs
-from service.errors import Busy
 from service.storage.archive.reading import Archive
 from service.storage.progress import Progress
+from service.storage.readers import Readers
 from service.storage.recording.events import HeardEvents
-from service.storage.recording.writer import RETRY_AFTER_S, Writer, may_pass, remove_probe
+from service.storage.recording.writer import Writer, remove_probe
 from service.storage.sql import engines
-from service.storage.sql.database_file import DatabaseFile, FileLock
-from service.storage.sql.engines import PersistentConnection
+from service.storage.sql.database_file import FileLock
 from service.storage.sql.migrations import bring_up_to_date, disposed, require_up_to_date
 from service.storage.sql.projector_lock import ProjectorLock
-
-log = logging.getLogger(__name__)
-
-
-class Readers:
-    """Connections that see one snapshot of a database each, and cannot write."""
-
-    def __init__(
-        self,
-        database: str,
-        *,
-        serving: bool = False,
-        file: DatabaseFile | None = None,
-    ) -> None:
-        """Connects to nothing yet; raises `BadConfiguration` for an invalid database URL.
-
-        With `serving`, waiting for a database that does not answer is bounded.  The file of
-        SQLite must stay the one that is there now.
-        """
-        self.url = engines.database_url(database)
-        self.file = file or engines.database_file(self.url)
-        if self.file is not None:
-            self.file.remember()
-        self._readers = engines.reading_engine(self.url, engines.TO_SHOW if serving else None)
-        self._lookup_engine = self._readers
-        if serving and self.file is None:
-            self._lookup_engine = engines.reading_engine(self.url, engines.TO_LOOK_UP, 1)
-        self._lookup_connection = PersistentConnection(
-            self._lookup_engine,
-            engines.TO_READ,
-            self.file,
-            engines.LONGEST_WAIT_S if serving else None,
-        )
-
-    def reading(self) -> AbstractContextManager[Connection]:
-        """A connection that sees one snapshot of the database and cannot write."""
-        return self.reading_record()
-
-    @contextmanager
-    def reading_record(self) -> Iterator[Connection]:
-        """A connection for what reads no projection, and so waits for none.
-
-        Raises `Busy` where the database is out of reach or every reader taken.
-        """
-        if self.file is not None:
-            self.file.require()
-        with _unavailable_is_busy(), self._readers.connect() as connection, connection.begin():
-            yield connection
-
-    @contextmanager
-    def lookup(self) -> Iterator[Connection]:
-        """A connection for prepared look-ups, each of which may see another snapshot.
-
-        Look-ups take turns.
-        """
-        with _unavailable_is_busy(), self._lookup_connection.lookup() as connection:
-            yield connection
-
-    def close(self) -> None:
-        """Let go of the database; what is still read by then is read to its end."""
-        self._lookup_connection.close()
-        for engine in (self._lookup_engine, self._readers):
-            # Else a connection that comes back later would stay open in a pool that nobody has.
-            event.listen(engine, "checkin", lambda _, entry: entry.close())
-            engine.dispose()
-
-
-@contextmanager
-def _unavailable_is_busy() -> Iterator[None]:
-    """Raise `Busy` for a fault of the database that may pass."""
-    try:
-        yield
-    except TimeoutError as error:
-        raise Busy("every connection to the database is in use") from error
-    except DBAPIError as error:
-        if not may_pass(error):
-            raise
-        log.error("the database could not be read: %s", error.orig)
-        raise Busy("the database cannot be read now", RETRY_AFTER_S) from error
 
 
 class Store(Readers):
@@ -154,7 +72,7 @@ class Store(Readers):
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
-        self.progress = Progress(self.lookup, lambda: self.writer.commits, is_shared=file is None)
+        self.progress = Progress(self, self.writer)
         """How far the projections are; readers wait for them."""
         self._heard: HeardEvents | None = None
         if serving and self.file_lock is not None:

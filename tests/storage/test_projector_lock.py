@@ -27,7 +27,8 @@ def run(store, sql):
 
 def project(store, sql):
     """The same in a step of the projector."""
-    return store.writer.project(lambda connection: connection.exec_driver_sql(sql).scalar())
+    with store.writer.projection() as connection:
+        return connection.exec_driver_sql(sql).scalar()
 
 
 def test_nothing_is_projected_before_the_lock_is_taken_and_both_record(opened):
@@ -86,7 +87,8 @@ def test_work_that_a_service_is_at_is_not_left_behind_until_it_has_ended(opened)
 
     def left():
         ids = {"one", "two", "three"}
-        return first.writer.project(lambda connection: left_behind(connection, ids))
+        with first.writer.projection() as connection:
+            return left_behind(connection, ids)
 
     assert left() == {"three"}
     second.at_work.discard("one")

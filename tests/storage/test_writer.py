@@ -90,10 +90,14 @@ def test_what_has_time_lets_others_pass_for_one_transaction(store, threads):
         waiting.append(threads.submit(writer.change, lambda _: done.append("a later post")))
         waiting_for_their_turn(writer, 3)
 
+    def project(k):
+        with writer.projection():
+            done.append(f"chunk {k}")
+
     go_on = held_up(writer, threads)
     waiting = []
     for k in (1, 2):
-        chunk = threads.submit(writer.project, lambda _, k=k: done.append(f"chunk {k}"))
+        chunk = threads.submit(project, k)
         waiting.append(chunk)
         waiting_for_their_turn(writer, k)
     waiting.append(threads.submit(writer.change, post_meanwhile))

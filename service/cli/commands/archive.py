@@ -141,7 +141,7 @@ def _folder(path: Path | None, option: str) -> Path:
 def _parts(parsed: Namespace) -> dict[str, str]:
     """The hashes of the parts that the database has batches in, by path."""
     from service.storage.archive.reading import archived_paths
-    from service.storage.store import Readers
+    from service.storage.readers import Readers
 
     with (
         closing(Readers(settings_of_existing(parsed).database)) as readers,

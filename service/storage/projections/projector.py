@@ -207,7 +207,8 @@ class Projector:
 
     def _write(self, step: Callable[[Connection], _Step]) -> _Step | None:
         try:
-            done = self._store.writer.project(step)
+            with self._store.writer.projection() as connection:
+                done = step(connection)
         except (NotProjecting, BadConfiguration):
             # Another process projects.
             self._progress.is_projecting = False

@@ -13,7 +13,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, field
 from typing import TypeVar
 
@@ -38,9 +38,6 @@ T = TypeVar("T")
 WriteOutcome = RecordOutcome | Exception
 WriteOutcomes = list[WriteOutcome]
 
-Work = Callable[[Connection, bool], T]
-"""The content of a transaction; True where an attempt has failed, so that care is needed."""
-
 MAX_ATTEMPTS = 5
 MAX_LOOKS = 5
 RETRY_AFTER_S = 5
@@ -50,6 +47,10 @@ PROBE_TABLE = "probe_of_room"
 
 # PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
 _CROSSED = ("40001", "40P01")
+
+
+class Crossed(Busy):
+    """PostgreSQL stopped a transaction, since another one wrote the same rows."""
 
 
 @dataclass(frozen=True)
@@ -175,13 +176,14 @@ class Writer:
         if not unsaved_results:
             return []
 
-        def work(connection: Connection, careful: bool) -> WriteOutcomes:
-            if careful:
-                return _record(connection, unsaved_results)
-            return list(record(connection, unsaved_results, assume_new=True))
+        def write(careful: bool) -> WriteOutcomes:
+            wait_s = None if low_priority else self._wait_s
+            with self._transaction(len(unsaved_results), low_priority, wait_s) as connection:
+                if careful:
+                    return _record(connection, unsaved_results)
+                return list(record(connection, unsaved_results, assume_new=True))
 
-        ticket = _Ticket(len(unsaved_results), low_priority)
-        outcomes = self._write(work, ticket, wait_s=None if low_priority else self._wait_s)
+        outcomes = self._attempted(write, len(unsaved_results))
         # Read first: the lock is for the rare case that something changes.  A small change that
         # succeeds says nothing of room for a batch.
         if self._is_failing:
@@ -191,32 +193,32 @@ class Writer:
 
     def change(self, change: Callable[[Connection], T]) -> T:
         """Make another change, which is kept whole or not at all, and may be made twice over."""
-        return self._write(lambda connection, _: change(connection), _Ticket(1, False))
 
-    def project(self, step: Callable[[Connection], T]) -> T:
-        """Make a step of the projector: a change that lets other callers go first.
+        def write(_: bool) -> T:
+            with self._transaction() as connection:
+                return change(connection)
+
+        return self._attempted(write, 1)
+
+    @contextmanager
+    def projection(self) -> Iterator[Connection]:
+        """A transaction of the projector, which lets other callers go first.
 
         Raises `NotProjecting` where another service that shares the database projects.
         """
         if self._lock is not None:
             self._lock.require()
-        lock = self._lock
-
-        def work(connection: Connection, _: bool) -> T:
-            if lock is not None:
-                lock.require_in(connection)
-            return step(connection)
-
-        return self._write(work, _Ticket(1, True), is_projection=True)
+        with self._transaction(low_priority=True, is_projection=True) as connection:
+            if self._lock is not None:
+                self._lock.require_in(connection)
+            yield connection
 
     def take_lock(self) -> Attempt:
         """Take the projector's lock, if no other session has it; raises `Busy`."""
-        lock = self._lock
-        if lock is None:
+        if self._lock is None:
             return "kept"
-        return self._write(
-            lambda connection, _: lock.take(connection), _Ticket(1, True), is_projection=True
-        )
+        with self._transaction(low_priority=True, is_projection=True) as connection:
+            return self._lock.take(connection)
 
     def later(self, write: Callable[[], T]) -> "Future[T]":
         """Call a function that writes from another thread, after those of earlier calls.
@@ -264,84 +266,78 @@ class Writer:
         self._turns.close()
         self._connection.close()
 
-    def _write(
+    def _attempted(self, write: Callable[[bool], T], records: int) -> T:
+        """Call a function that writes; after an error that another process may have caused, again.
+
+        The function is told whether an attempt failed, so that care is needed.
+        """
+        attempt = 1
+        while True:
+            try:
+                return write(attempt > 1)
+            except Crossed:
+                if attempt == MAX_ATTEMPTS:
+                    self.note_failure(records)
+                    raise
+            except Exception as error:
+                if attempt > 1 or isinstance(error, Busy):
+                    raise
+                log.debug("a transaction is made again, with care: %s", type(error).__name__)
+            attempt += 1
+
+    @contextmanager
+    def _transaction(
         self,
-        work: Work[T],
-        ticket: _Ticket,
-        *,
+        records: int = 1,
+        low_priority: bool = False,
         wait_s: float | None = None,
         is_projection: bool = False,
-    ) -> T:
+    ) -> Iterator[Connection]:
+        """A transaction in this thread's turn, committed at the end of the block.
+
+        An error of the block's own rolls the transaction back, and is raised.  Raises `Busy`
+        where the database fails or the turn does not come within `wait_s`, and `Crossed` where
+        PostgreSQL stopped the transaction for another one.
+        """
         if self._file_lock is not None:
             self._file_lock.take()
-        refused: Exception | None = None
+        own_error: Exception | None = None
+        has_events = False
         try:
-            with self._turns.turn(ticket, wait_s):
-                try:
-                    outcome, has_events = self._transaction(work, ticket.low_priority)
-                except _Refused as error:
-                    refused = error.reason
-                else:
-                    self.commits += not is_projection
+            with self._turns.turn(_Ticket(records, low_priority), wait_s), suppress(RolledBack):
+                with (
+                    self._connection.transaction() as connection,
+                    patience(connection) if low_priority else nullcontext(),
+                ):
+                    try:
+                        with events.numbered(connection):
+                            yield connection
+                    except Exception as error:
+                        if is_of_the_database(error):
+                            raise
+                        own_error = error
+                        raise RolledBack from error
+                    has_events = events.noted(connection) > 0
+                if not is_projection:
+                    self.commits += 1
         except exc.DBAPIError as error:
-            log.error("%d records could not be written: %s", ticket.records, error.orig)
+            if getattr(error.orig, "sqlstate", None) in _CROSSED:
+                raise Crossed("other transactions came in the way", RETRY_AFTER_S) from error
+            log.error("%d records could not be written: %s", records, error.orig)
             if not is_of_the_database(error):
                 raise
             if not is_projection:
-                self.note_failure(ticket.records)
+                self.note_failure(records)
             # Its words name files and hosts, which are for the log alone.
             raise Busy("the database cannot be written now", RETRY_AFTER_S) from error
         except Busy:
             if not is_projection:
-                self.note_failure(ticket.records)
+                self.note_failure(records)
             raise
-        if refused is not None:
-            raise refused
+        if own_error is not None:
+            raise own_error
         if has_events:
             self.bell.ring()
-        return outcome
-
-    def _transaction(self, work: Work[T], has_time: bool) -> tuple[T, bool]:
-        """Do the work in one transaction, and tell whether it recorded events.
-
-        Where the work raises an error that is not the database's, it is done once more, since
-        another process may have caused the error; then this raises `_Refused`.
-        """
-        attempt = 1
-        while True:
-            reason: Exception | None = None
-            try:
-                with (
-                    self._connection.transaction() as connection,
-                    patience(connection) if has_time else nullcontext(),
-                ):
-                    try:
-                        with events.numbered(connection):
-                            outcome = work(connection, attempt > 1)
-                    except Exception as error:
-                        if is_of_the_database(error):
-                            raise
-                        reason = error
-                        raise RolledBack from error
-                    has_events = events.noted(connection) > 0
-                return outcome, has_events
-            except RolledBack:
-                assert reason is not None
-                if attempt > 1:
-                    raise _Refused(reason) from None
-                log.debug("a transaction is made again, with care: %s", type(reason).__name__)
-            except exc.DBAPIError as error:
-                if getattr(error.orig, "sqlstate", None) not in _CROSSED or attempt == MAX_ATTEMPTS:
-                    raise
-            attempt += 1
-
-
-class _Refused(Exception):
-    """The work of a transaction raised an error; the database is not at fault."""
-
-    def __init__(self, reason: Exception) -> None:
-        super().__init__(str(reason))
-        self.reason = reason
 
 
 def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> WriteOutcomes:
