@@ -3,7 +3,9 @@
 import json
 import threading
 import time
+from itertools import cycle
 
+import numpy as np
 import pytest
 from sqlalchemy import delete, func, insert, select, update
 
@@ -68,8 +70,11 @@ def alarms_of(store):
     return sorted(map(repr, found)), sorted(map(repr, kept)), changes
 
 
-def rebuilt(store, file, monkeypatch):
-    """A database with the same record, whose projections are made anew, one result at a time."""
+def rebuilt(store, file, sizes=1):
+    """A database with the same record, whose projections are made anew.
+
+    Each turn takes so many results, by default one; `sizes` may differ from turn to turn.
+    """
     made = Store(sqlite_at(file))
     copied = {table: rows_of(store, table) for table in RECORD}
 
@@ -79,13 +84,13 @@ def rebuilt(store, file, monkeypatch):
                 connection.execute(insert(table), sorted(rows, key=lambda row: str(row.get("id"))))
 
     made.writer.change(copy)
-    with monkeypatch.context() as patch:
-        patch.setattr(projecting, "MOST_AT_ONCE", 1)
-        again = Projector(made)
-        again.start()
-        again.wait()
-        again.close()
-    return made
+    again = Projector(made)
+    for size in cycle(np.atleast_1d(sizes).tolist()):
+        again._most = size
+        with made.writer.projection() as connection:
+            if again._step(connection).is_all:
+                return made
+    raise AssertionError("there is no size")
 
 
 @pytest.fixture
@@ -106,7 +111,7 @@ def test_they_equal_a_rebuild_after_each_kind_of_change(
             assert_equal_to_a_recount(connection)
         assert verify(url) == [], what
         if alarms_again:
-            again = rebuilt(app.store, tmp_path / f"{what}.db", monkeypatch)
+            again = rebuilt(app.store, tmp_path / f"{what}.db")
             assert alarms_of(app.store) == alarms_of(again), what
             with again.reading() as connection:
                 assert_equal_to_a_recount(connection)
@@ -167,6 +172,31 @@ def assert_passed(connection):
 
 def held_up(connection, new):
     raise Busy("held up")
+
+
+def test_alarms_are_the_same_however_results_are_grouped(opened, make, tmp_path, rng):
+    """Batches come in any order, in limits and out of them, in single steps and in one."""
+    app = opened()
+    for name, high in (
+        ("unmatched_share", 0.1),
+        ("ambiguous_share", 0.05),
+        ("no_attitude_share", 0.3),
+    ):
+        wanted = {"warning": {"high": high}, "critical": {"high": 3 * high}, "hysteresis": 0.02}
+        wanted |= {"minimum_count": int(rng.integers(1, 5)), "duration_s": 60.0}
+        limits = LimitSettings.model_validate(wanted)
+        app.limits.set("XTE", name, limits, who="jb", comment="for the test")
+    kinds = rng.choice(["good", "suspect", "one_star", "spurious"], 40, p=[0.4, 0.1, 0.2, 0.3])
+    places = np.arange(40) + rng.normal(0.0, 2.0, 40)
+    for k in np.argsort(places):
+        app.submissions.submit(make(f"b{k}", kind=kinds[k], after_s=30.0 * float(k)))
+    expected = alarms_of(rebuilt(app.store, tmp_path / "single.db"))
+    assert alarms_of(app.store) == expected
+    assert expected[0], "no alarm was raised"
+    for trial, most in enumerate((3, 10, 40)):
+        sizes = rng.integers(1, most + 1, 40)
+        again = rebuilt(app.store, tmp_path / f"groups-{trial}.db", sizes)
+        assert alarms_of(again) == expected, sizes
 
 
 def test_changes_beside_what_is_not_projected_yet_count_nothing_twice(app, make, monkeypatch):

@@ -151,7 +151,7 @@ class LimitEvaluator:
                 latest_ns = window.samples[-1][0]
                 for batch in present:
                     if batch["time_ns"] >= latest_ns:
-                        self._latest[name] = latest_ns, _reference(batch)
+                        self._latest[name] = batch["time_ns"], _reference(batch)
                 point = Point(value, *self._latest_in_window(name, present[-1], latest_ns))
                 self._active.observe(name, None, limits, point, present[-1]["received"])
         return due
@@ -167,7 +167,7 @@ class LimitEvaluator:
     def _latest_in_window(self, subject: Subject, batch: Row, latest_ns: int) -> BatchRef:
         """The latest batch of a subject's window: the one given, unless it comes late."""
         if batch["time_ns"] >= latest_ns:
-            self._latest[subject] = latest_ns, _reference(batch)
+            self._latest[subject] = batch["time_ns"], _reference(batch)
             return _reference(batch)
         known_ns, known = self._latest.get(subject, (None, None))
         if known is None or known_ns != latest_ns:
