@@ -14,6 +14,7 @@ from service.acquire.picture import (
     blind_sky,
     doubt_of_exposure,
     solve_picture,
+    trail_refusal,
 )
 from service.identify.blind.lens import Lens
 from service.imaging import submit
@@ -71,6 +72,8 @@ def _of_unknown_lens(
     read = perf_counter_ns()
     sky, solver = blind_sky(catalog, round(parse_utc(time).julian_year))
     result = solve_picture(_without_time(frame), sky, solver, camera.focal_length_px)
+    if result.points.trailed is not None:
+        raise bad_frame(f"cannot be measured: {trail_refusal(result.points)}")
     if result.points.count == 0:
         raise bad_frame("shows no star that could be used", "; ".join(result.remarks)[:200])
     chosen = _chosen(result, camera.most_stars, mission.catalog.magnitude_limit_mag)

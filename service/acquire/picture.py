@@ -192,6 +192,8 @@ def solve_picture(
         if keep_hot and not tried[0].hot_pixels:
             break
         tried.append(find_points(frame.counts, threshold, keep_hot))
+        if tried[-1].trailed is not None:
+            return _refused_trails(frame, tried[-1])
         for focal in ranges:
             result = _solved(frame, tried[-1], sky, solver, focal, guess_px)
             if result.attitude is not None:
@@ -204,6 +206,21 @@ def solve_picture(
             if found.attitude is not None:
                 return found
     return replace(result, points=points, remarks=tuple(advice_without_attitude(points)))
+
+
+def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:
+    """The result of a picture whose stars moved in a way that tells no attitude."""
+    nothing = BlindResult(None, -math.inf, 0, 0, 0, False)
+    return PictureResult(frame, points, None, nothing, (trail_refusal(points),))
+
+
+def trail_refusal(points: PointSources) -> str:
+    """Why a picture of stars that moved has no attitude, and what to do about it."""
+    return (
+        f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure, "
+        f"{points.trailed}: where they were at mid exposure cannot be told; use a shorter "
+        "exposure, or hold the camera still"
+    )
 
 
 def _solved(
@@ -447,6 +464,11 @@ def advice_without_attitude(points: PointSources) -> Iterator[str]:
 
 
 def _light(points: PointSources) -> Iterator[str]:
+    if points.trail_px is not None:
+        yield (
+            f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure; the "
+            "middles of their trails were taken, where they were at mid exposure"
+        )
     if points.hot_pixels > NOTABLE_HOT:
         yield (
             f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars; a dark "

@@ -14,6 +14,16 @@ import sep
 from scipy import fft
 
 from service.imaging.detection.levels import count_step, levels_of
+from service.imaging.detection.trails import (
+    CLEAR_RATIO,
+    MOST_UNEXPLAINED,
+    Trails,
+    find_trails,
+    may_trail,
+    measured_trails,
+    placed_trails,
+    twin_distance_px,
+)
 from service.imaging.frames.frame import CountArray, Frame, bad_frame
 from service.vectors import Vector, read_only
 
@@ -43,6 +53,8 @@ PLACE_NOISE = 1.34
 The least that there can be is the root of 2 behind a filter with the image of a star alone; the
 surround takes 5 % off the ratio.
 """
+TRAIL_PEAKS, TRAIL_WEIGHT_PX, TRAIL_ROUNDS = 30, 3.0, 2
+"""The clearest peaks, the width of the weight, and its rounds, by which trails are noticed."""
 _LEAST_SIGMA_PX = 0.05
 _CENTROID_ROUNDS = 6
 
@@ -72,6 +84,10 @@ class PointSources:
     height_px: int
     hot_pixels: int = 0
     """Single bright pixels, which no star makes."""
+    trail_px: float | None = None
+    """The typical length of the trails along which stars moved; None where they stand still."""
+    trailed: str | None = None
+    """Why the places at mid exposure cannot be told of stars that moved; None where they can."""
 
     @property
     def count(self) -> int:
@@ -108,30 +124,27 @@ def find_points(
     if hot.any() and not keep_hot:
         _fill(light, peaks[0][hot], peaks[1][hot])
         peaks = _peaks(light, GUESSED_PSF_PX, threshold, step)
-    psf = _measured_psf(light, *peaks)
-    if not 1.0 / LIKE_PSF < psf / GUESSED_PSF_PX < LIKE_PSF:
-        peaks = _peaks(light, psf, threshold, step)
-    u, v, ratio = peaks
-    order = np.argsort(-ratio, kind="stable")[:MAX_POINTS]
-    u, v, ratio = u[order], v[order], ratio[order]
-    weight = max(psf, 1.0)
-    shapes = _moments(light, u, v, weight)
-    # A place between two dark pixels may stand out behind the filter without any light of its own.
-    lit = shapes.weighted > 0.0
-    ratio = ratio[lit]
-    sigma = np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX)
+    noise_counts = max(float(background.globalrms), step / math.sqrt(12.0))
+    trails = _trails(light, noise_counts, *peaks)
+    if trails is None:
+        psf = _measured_psf(light, *peaks)
+        if not 1.0 / LIKE_PSF < psf / GUESSED_PSF_PX < LIKE_PSF:
+            peaks = _peaks(light, psf, threshold, step)
+        places = _still_places(light, psf, *peaks)
+    else:
+        psf = trails.sigma_px
+        places = _middles_of_trails(light, noise_counts, trails, threshold)
     offset, unit = 0.5 * (binning - 1), 1.0 / levels.factor
-    flux = shapes.weighted[lit] * (1.0 + (psf / weight) ** 2) * binning**2
     if not levels.is_as_it_is:
         light *= np.float32(unit)
-    return PointSources(
-        u_px=read_only(shapes.u_px[lit] * binning + offset),
-        v_px=read_only(shapes.v_px[lit] * binning + offset),
-        sigma_px=read_only(sigma * binning),
-        signal_ratio=read_only(ratio),
-        flux_counts=read_only(flux * unit),
+    found = PointSources(
+        u_px=read_only(places.u_px * binning + offset),
+        v_px=read_only(places.v_px * binning + offset),
+        sigma_px=read_only(places.sigma_px * binning),
+        signal_ratio=read_only(places.signal_ratio),
+        flux_counts=read_only(places.flux_counts * binning**2 * unit),
         psf_sigma_px=psf * binning,
-        noise_counts=max(float(background.globalrms), step / math.sqrt(12.0)) * unit,
+        noise_counts=noise_counts * unit,
         background_counts=float(background.globalback) * unit + levels.zero_counts,
         clipped_share=np.count_nonzero(counts <= np.nanmin(counts)) / counts.size,
         light=light,
@@ -139,18 +152,102 @@ def find_points(
         width_px=width,
         height_px=height,
         hot_pixels=int(np.count_nonzero(hot)),
+        trail_px=None if trails is None else trails.length_px * binning,
+        trailed=None if trails is None else trails.refused,
+    )
+    apart_px = twin_distance_px(found.u_px, found.v_px, found.flux_counts, max(width, height))
+    if apart_px is None:
+        return found
+    return replace(found, trail_px=apart_px, trailed="in two images of each")
+
+
+@dataclass(frozen=True)
+class _Places:
+    """Places and their sigmas (n) in working pixels, signal to noise, and light in counts."""
+
+    u_px: Vector
+    v_px: Vector
+    sigma_px: Vector
+    signal_ratio: Vector
+    flux_counts: Vector
+
+
+def _still_places(
+    light: CountArray,
+    psf: float,
+    u: npt.NDArray[np.int64],
+    v: npt.NDArray[np.int64],
+    ratio: Vector,
+) -> _Places:
+    """The centroids of the clearest peaks."""
+    order = np.argsort(-ratio, kind="stable")[:MAX_POINTS]
+    u, v, ratio = u[order], v[order], ratio[order]
+    weight = max(psf, 1.0)
+    shapes = _moments(light, u, v, weight)
+    # A place between two dark pixels may stand out behind the filter without any light of its own.
+    lit = shapes.weighted > 0.0
+    ratio = ratio[lit]
+    return _Places(
+        shapes.u_px[lit],
+        shapes.v_px[lit],
+        np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX),
+        ratio,
+        shapes.weighted[lit] * (1.0 + (psf / weight) ** 2),
+    )
+
+
+def _trails(
+    light: CountArray,
+    noise_counts: float,
+    u: npt.NDArray[np.int64],
+    v: npt.NDArray[np.int64],
+    ratio: Vector,
+) -> Trails | None:
+    """The trails of the stars, if the clear peaks are drawn out alike."""
+    clear = np.argsort(-ratio, kind="stable")[:TRAIL_PEAKS]
+    clear = clear[ratio[clear] > 2.0 * FIRST_THRESHOLD]
+    u, v = u[clear], v[clear]
+    shapes = _moments(light, u, v, TRAIL_WEIGHT_PX, TRAIL_ROUNDS)
+    if not may_trail(shapes.u_px, shapes.v_px, shapes.drawn_out, max(light.shape)):
+        return None
+    return measured_trails(light, noise_counts, _below_full(light))
+
+
+def _below_full(light: CountArray) -> npt.NDArray[np.bool_]:
+    """The pixels (rows, columns) that are not cut off at the largest count."""
+    return np.asarray(light < FULL_SHARE * light.max(initial=0.0))
+
+
+def _middles_of_trails(
+    light: CountArray, noise_counts: float, trails: Trails, threshold: float
+) -> _Places:
+    """The middles of the clearest trails, without what has another shape."""
+    u, v, ratio = find_trails(light, noise_counts, trails, threshold, MAX_POINTS)
+    placed = placed_trails(light, noise_counts, _below_full(light), trails, u, v)
+    alike = (placed.unexplained < MOST_UNEXPLAINED) | (ratio < CLEAR_RATIO)
+    return _Places(
+        placed.u_px[alike],
+        placed.v_px[alike],
+        np.maximum(placed.sigma_px[alike], _LEAST_SIGMA_PX),
+        ratio[alike],
+        placed.flux_counts[alike],
     )
 
 
 @dataclass(frozen=True)
 class _Shapes:
-    """Every image's place, width, lack of roundness (0 to 1), and light under the weight."""
+    """Every image's place, width, lack of roundness (0 to 1), and light under the weight.
+
+    `drawn_out` has the ellipticity as its size, and twice the direction of the longer axis from
+    u towards v as its angle.
+    """
 
     u_px: Vector
     v_px: Vector
     sigma_px: Vector
     ellipticity: Vector
     weighted: Vector
+    drawn_out: npt.NDArray[np.complex128]
 
 
 def _binned(counts: CountArray, binning: int) -> CountArray:
@@ -275,7 +372,11 @@ def _peaks(
 
 
 def _moments(
-    light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], weight_px: float
+    light: CountArray,
+    u: npt.NDArray[np.int64],
+    v: npt.NDArray[np.int64],
+    weight_px: float,
+    rounds: int = _CENTROID_ROUNDS,
 ) -> _Shapes:
     """Centroids and second moments under a Gaussian weight that follows each image."""
     half = max(3, math.ceil(3.0 * weight_px))
@@ -285,7 +386,7 @@ def _moments(
     window = light[rows[:, :, None], columns[:, None, :]].astype(np.float64)
     x, y = np.zeros(len(u)), np.zeros(len(u))
     reach = 1.5 * weight_px
-    for _ in range(_CENTROID_ROUNDS):
+    for _ in range(rounds):
         along_u, along_v = steps - x[:, None], steps - y[:, None]
         weight_u = np.exp(-0.5 * (along_u / weight_px) ** 2)
         weight_v = np.exp(-0.5 * (along_v / weight_px) ** 2)
@@ -306,7 +407,8 @@ def _moments(
     # What the weight took from the width.
     sigma = np.sqrt(1.0 / np.clip(1.0 / size - 1.0 / weight_px**2, 0.01, 25.0))
     stretch = np.hypot(uu - vv, 2.0 * uv) / (2.0 * size)
-    return _Shapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0))
+    drawn_out = (uu - vv + 2j * uv) / (2.0 * size)
+    return _Shapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0), drawn_out)
 
 
 HOT_SIGMAS = 8.0
