@@ -15,7 +15,7 @@ from numba.core.errors import NumbaError
 from service.attitude.covariance import information
 from service.attitude.quest import quest
 from service.compiled.arrays import borrowed_view
-from service.compiled.jit import _BitcodeLibrary, njit, njit_no_refcount
+from service.compiled.jit import _BitcodeLibrary, njit, njit_inlined, njit_no_refcount
 from service.identify.voting.fov_rotation import rotation_rad
 from service.vectors import unit
 
@@ -76,6 +76,29 @@ def test_only_what_python_calls_becomes_machine_code():
     assert not doubled.overloads
     assert doubled(3.0) == 6.0
     assert len(doubled.overloads) == 1
+
+
+def test_what_a_copied_part_calls_is_not_copied_with_it():
+    """Else each level of calls would multiply the code of the one below."""
+
+    @njit_no_refcount
+    def called(value):
+        return value + 1.0
+
+    @njit_inlined
+    def part(value):
+        return called(value) * called(2.0 * value)
+
+    @njit_no_refcount
+    def kernel(value):
+        return part(value)
+
+    assert kernel(1.0) == 6.0
+    for each, is_copied in ((called, False), (part, True)):
+        (compiled,) = each._inner.overloads.values()
+        code = compiled.library.get_llvm_str()
+        assert each.__name__ in code
+        assert ("alwaysinline" in code) == is_copied
 
 
 def test_an_error_in_what_a_kernel_calls_is_raised():

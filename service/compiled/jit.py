@@ -75,6 +75,7 @@ def njit_inlined(kernel: Callable[..., Any]) -> Any:
 
     A named tuple of arrays is passed as tens of numbers, and the compiler does not see
     which of them the part uses: called for every pair of stars, that took as long as its work.
+    What the part calls is not copied by that.
     """
     return _compiled(kernel, error_model="numpy", _nrt=False, forceinline=True)
 
@@ -100,6 +101,8 @@ class Kernel(CPUDispatcher):
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         options["nopython"] = True
+        # numba would hand this on from a kernel to all that it calls, and those call.
+        options.setdefault("forceinline", False)
         super().__init__(function, targetoptions=options, pipeline_class=_ForPython)
         try:
             self._cache = _LockedCache(function)

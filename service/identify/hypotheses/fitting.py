@@ -10,7 +10,7 @@ import numpy as np
 
 from service.attitude.covariance import inverse_symmetric
 from service.attitude.triad import triad
-from service.compiled.jit import njit_no_refcount
+from service.compiled.jit import njit_inlined, njit_no_refcount
 from service.identify.hypotheses import evidence
 from service.identify.hypotheses.scene import with_magnitude
 from service.identify.sighting import PRIOR_ROTATION
@@ -20,7 +20,7 @@ LEAST_SINE2 = 4e-10
 """Of the angle between the widest pair, four times its squared sine: 2 arcsec."""
 
 
-@njit_no_refcount
+@njit_inlined
 def fit_match(observed, stars, match, scratch, steps):  # type: ignore[no-untyped-def]
     """Fit T to a hypothesis: TRIAD on the widest pair, then Gauss-Newton steps.
 
@@ -145,7 +145,7 @@ def prior_angle(t, axis, kind):  # type: ignore[no-untyped-def]
     return 2.0 * math.asin(min(1.0, 0.5 * math.sqrt(chord2)))
 
 
-@njit_no_refcount
+@njit_inlined
 def weigh(observed, stars, match, scratch):  # type: ignore[no-untyped-def]
     """The log weight of a hypothesis, fitted; see `fit_match`."""
     count, square, log_det = fit_match(observed, stars, match, scratch, 1)
@@ -201,7 +201,7 @@ def weigh_without(observed, stars, match, k, square, scratch):  # type: ignore[n
     return log_weight_of(observed, stars, match, turned, count, max(left, 0.0), math.log(det))
 
 
-@njit_no_refcount
+@njit_inlined
 def log_weight_of(observed, stars, match, t, count, square, log_det):  # type: ignore[no-untyped-def]
     """The log weight of a hypothesis of `count` stars from its fit."""
     compared = clutter = 0

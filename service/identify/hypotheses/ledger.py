@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.jit import njit, njit_allocating, njit_no_refcount
+from service.compiled.jit import njit, njit_allocating, njit_inlined, njit_no_refcount
 from service.identify.hypotheses.evidence import log_sum
 from service.identify.hypotheses.scene import Progress
 from service.vectors import Vector
@@ -18,7 +18,7 @@ RIVAL_PROBABILITY = 1e-3
 """A star at least this likely is named among the rivals of one that is not unique."""
 
 
-@njit_no_refcount
+@njit_inlined
 def known(match, ledger, count):  # type: ignore[no-untyped-def]
     """Whether the ledger, of so many hypotheses, holds this one."""
     if count <= FEW:
@@ -35,7 +35,7 @@ def known(match, ledger, count):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit_no_refcount
+@njit_inlined
 def _same(match, ledger, h):  # type: ignore[no-untyped-def]
     """Whether hypothesis h of the ledger names the same stars."""
     for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
@@ -63,7 +63,7 @@ def _enter(ledger, h):  # type: ignore[no-untyped-def]
     table[at] = h
 
 
-@njit_no_refcount
+@njit_inlined
 def is_part(match, whole):  # type: ignore[no-untyped-def]
     """Whether every star of a match is the same in another."""
     apart = 0
@@ -119,7 +119,7 @@ def clear(ledger):  # type: ignore[no-untyped-def]
     ledger.heaviest[0] = ledger.heaviest_dropped[0] = -math.inf
 
 
-@njit_no_refcount
+@njit_inlined
 def spent(progress, work):  # type: ignore[no-untyped-def]
     """The progress after so much more work."""
     return Progress(
@@ -128,13 +128,13 @@ def spent(progress, work):  # type: ignore[no-untyped-def]
     )
 
 
-@njit_no_refcount
+@njit_inlined
 def at_bound(progress):  # type: ignore[no-untyped-def]
     """Whether the search has done all the work that it may."""
     return progress.work >= progress.max_work
 
 
-@njit_no_refcount
+@njit_inlined
 def left_unexplored(progress, log_weight):  # type: ignore[no-untyped-def]
     """The progress with a log weight added to what is not kept."""
     total = log_sum(progress.unexplored_weight, log_weight)

@@ -53,7 +53,7 @@ class Scan(NamedTuple):
     agreeing: Any
 
 
-@njit_no_refcount
+@njit_inlined
 def weight_bound(count, observed, stars, bounds):  # type: ignore[no-untyped-def]
     """The most that so many stars can weigh, but for det N, worked out once in a search."""
     if np.isnan(bounds[count]):
@@ -262,7 +262,7 @@ def _half_log_det(observed, i, j, order, others):  # type: ignore[no-untyped-def
     return 0.5 * math.log(max(least, 1e-30))
 
 
-@njit_no_refcount
+@njit_inlined
 def _test(scratch, others, at):  # type: ignore[no-untyped-def]
     """How one of the others in order is predicted, and its level of voxels, -1 where none tells."""
     if at >= others:
@@ -287,7 +287,7 @@ def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[
     )
 
 
-@njit_no_refcount
+@njit_inlined
 def _fewest(observed, stars, scan, best, bounds):  # type: ignore[no-untyped-def]
     """The fewest stars with which a candidate of a scan matters beside the best."""
     fewest = 3

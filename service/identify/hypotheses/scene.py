@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from service.compiled.jit import njit, njit_no_refcount
+from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.sky.geometry.directions import separation_rad
 
 MAX_HYPOTHESES = 2048
@@ -250,7 +250,7 @@ def with_magnitude(observed):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit_no_refcount
+@njit_inlined
 def within_bounds(row, stars):  # type: ignore[no-untyped-def]
     """Whether a zone star lies within the exact bounds."""
     if stars.polar[row] < 0.0:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from service.compiled.jit import njit, njit_no_refcount
+from service.compiled.jit import njit, njit_inlined, njit_no_refcount
 from service.vectors import Vector, read_only
 
 CELL = 0.004
@@ -85,7 +85,7 @@ def build_star_buckets(direction: Vector) -> StarBuckets:
     )
 
 
-@njit_no_refcount
+@njit_inlined
 def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
     """The face of a direction and the block of cells within `gate` radians of it.
 
@@ -111,7 +111,7 @@ def cells_about(x, y, z, gate):  # type: ignore[no-untyped-def]
     )
 
 
-@njit_no_refcount
+@njit_inlined
 def nearest(px, py, pz, gate, start, rows, direction, used, taken):  # type: ignore[no-untyped-def]
     """The two stars nearest to a direction within `gate` radians, -1 where there is none.
 
