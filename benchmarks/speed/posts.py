@@ -17,7 +17,7 @@ import tempfile
 import threading
 import time
 import urllib.request
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
@@ -65,6 +65,8 @@ No share of theirs: a processor that slept makes them take 1.3 ms at one time an
 """
 STARTS, SEEN, LATER, PAUSE_S = 9, 40, 5, 0.05
 RIGHT = 0.98
+ALARM_LOAD, MOST_ALARM_S = 500, 0.5
+"""Posts a second beside those that raise an alarm."""
 
 
 @dataclass(frozen=True)
@@ -260,6 +262,68 @@ def _after_pause_ms(served: Served, body: bytes) -> float:
     return drive(served.port, [request(f"{API}/batches", body)], 1).waits_ms[0]
 
 
+def alarms(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[Bound]]:
+    """Seconds from a post to the alarm in the event stream that it causes, idle and under load."""
+    figures, bounds = {}, []
+    with (
+        service(folder / "alarms.db") as served,
+        urllib.request.urlopen(served.address(f"{API}/events"), timeout=60) as stream,
+    ):
+        warm(served, pass_)
+        alarm_times = _alarm_times(stream)
+        limit = {"warning": {"high": 0.01}, "minimum_count": 1, "duration_s": 0, "hysteresis": 0}
+        asked = urllib.request.Request(
+            served.address(f"{API}/spacecraft/XTE/limits/unmatched_share"),
+            json.dumps({"settings": limit, "who": "benchmark"}).encode(),
+            {"Content-Type": "application/json"},
+            method="PUT",
+        )
+        urllib.request.urlopen(asked, timeout=60).close()
+        for per_second in (1, ALARM_LOAD):
+            others = pass_.bodies(per_second * (4 if quick else 20), f"load-{per_second}")
+            load = [request(f"{API}/batches", _in_run(each, "load")) for each in others]
+            loading = threading.Thread(
+                target=lambda load=load, rate=per_second: drive(
+                    served.port, load, CONNECTIONS, per_second=rate
+                )
+            )
+            loading.start()
+            delays_s = []
+            while loading.is_alive():
+                # One batch leaves the limits, the next one is back in them.
+                for is_out in (True, False):
+                    body = pass_.body(len(delays_s), f"alarm-{per_second}-{len(delays_s)}-{is_out}")
+                    _posted(served, f"{API}/batches", [_with_a_false_star(body, is_out)])
+                    posted_s = time.perf_counter()
+                    delays_s.append(next(alarm_times) - posted_s)
+            loading.join()
+            name = f"alarm: seconds after its post, at {per_second} posts a second"
+            figures[f"{name}, median"] = median(delays_s)
+            figures[f"{name}, longest"] = max(delays_s)
+            bounds.append(at_most(f"{name}, longest", max(delays_s), MOST_ALARM_S, "s"))
+    return figures, bounds
+
+
+def _in_run(body: bytes, run: str) -> bytes:
+    return json.dumps(json.loads(body) | {"run": run}).encode()
+
+
+def _with_a_false_star(body: bytes, is_out: bool) -> bytes:
+    """A batch with, or without, a star that the catalog does not have."""
+    batch = json.loads(body)
+    stars = batch["observations"][0]["stars"]
+    if is_out:
+        stars.append({"vector": [0.02, 0.01, 0.9997499687421851], "magnitude": 1.0})
+    return json.dumps(batch).encode()
+
+
+def _alarm_times(stream: Iterable[bytes]) -> Iterator[float]:
+    """The moments at which alarms come in the event stream."""
+    for line in stream:
+        if line.startswith(b"event: alarm"):
+            yield time.perf_counter()
+
+
 def bulk(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any], list[Bound]]:
     """Bulk beside its ceiling, and the waits of single posts while it runs."""
     count = QUICK_BULK if quick else BULK
@@ -383,8 +447,9 @@ def run(quick: bool, seed: int) -> Report:
     pass_ = telemetry(seed)
     with tempfile.TemporaryDirectory() as folder:
         figures, bounds = singles(quick, pass_, Path(folder))
+        alarmed, of_alarms = alarms(quick, pass_, Path(folder))
         more, of_bulk = bulk(quick, pass_, Path(folder))
-    return Report("posts", figures | more, bounds + of_bulk)
+    return Report("posts", figures | alarmed | more, bounds + of_alarms + of_bulk)
 
 
 if __name__ == "__main__":
