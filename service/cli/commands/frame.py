@@ -53,7 +53,7 @@ def add(commands: Any) -> None:
         "--image",
         metavar="NAME",
         help="which image of a file with several: name or number of a FITS unit, :2 for the second "
-        "plane of a cube, the number of a TIFF page",
+        "plane of a cube, the number of an image of TIFF, PNG, GIF, JPEG (MPO) or .npy",
     )
     arguments.add_url_or_in_process(parser)
     parser.add_argument(
@@ -89,7 +89,7 @@ def _add_lens(parser: ArgumentParser) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, BMP, PGM, raw, .npy),
+    """Detect the stars in frames and pictures (FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, raw, .npy),
     identify them and solve for the attitude.  Frames of a spacecraft are recorded; one that is
     sent again returns the first answer.  Without a spacecraft a picture may be from any camera:
     its lens is fitted with the attitude, and nothing is recorded.

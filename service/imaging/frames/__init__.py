@@ -1,1 +1,1 @@
-"""Frames from image files: FITS, TIFF, PNG, JPEG, BMP, raw files and numpy arrays."""
+"""Frames from image files: FITS, TIFF, PNG, JPEG, GIF, BMP, raw files and numpy arrays."""

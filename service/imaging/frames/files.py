@@ -25,6 +25,7 @@ from service.errors import BadFile
 from service.imaging.frames.bounded_file import BoundedFile, decoding
 from service.imaging.frames.exif import timing_remarks
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
+from service.imaging.frames.several import MAX_IMAGES, Subfile, chosen_image
 
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -35,9 +36,9 @@ COLOURS = 3
 
 
 def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
-    """A frame from a .npy file of (rows, columns), or of three colours first or last.
+    """A frame from a .npy file of (rows, columns), or of planes or three colours beside them.
 
-    Of colours the counts are the sums.  Raises `BadFile`.
+    Of colours the counts are the sums; of planes one has to be chosen.  Raises `BadFile`.
     """
     try:
         version = np.lib.format.read_magic(file)
@@ -54,28 +55,50 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     if any(type(side) is not int for side in shape):
         # A truth value is a whole number of Python.
         raise bad_frame("must have a shape of whole numbers", str(shape)[:80])
-    colours = _colour_axis(shape)
-    height_px, width_px = (side for k, side in enumerate(shape) if k != colours)
+    axis, plane, remarks = _chosen_plane(shape, limits.image)
+    height_px, width_px = (side for k, side in enumerate(shape) if k != axis)
     limits.require(width_px, height_px)
-    count = width_px * height_px * (1 if colours is None else COLOURS)
+    count = width_px * height_px
+    if axis is not None and plane is not None and not by_column:
+        file.seek(file.tell() + plane * count * dtype.itemsize)
+        shape, axis = (height_px, width_px), None
+    else:
+        count = math.prod(shape)
     data = file.exactly(count * dtype.itemsize)
     order = "F" if by_column else "C"
     values = np.frombuffer(data, dtype).reshape(shape, order=order)  # type: ignore[call-overload]
     full_scale = full_scale_of(values.dtype)
-    if colours is not None:
+    if axis is not None and plane is not None:
+        values = values[plane]
+    elif axis is not None:
         wide = np.int64 if dtype.kind in "iu" and dtype.itemsize < 8 else np.float64
-        values, full_scale = values.sum(axis=colours, dtype=wide), COLOURS * full_scale
-    return Frame(as_counts(values), "NPY", digest, full_scale)
+        values, full_scale = values.sum(axis=axis, dtype=wide), COLOURS * full_scale
+    return Frame(as_counts(values), "NPY", digest, full_scale, remarks=remarks)
 
 
-def _colour_axis(shape: tuple[int, ...]) -> int | None:
-    """The axis of three colours, None without one; raises `BadFile` for another number of axes."""
+def _chosen_plane(
+    shape: tuple[int, ...], choice: str | None
+) -> tuple[int | None, int | None, tuple[str, ...]]:
+    """The axis of the planes of an array, the plane that was chosen from 0, and remarks.
+
+    Without a plane three of them are colours to sum.  Raises `BadFile` for another number of axes,
+    and for several planes of which none is chosen.
+    """
+    number = None if choice is None else choice.removeprefix(":")
     if len(shape) == 2:
-        return None
-    if len(shape) == 3 and COLOURS in (shape[0], shape[2]):
-        return 2 if shape[2] == COLOURS else 0
-    message = "must have two dimensions, rows and columns, or a third of three colours"
-    raise bad_frame(message, str(shape)[:80])
+        chosen_image([Subfile(shape[1], shape[0])], number)
+        return None, None, ()
+    is_stack = len(shape) == 3 and 1 <= shape[0] <= MAX_IMAGES
+    if not is_stack and not (len(shape) == 3 and shape[2] == COLOURS):
+        message = "must have two dimensions, rows and columns, or a third of three colours"
+        raise bad_frame(message, str(shape)[:80])
+    if number is None and COLOURS in (shape[0], shape[2]):
+        axis = 2 if shape[2] == COLOURS else 0
+        return axis, None, ("image: its three planes were summed as colours",)
+    if not is_stack:
+        raise bad_frame("holds one image in colour; there is none to choose", choice)
+    plane, remarks = chosen_image([Subfile(shape[2], shape[1])] * shape[0], number)
+    return 0, plane, remarks
 
 
 def as_counts(values: npt.NDArray[Any]) -> CountArray:
@@ -91,7 +114,7 @@ def full_scale_of(dtype: np.dtype[Any]) -> float:
 
 Reader = Callable[[BoundedFile, FrameLimits, str], Frame]
 
-FORMATS = "FITS, TIFF, PNG, JPEG, BMP, PGM, a camera's raw file or a numpy array (.npy)"
+FORMATS = "FITS, TIFF, PNG, JPEG, GIF, BMP, PGM, a camera's raw file or a numpy array (.npy)"
 _PDS3 = "a PDS3 file; write its image as FITS, TIFF or .npy (with pdr, GDAL or ISIS)"
 OTHERS: Mapping[bytes, str] = {
     b"LUCAM-RECORDER": "a SER video; export one frame of it as FITS or TIFF",
@@ -185,6 +208,7 @@ _READERS: Mapping[tuple[bytes, ...], Reader] = {
     (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"): _later("tiff:read_tiff"),
     (b"\x89PNG\r\n\x1a\n",): _later("pictures:read_picture", "PNG"),
     (b"\xff\xd8\xff",): _later("pictures:read_picture", "JPEG"),
+    (b"GIF87a", b"GIF89a"): _later("pictures:read_picture", "GIF"),
     (b"BM",): _later("pictures:read_picture", "BMP"),
     (b"P2", b"P3", b"P5", b"P6"): _later("pictures:read_picture", "PGM"),
     (b"\x93NUMPY",): read_npy,
@@ -232,6 +256,8 @@ def _has_tags_of_raw(file: BoundedFile, order: str) -> bool:
 
 def read_raw(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """The frame in a camera's raw file; raises `BadFile` with what is wrong with it."""
+    if limits.image not in (None, "1"):
+        raise bad_frame("is a camera's raw file; there is no image to choose", limits.image)
     if not importlib.util.find_spec("rawpy"):
         raise bad_frame(ABSENT)
     import rawpy

@@ -1,4 +1,4 @@
-"""Frames from PNG, JPEG, BMP and PGM files: grey or colours of up to 16 bits."""
+"""Frames from PNG, JPEG, GIF, BMP and PGM files: grey or colours of up to 16 bits."""
 
 import re
 import sys
@@ -19,6 +19,7 @@ from service.imaging.frames.exif import (
 from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
+from service.imaging.frames.several import part_of_jpeg, sought_frame
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "F")
 """Pillow's words for one channel of light."""
@@ -32,14 +33,14 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
 
     Of a colour picture the counts are the sums of red, green and blue.
     """
-    if limits.image not in (None, "1"):
-        raise bad_frame("holds one image; there is none to choose", limits.image)
     if file_format == "JPEG":
-        require_small_exif(file)
+        file, remarks = _one_jpeg(file, limits)
     with decoding(file_format), _opened(file, file_format) as image:
         limits.require_either_way(*image.size)
-        if file_format == "PNG" and getattr(image, "is_animated", False):
-            raise bad_frame("is a moving picture; send one picture of it")
+        if file_format != "JPEG":
+            number, remarks = sought_frame(image, file, limits)
+            if number and image.mode not in (*COLORS, "L"):
+                raise bad_frame("is a moving picture of 16 bits, of which the first can be read")
         # To look for EXIF may decode the picture, and takes the word of its depth away.
         deep, grey, plain = is_deep(image), is_deep_grey(image), _is_plain(image)
         tag = exif_of(image).get(TAG)
@@ -61,8 +62,19 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
     return Frame(
         *(counts, file_format, digest, full_scale, time, exposure_s),
         orientation=orientation,
-        remarks=tuple(timing_remarks(time, exposure_s)),
+        remarks=(*remarks, *timing_remarks(time, exposure_s)),
     )
+
+
+def _one_jpeg(file: BoundedFile, limits: FrameLimits) -> tuple[BoundedFile, tuple[str, ...]]:
+    """The data of one image of a JPEG file, which may hold several (MPO), and remarks."""
+    require_small_exif(file)
+    with decoding("JPEG"), _opened(file, "JPEG") as image:
+        part = part_of_jpeg(image, file, limits.image)
+    if part is None:
+        return file, ()
+    require_small_exif(part[0])
+    return part
 
 
 def _opened(file: BoundedFile, file_format: str) -> Any:
@@ -100,6 +112,8 @@ def _plain_light(image: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float
     colours, kind = (3 if mode == "RGB" else 1), np.dtype(">u2" if largest > 255 else "u1")
     file.seek(at)
     data = file.exactly(image.width * image.height * colours * kind.itemsize)
+    if file.read(2) in _MAGICS:
+        raise bad_frame("holds several images; write the one that is meant to a file of its own")
     values = np.frombuffer(data, kind).reshape(image.height, image.width, colours)
     return values.sum(axis=2, dtype=np.uint32), float(colours * largest)
 
@@ -119,6 +133,7 @@ def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
     return channels.sum(axis=2, dtype=np.uint16), 3.0 * 255.0
 
 
+_MAGICS = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6")
 _DEEP = re.compile(r"(RGB[AX]?;16)([BLN])")
 _DEEP_GREY, _FOUR_BYTES = "LA;16B", "RGBA"
 """Both have four bytes a pixel; the second keeps them as they are."""

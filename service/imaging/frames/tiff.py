@@ -9,7 +9,7 @@ import logging
 import math
 import struct
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,12 +28,20 @@ from service.imaging.frames.exif import (
 from service.imaging.frames.files import as_counts, full_scale_of
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame
 from service.imaging.frames.jpeg import require_whole
+from service.imaging.frames.several import (
+    MAX_IMAGES,
+    Subfile,
+    chosen_image,
+    planes_described,
+    require_few,
+)
 
-MAX_TAGS, MAX_PAGES = 256, 256
+MAX_TAGS = 256
 MAX_TAG_BYTES = 1 << 20
 MAX_TILE_PIXELS = 1 << 22
 MAX_SAMPLES = 8
 _SUBFILE, _TILE_WIDTH, _TILE_LENGTH = 254, 322, 323
+_DESCRIPTION, _SAMPLES, _META_MORPH = 270, 277, 33629
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _FILTER_PATTERN, _LINEAR_RAW = 0, 1, 2, 32803, 34892
 _GREYS = (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _FILTER_PATTERN)
 _BY_PILLOW = {3: "palette", 5: "CMYK", 6: "YCbCr"}
@@ -54,21 +62,24 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     """
     from tifffile import TiffFile
 
-    number, remarks = chosen_page(_subfiles(file), limits.image)
+    subfiles, planes = _subfiles(file)
+    number, remarks = chosen_image(subfiles, limits.image)
     file.seek(0)
     with (
         decoding("TIFF"),
         TiffFile(file.stream, name="frame", _multifile=False, is_ndpi=False) as opened,
     ):
-        page: Any = opened.pages[number]
+        page: Any = opened.pages[0 if planes > 1 else number]
         _require_readable(page, limits)
+        if planes > 1:
+            _move_to_plane(page, number)
         tag = page.tags.valueof(TAG)
         time, exposure_s = _page_exposure(page)
         if page.photometric in _BY_PILLOW or page.compression == _JPEG:
             if page.compression == _JPEG:
                 _require_whole_segments(page, file, limits)
             # Pillow turns what it decodes by itself.
-            counts, full_scale = _by_pillow(file, number)
+            counts, full_scale = _by_pillow(file, 0 if planes > 1 else number)
             _, orientation = as_shown(np.zeros((1, 1)), tag)
         else:
             stored, full_scale = _light(page, file)
@@ -79,35 +90,6 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         orientation=orientation,
         remarks=(*remarks, *timing_remarks(time, exposure_s)),
     )
-
-
-class Subfile(NamedTuple):
-    """One directory of a TIFF: its size, and whether it is a smaller copy or a mask of another."""
-
-    width_px: int
-    height_px: int
-    is_auxiliary: bool
-
-
-def chosen_page(subfiles: list[Subfile], choice: str | None) -> tuple[int, tuple[str, ...]]:
-    """The number of the page that holds the frame, from 0, and remarks on the choice.
-
-    Raises `BadFile` where several may be meant and none is chosen; choices count from 1.
-    """
-    if choice is not None:
-        if choice.isdecimal() and 1 <= int(choice) <= len(subfiles):
-            return int(choice) - 1, (f"image: {choice} of {len(subfiles)} was chosen",)
-        raise bad_frame(f"holds the images 1 to {len(subfiles)}; choose one of them", choice[:40])
-    whole = [k for k, each in enumerate(subfiles) if not each.is_auxiliary] or [0]
-    if len(whole) > 1:
-        sizes = ", ".join(
-            f"{k + 1}: {subfiles[k].width_px} x {subfiles[k].height_px}" for k in whole
-        )
-        raise bad_frame(
-            f"holds several images; choose one by its number ({sizes[:120]})",
-            f"{len(whole)} images",
-        )
-    return whole[0], ()
 
 
 def _require_readable(page: Any, limits: FrameLimits) -> None:
@@ -145,6 +127,22 @@ def _require_readable(page: Any, limits: FrameLimits) -> None:
     if page.predictor != _NO_PREDICTOR and page.compression in (_PLAIN, _PACK_BITS):
         # Some readers ignore it there, and some do not.
         raise bad_frame("has a predictor with a compression that takes none", compression)
+
+
+def _move_to_plane(page: Any, number: int) -> None:
+    """Let a page of one directory be one of the planes that lie behind each other in the file.
+
+    Raises `BadFile` where they are compressed, or their strips not one behind the other.
+    """
+    ends = [at + size for at, size in zip(page.dataoffsets, page.databytecounts, strict=True)]
+    if page.compression != _PLAIN or list(page.dataoffsets[1:]) != ends[:-1]:
+        raise bad_frame("holds several images in a layout that is not read; save them as pages")
+    # Some writers state the bytes of all planes for the first.
+    pixel_bytes = page.samplesperpixel * page.dtype.itemsize
+    plane_bytes = page.imagewidth * page.imagelength * pixel_bytes
+    if len(page.databytecounts) == 1:
+        page.databytecounts = (plane_bytes,)
+    page.dataoffsets = tuple(at + number * plane_bytes for at in page.dataoffsets)
 
 
 def _word(value: Any) -> str:
@@ -333,8 +331,10 @@ def _page_exposure(page: Any) -> tuple[str | None, float | None]:
     return exif_exposure(*(exif.get(name) for name in names))
 
 
-def _subfiles(file: BoundedFile) -> list[Subfile]:
-    """The directories of a TIFF; raises `BadFile` where tags alone would take much memory.
+def _subfiles(file: BoundedFile) -> tuple[list[Subfile], int]:
+    """The images of a TIFF, and how many planes its only directory has; 1: each has its own.
+
+    Raises `BadFile` where tags alone would take much memory.
 
     Every tag is read whole before anything can be asked of it; many tags may
     point to the same bytes of a file.
@@ -346,8 +346,8 @@ def _subfiles(file: BoundedFile) -> list[Subfile]:
     try:
         (at,) = struct.unpack_from(order + ("8xQ" if big else "4xL"), start)
         while at:
-            if len(subfiles) == MAX_PAGES:
-                raise bad_frame(f"holds more than {MAX_PAGES} images, or its directories loop")
+            if len(subfiles) == MAX_IMAGES:
+                raise bad_frame(f"holds more than {MAX_IMAGES} images, or its directories loop")
             entries = directory(file, order, at, big)
             _require_small(order, entries)
             (at,) = struct.unpack(order + ("Q" if big else "L"), file.read(8 if big else 4))
@@ -357,12 +357,31 @@ def _subfiles(file: BoundedFile) -> list[Subfile]:
             )
             if bytes_beyond(file, order, entries, big=big) > MAX_EXIF_BYTES:
                 raise bad_frame(f"has more than {MAX_EXIF_BYTES} bytes of EXIF")
+        planes = _planes(file, order, entries, subfiles[0]) if len(subfiles) == 1 else 1
     except struct.error:
         kind = "BigTIFF" if big else "TIFF"
         raise bad_frame(
             f"is cut off: its {kind} directory lies beyond its {file.length} bytes"
         ) from None
-    return subfiles
+    return (subfiles * planes, planes)
+
+
+def _planes(file: BoundedFile, order: str, entries: list[Entry], image: Subfile) -> int:
+    """The images behind the only directory of a file, as ImageJ, tifffile and MetaMorph write."""
+    found = {entry.tag: entry for entry in reversed(entries)}
+    planes = found[_META_MORPH].number if _META_MORPH in found else 1
+    if _DESCRIPTION in found:
+        entry = found[_DESCRIPTION]
+        text = entry.value[: entry.size_bytes]
+        if entry.size_bytes > len(entry.value):
+            (at,) = struct.unpack(order + ("Q" if len(entry.value) == 8 else "L"), entry.value)
+            file.seek(at)
+            text = file.read(entry.size_bytes)
+        samples = found[_SAMPLES].whole(order) if _SAMPLES in found else 1
+        pixels = image.width_px * image.height_px * samples
+        planes = max(planes, planes_described(text, pixels))
+    require_few(planes)
+    return planes
 
 
 def _require_small(order: str, entries: list[Entry]) -> None:

@@ -69,8 +69,9 @@ class FrameQuery(Query):
         str | None,
         Field(
             description="Which image of a file with several: the name or number of a FITS unit, "
-            "`:2` for the second plane of a cube, the number of a TIFF page from 1. Default: the "
-            "first of a FITS file; a TIFF with several is refused.",
+            "`:2` for the second plane of a cube, the number from 1 of a page or plane of TIFF "
+            "(also of ImageJ and OME), of PNG, GIF, JPEG (MPO) or .npy. Default: the first of a "
+            "FITS file; another file with several is refused.",
             examples=["SCI"],
         ),
     ] = None

@@ -127,6 +127,7 @@ async function solve() {
   const query = new URLSearchParams({ overlay: "true" });
   if (element("camera").value) query.set("spacecraft", element("camera").value);
   if (element("field").value) query.set("field_of_view_deg", element("field").value);
+  if (element("image").value.trim()) query.set("image", element("image").value.trim());
   const button = form.querySelector("button.main");
   button.disabled = true;
   for (const part of ["found", "failed", "record"]) if (element(part)) element(part).hidden = true;
@@ -168,6 +169,7 @@ element("record-form")?.addEventListener("submit", (event) => {
   event.preventDefault();
   attempt(event.target.querySelector("button"), element("record-status"), async () => {
     const query = new URLSearchParams();
+    if (element("image").value.trim()) query.set("image", element("image").value.trim());
     for (const name of ["time", "batch"]) {
       if (element(`record-${name}`).value) query.set(name, element(`record-${name}`).value);
     }
