@@ -73,7 +73,7 @@ def part_of_jpeg(
         image.seek(number)
         places.append(int(image.offset))
         is_smaller = image.width < first[0] and image.height < first[1]
-        sizes.append(Subfile(*image.size, is_auxiliary=number > 0 and is_smaller))
+        sizes.append(Subfile(image.width, image.height, number > 0 and is_smaller))
     number, remarks = chosen_image(sizes, choice)
     file.seek(places[number])
     end = next((place for place in sorted(places) if place > places[number]), file.length)
