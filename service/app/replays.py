@@ -20,7 +20,13 @@ from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
-from service.observations.decompress import Coding, unpacked_lines
+from service.observations.decompress import Coding, Line, unpacked_lines
+from service.observations.telemetry import (
+    TelemetryForm,
+    TelemetryFormat,
+    read_lines,
+    require_telemetry,
+)
 from service.packets.reader import PacketLines
 from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries import replays
@@ -60,8 +66,8 @@ class UploadForm:
     coding: Coding
     longest_bytes: int
     """A line is cut there."""
-    is_packets: bool = False
-    """An archive of space packets and their XTCE file, in place of lines."""
+    form: TelemetryForm = "lines"
+    """`packets` is an archive of space packets and their XTCE file."""
     spacecraft: str | None = None
     """The mission whose packets are read; None: the only one that reads packets."""
 
@@ -126,13 +132,18 @@ class Replays:
     ) -> str:
         """`start` with the lines of an upload, which is stored until the replay is over.
 
-        Raises `BadInput` for packets that the mission's table and the XTCE file do not fit.
+        Raises `BadInput` for packets that the mission's table and the XTCE file do not fit, and
+        for CSV without the columns of a batch.
         """
         bound = None if caller.spacecraft is None else sorted(caller.spacecraft)
         options |= {"check": caller.require, "owner": caller.token_id}
         with ExitStack() as on_failure:
             on_failure.callback(discard_upload, file)
             packets = self._packet_lines(file, form)
+            if packets is None and form.coding == "identity":
+                file.flush()
+                kind: TelemetryFormat = "csv" if form.form == "csv" else "ndjson"
+                require_telemetry(Path(file.name), kind, "body")
             replay = self._new(run, options, drop=self._spool.drop)
             on_failure.callback(replay.release_slot)
             about = SpooledReplay(
@@ -143,11 +154,12 @@ class Replays:
                 caller.name,
                 bound,
                 packets.spacecraft if packets else None,
+                form.form == "csv",
             )
             on_failure.callback(self._spool.drop, replay.id)
             self._spool.keep(file, about)
             file.seek(0)
-            lines = packets or _lines_of(file, about, replay)
+            lines = packets or self._lines_of(file, about, replay)
             replay.start(lines, _stored_with(run, options))
             on_failure.pop_all()
         return replay.id
@@ -186,14 +198,21 @@ class Replays:
         file = self._spool.open(about.id)
         replay = self._new(stored.run, options, stored, self._spool.drop)
         log.info("replay %s continues after line %d", about.id, stored.lines.done)
-        form = UploadForm(
-            about.coding, about.longest_bytes, about.packets is not None, about.packets
-        )
-        replay.resume(self._packet_lines(file, form) or _lines_of(file, about, replay))
+        kind: TelemetryForm = "lines" if about.packets is None else "packets"
+        form = UploadForm(about.coding, about.longest_bytes, kind, about.packets)
+        replay.resume(self._packet_lines(file, form) or self._lines_of(file, about, replay))
+
+    def _lines_of(
+        self, file: IO[bytes], about: SpooledReplay, replay: RunningReplay
+    ) -> Iterable[bytes | Line]:
+        if not about.is_csv:
+            return unpacked_lines(file, about.coding, about.longest_bytes, replay.require_going_on)
+        file.close()
+        return read_lines(self._spool.path(about.id), "csv")
 
     def _packet_lines(self, file: IO[bytes], form: UploadForm) -> PacketLines | None:
         """The batches of packets; None for an upload of lines."""
-        if not form.is_packets:
+        if form.form != "packets":
             return None
         return PacketLines(file, self._context.missions, form.spacecraft)
 
@@ -314,10 +333,6 @@ def discard_upload(file: IO[bytes]) -> None:
     """Remove an upload for which no replay was started."""
     file.close()
     Path(file.name).unlink(missing_ok=True)
-
-
-def _lines_of(file: IO[bytes], about: SpooledReplay, replay: RunningReplay) -> Iterable[bytes]:
-    return unpacked_lines(file, about.coding, about.longest_bytes, replay.require_going_on)
 
 
 def _stored_with(run: str, options: ReplayOptions) -> Callable[[Connection], None]:

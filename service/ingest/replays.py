@@ -114,6 +114,12 @@ class ProgressRecorder:
         self._counts["attitudes"] += bytes(answer.attitude) != b"null"
         self._counts.update(answer.counts)
 
+    @property
+    def has_recorded(self) -> bool:
+        """True if a batch or a gyro block of the file is recorded."""
+        recorded = ("new", "repeated", "gyro_new", "gyro_repeated")
+        return any(self._counts[name] for name in recorded)
+
     def refuse(self, number: int, error: Exception, *, ends: bool = False) -> None:
         """Count a refused line; an error that `ends` the replay is kept in any case."""
         self._refused += 1
@@ -447,11 +453,19 @@ class RunningReplay:
                 # After a damaged line the chunks before it are still written.
                 if not self._stopping.is_set():
                     self._write_until(0)
-            return "interrupted" if self._computing else "done"
+            if self._computing:
+                return "interrupted"
+            return "done" if self._finished_all() else "failed"
         finally:
             for pending in self._computing:
                 pending.chunk.cancel()
             self._finish(self._writing)
+
+    def _finished_all(self) -> bool:
+        """True if something is recorded once the last chunk is written."""
+        self._finish(self._writing)
+        self._writing = None
+        return self._progress.has_recorded
 
     def _begin(self, texts: list[bytes]) -> BulkChunk:
         return self._bulk.begin(texts, self._progress.run, self._check, self.require_going_on)

@@ -36,6 +36,8 @@ class SpooledReplay:
     """The spacecraft that the token is bound to; None: all."""
     packets: str | None = None
     """The spacecraft whose space packets the file holds; None: the file has lines."""
+    is_csv: bool = False
+    """True if the lines are CSV rows."""
 
 
 class Spool:
@@ -89,9 +91,13 @@ class Spool:
         if held is not None:
             held.close()
 
+    def path(self, id: str) -> Path:
+        """The place of the file of a replay."""
+        return (self._folder / id).with_suffix(LINES)
+
     def open(self, id: str) -> IO[bytes]:
         """The file of a replay; raises `OSError` where it is gone."""
-        return (self._folder / id).with_suffix(LINES).open("rb")
+        return self.path(id).open("rb")
 
     def ids(self) -> set[str]:
         """The replays whose files are there."""

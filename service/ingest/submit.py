@@ -35,6 +35,7 @@ from service.storage.recording.identity import (
     look_up,
 )
 from service.storage.recording.results import record
+from service.storage.recording.signatures import naming_result
 from service.storage.recording.unsaved_result import Answered, UnsavedResult, unsaved_what_if
 from service.storage.recording.writer import WriteOutcomes
 from service.storage.store import Store
@@ -301,16 +302,18 @@ class SubmissionService:
         if not (record or adopt):
             answer = answer_of(acquisition, id=None, parent=id, recorded=False)
             return Answered(None, msgspec.json.encode(answer), replayed=False)
+        result_id = self.solver.ids.new()
         unsaved = unsaved_what_if(
             acquisition,
-            id=self.solver.ids.new(),
+            id=result_id,
             batch_id=parent["batch_id"],
             parent=id,
             adopt=adopt,
             created=utc_now(),
         )
         if entry is not None:
-            unsaved.audit = entry.row()
+            named = replace(entry, body=naming_result(entry.body, result_id))
+            unsaved.audit = named.row()
         unsaved.handed_over_ns = time.perf_counter_ns()
         (outcome,) = decided(self._store.writer.record([unsaved]))
         if isinstance(outcome, AcquisitionError):

@@ -22,6 +22,8 @@ from service.observations.decompress import Line, physical_lines
 from service.times import parse_utc
 
 TelemetryFormat = Literal["ndjson", "csv"]
+TelemetryForm = Literal["lines", "csv", "packets"]
+"""The forms of an upload: NDJSON, CSV, or an archive of space packets."""
 
 _LOOKED_AT_BYTES, _LOOKED_AT_LINES = 1 << 16, 20
 _PACKED = {b"\x1f\x8b": ("gzip", "gunzip"), b"\x28\xb5\x2f\xfd": ("zstd", "unzstd")}
@@ -50,24 +52,27 @@ def read_lines(source: Path | BinaryIO, form: TelemetryFormat | None = None) -> 
             yield from physical_lines(stream)
 
 
-def require_telemetry(path: Path) -> None:
+def require_telemetry(
+    path: Path, form: TelemetryFormat | None = None, field: str | None = None
+) -> None:
     """Raise `BadFile` for a file that cannot be opened or that is no telemetry at all.
 
-    That is told by its first bytes.  Single bad lines are no matter of this.
+    That is told by its first bytes.  Single bad lines are no matter of this.  Faults name the
+    path, or `field` in its place.
     """
-    form = telemetry_format(path)
+    form, field = form or telemetry_format(path), field or str(path)
     with _opened(path, form) as stream:
         start = stream.read(_LOOKED_AT_BYTES).removeprefix(codecs.BOM_UTF8)
     message = _not_telemetry(start, form)
     if message is not None:
         shown = shown_value(start[:_SHOWN_BYTES]) if start.strip() else None
-        raise BadFile(Fault(str(path), message, shown))
+        raise BadFile(Fault(field, message, shown))
     if form == "csv":
         try:
-            next(read_lines(path), None)
+            next(read_lines(path, form), None)
         except BadFile as error:
             raise BadFile(
-                Fault(f"{path}: {each.field}", each.message, each.value) for each in error.faults
+                Fault(f"{field}: {each.field}", each.message, each.value) for each in error.faults
             ) from None
 
 

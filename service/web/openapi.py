@@ -26,7 +26,7 @@ from service.web.middleware import API
 from service.web.requests.access import POLICIES
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
 from service.web.requests.query_parameters import NO_QUERY, TIME_SCHEMA
-from service.web.requests.request_body import BINARY, FRAMES, JSON, NDJSON, PACKETS
+from service.web.requests.request_body import BINARY, CSV, FRAMES, JSON, NDJSON, PACKETS
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -155,6 +155,8 @@ class ApiRouter(APIRouter):
             lines = {"schema": _BINARY | {"description": description}}
             content, reading = dict.fromkeys((NDJSON[0], BINARY), lines), READING_NDJSON
             if archive is not None:
+                rows = "One star or one gyro sample a row; `.csv` or `.tsv` of `acquire replay`."
+                content[CSV] = {"schema": _BINARY | {"description": rows}}
                 content[PACKETS] = {"schema": _BINARY | {"description": archive}}
         if frame:
             file = {"schema": _BINARY}

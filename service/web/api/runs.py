@@ -156,15 +156,16 @@ def start_replay(
 ) -> Response:
     """Accept a telemetry file and process it in the background.
 
-    The body has one batch per line, or is a tar archive of CCSDS space packets and the XTCE file
-    that describes them.
+    The body has one batch per line, or one star per row of a CSV table, or is a tar archive of
+    CCSDS space packets and the XTCE file that describes them. A file of which nothing is recorded
+    ends as `failed`.
     """
     query, body = upload.query, upload.body
-    if query.spacecraft is not None and not body.is_packets:
+    if query.spacecraft is not None and body.form != "packets":
         discard_upload(body.file)
         message = "goes with space packets; a batch names its own spacecraft"
         raise BadBatch(Fault("spacecraft", message, shown_value(query.spacecraft)))
-    form = UploadForm(body.coding, request_body.MAX_JSON_BYTES, body.is_packets, query.spacecraft)
+    form = UploadForm(body.coding, request_body.MAX_JSON_BYTES, body.form, query.spacecraft)
     id = app.replays.start_upload(
         body.file,
         form,

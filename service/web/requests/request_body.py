@@ -23,6 +23,7 @@ from starlette.types import Scope
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
 from service.observations.schema import checked_by
+from service.observations.telemetry import TelemetryForm
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
@@ -32,6 +33,7 @@ FRAMES = ("application/fits", "image/fits", "image/tiff", "image/png", "applicat
 NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
 """Generated clients can send the last one: most know no type for lines."""
 PACKETS = "application/x-tar"
+CSV = "text/csv"
 """Files of space packets with their XTCE file."""
 
 MAX_JSON_BYTES = 2 << 20
@@ -199,18 +201,19 @@ class Spooled:
     file: IO[bytes]
     coding: Coding
     lines: int | None
-    is_packets: bool = False
+    form: TelemetryForm = "lines"
 
 
 async def telemetry_body(
     request: Request, new_file: Callable[[], IO[bytes]], discard: Callable[[IO[bytes]], object]
 ) -> Spooled:
-    """A body of lines or of packets in a new file; one that did not arrive is discarded.
+    """A body of lines, CSV or packets in a new file; one that did not arrive is discarded.
 
     Lines (NDJSON) may be compressed.
     """
-    is_packets = _require_type(request, (*NDJSON, PACKETS)) == PACKETS
-    coding = _coding(request, ("identity",) if is_packets else ("identity", "gzip", "zstd"))
+    kind = _require_type(request, (*NDJSON, CSV, PACKETS))
+    form: TelemetryForm = "packets" if kind == PACKETS else "csv" if kind == CSV else "lines"
+    coding = _coding(request, ("identity", "gzip", "zstd") if form == "lines" else ("identity",))
     limits: BodyLimits = request.app.state.limits
     file = new_file()
     lines, last = 0, b"\n"
@@ -228,8 +231,8 @@ async def telemetry_body(
         discard(file)
         raise BadBatch(Fault("body", "has no lines; it must hold one batch per line"))
     file.seek(0)
-    if is_packets:
-        return Spooled(file, coding, None, is_packets)
+    if form != "lines":
+        return Spooled(file, coding, None, form)
     # The last line may lack its newline.
     return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
 

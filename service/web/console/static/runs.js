@@ -2,6 +2,7 @@
 import { refreshSoon } from "./live_updates.js";
 import { attempt, send } from "./actions.js";
 
+const KINDS = { csv: "text/csv", tsv: "text/csv", tar: "application/x-tar" };
 const message = document.getElementById("message");
 
 document.getElementById("replay").addEventListener("submit", (event) => {
@@ -10,10 +11,11 @@ document.getElementById("replay").addEventListener("submit", (event) => {
   attempt(event.submitter, message, async () => {
     const query = new URLSearchParams({ run: run.value.trim() });
     if (alarms.checked) query.set("alarms", "true");
-    const headers = { "Content-Type": "application/x-ndjson" };
+    const ending = file.files[0].name.split(".").at(-1).toLowerCase();
+    const headers = { "Content-Type": KINDS[ending] ?? "application/x-ndjson" };
     const replay = await send("POST", `/api/v1/replays?${query}`, file.files[0], headers);
     refreshSoon();
-    return `Replaying ${file.files[0].name}: ${replay.lines.total} lines into run ${replay.run}.`;
+    return `Replaying ${file.files[0].name} into run ${replay.run}.`;
   });
 });
 
