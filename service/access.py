@@ -34,6 +34,7 @@ from service.errors import (
 from service.missions.mission import Mission, mission_named
 from service.storage.models.base import Id, Page, Record, Stamp, doc, list_record, page_record
 from service.storage.recording.ids import Ulids
+from service.storage.recording.signatures import signed_in
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import access_sessions, access_tokens, audit
 from service.times import DAY_S, Utc, shifted, utc_now
@@ -88,6 +89,8 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     about: Annotated[str, doc("Path and query of the request.")]
     body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
     status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
+    person: Annotated[str, doc("Who signed the request; without a signature the token's name.")]
+    reason: Annotated[str | None, doc("The comment or the note that was sent with it.")]
 
 
 AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")
@@ -127,13 +130,42 @@ def _kept(body: str | None) -> str | None:
     return body[: MAX_BODY_KEPT - 1] + "…"
 
 
-def list_entries(connection: Connection, limit: int, cursor: str | None) -> Page[AuditEntry]:
-    """The entries, newest first; a cursor is the id of the last one shown."""
-    query = select(audit).order_by(audit.c.id.desc()).limit(limit + 1)
-    if cursor is not None:
-        query = query.where(audit.c.id < cursor)
-    rows = [AuditEntry(**row) for row in connection.execute(query).mappings()]
-    return Page(rows[:limit], rows[limit - 1].id if len(rows) > limit else None)
+READ_AT_ONCE = 500
+
+
+def list_entries(
+    connection: Connection,
+    limit: int,
+    cursor: str | None,
+    *,
+    person: str = "",
+    action: str = "",
+    about: str = "",
+) -> Page[AuditEntry]:
+    """The entries, newest first; a cursor is the id of the last one shown.
+
+    `person` signed them or is the token's name; `action` and `about` are parts of theirs.
+    """
+    query = select(audit).order_by(audit.c.id.desc()).limit(READ_AT_ONCE)
+    if action:
+        query = query.where(audit.c.action.contains(action, autoescape=True))
+    if about:
+        query = query.where(audit.c.about.contains(about, autoescape=True))
+    found: list[AuditEntry] = []
+    while len(found) <= limit:
+        older = query if cursor is None else query.where(audit.c.id < cursor)
+        rows = [_entry(row) for row in connection.execute(older).mappings()]
+        found += [each for each in rows if person in ("", each.person, each.who)]
+        if len(rows) < READ_AT_ONCE:
+            break
+        cursor = rows[-1].id
+    return Page(found[:limit], found[limit - 1].id if len(found) > limit else None)
+
+
+def _entry(row: Any) -> AuditEntry:
+    """A stored entry with the signature in its body, if that has one."""
+    who, reason = signed_in(row["body"])
+    return AuditEntry(**row, person=who or row["who"], reason=reason)
 
 
 SCOPES: tuple[Scope, ...] = get_args(Scope)

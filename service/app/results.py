@@ -26,6 +26,7 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period
 from service.storage.queries.results import (
     OutcomeName,
+    ResultPlace,
     StatusName,
     batch_with_options,
     merged_options,
@@ -38,6 +39,7 @@ from service.storage.queries.results import (
 from service.storage.queries.star_field import StarField, star_field_of, tracker_comparison
 from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.ids import is_ulid
+from service.storage.recording.signatures import signature_of
 from service.storage.recording.unsaved_result import LIVE, Answered
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now
@@ -53,7 +55,12 @@ class Results:
     def get(self, id: str) -> Result:
         """One result: `answer`, `input`, `current`, `parent`, and the `what_ifs` of its batch."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, archived):
-            return results.read_record(connection, id, archived=archived)
+            record = results.read_record(connection, id, archived=archived)
+        if record.parent is None:
+            return record
+        with self._context.reading() as connection:
+            signature = signature_of(connection, record.parent, id)
+        return structs.replace(record, signature=signature)
 
     def latest(self, spacecraft: str, run: str | None = None) -> Result:
         """The newest current result of a spacecraft in a run, by batch time; as `get`.
@@ -109,6 +116,13 @@ class Results:
         """The results before and after one in time: `earlier` and `later`, or None."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             place = place_of(connection, id)
+        with self._context.reading_record() as connection:
+            return neighbours(connection, self._context.store.archive, place)
+
+    def around(self, moment: Utc, run: str, spacecraft: str | None = None) -> Neighbours:
+        """The latest result of a run until a time, and the first one after it."""
+        # One nanosecond later, so that a batch at the time itself is `earlier`.
+        place = ResultPlace(spacecraft, run, moment.tai_ns + 1, None)
         with self._context.reading_record() as connection:
             return neighbours(connection, self._context.store.archive, place)
 

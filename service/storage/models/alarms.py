@@ -181,7 +181,10 @@ class AlarmSummary(Record, frozen=True, kw_only=True):
     open: int
     acknowledged: int
     shelved: int
-    worst: Annotated[SeverityName | None, doc("Worst severity of the alarms that are not shelved.")]
+    worst: Annotated[
+        SeverityName | None,
+        doc("Worst present severity of the alarms that are not shelved; null: none is out."),
+    ]
 
 
 class Annotation(Record, frozen=True, kw_only=True):

@@ -354,6 +354,14 @@ class Summary(Record, frozen=True, kw_only=True):
 BatchPage = page_record("BatchPage", Summary, "A page of results.")
 
 
+class Signature(Record, frozen=True, kw_only=True):
+    """Who recorded or adopted a what-if, when and why."""
+
+    who: str
+    at: Stamp
+    comment: str | None
+
+
 class Result(Record, frozen=True, kw_only=True):
     """A result with its batch, and the other results of that batch."""
 
@@ -368,6 +376,8 @@ class Result(Record, frozen=True, kw_only=True):
     measures: Measures
     current: bool
     parent: Id | None
+    signature: Signature | UnsetType | None = UNSET
+    """Only for a recorded what-if: who recorded it; null where the audit list does not know."""
     archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
     frame: FrameWithStars | UnsetType | None = UNSET

@@ -214,24 +214,29 @@ def list_alarms(
 
 
 def active_alarms(connection: Connection, run: str, now: str) -> list[models.Alarm]:
-    """The alarms of a run that are not cleared, the worst first."""
+    """The alarms of a run that are not cleared, in the order of `present_rank`.
+
+    Of equals the newest is first.
+    """
     query = select(alarms).where(alarms.c.run == run, _ACTIVE).order_by(alarms.c.id.desc())
     found = [shown_alarm(row, now) for row in connection.execute(query).mappings()]
-    return sorted(found, key=lambda each: -_rank(each.severity))
+    return sorted(found, key=present_rank, reverse=True)
+
+
+def present_rank(alarm: models.Alarm) -> tuple[bool, int]:
+    """How bad an alarm is now: unshelved ones by present severity, which is 0 back in limits."""
+    severity = alarm.current_severity
+    return alarm.state != "shelved", 0 if severity is None else Severity[severity.upper()]
 
 
 def summary(found: Sequence[models.Alarm]) -> models.AlarmSummary:
-    """How many active alarms there are by state, and the worst of those not shelved."""
+    """How many active alarms there are by state, and the present severity of the worst one."""
     states = ("open", "acknowledged", "shelved")
-    worst: list[models.SeverityName] = [each.severity for each in found if each.state != "shelved"]
+    worst = max(found, key=present_rank, default=None)
     return models.AlarmSummary(
         **{state: sum(each.state == state for each in found) for state in states},
-        worst=max(worst, key=_rank, default=None),
+        worst=None if worst is None or worst.state == "shelved" else worst.current_severity,
     )
-
-
-def _rank(severity: str | None) -> Severity:
-    return Severity[(severity or "").upper()]
 
 
 def read_alarm(connection: Connection, id: str, now: str) -> models.AlarmWithActions:

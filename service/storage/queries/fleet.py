@@ -72,7 +72,7 @@ class FleetRow:
     state: str
     """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
     alarms: tuple[Alarm, ...]
-    """The alarms that are not cleared, worst first."""
+    """The alarms that are not cleared, the one that is worst now first."""
     latest_batch: Summary | None = None
     last_attitude: KnownAttitude | None = None
     """It can be older than the latest batch."""

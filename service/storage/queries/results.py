@@ -243,9 +243,12 @@ def measured(row: Any) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class ResultPlace:
-    """A result: its spacecraft, run and time, and the id of the current one of its batch."""
+    """A result: its spacecraft, run and time, and the id of the current one of its batch.
 
-    spacecraft: str
+    Without a spacecraft the place is one among the results of all.
+    """
+
+    spacecraft: str | None
     run: str
     time_ns: int
     current: str | None

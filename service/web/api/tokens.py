@@ -130,7 +130,7 @@ def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
 def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
     with app.context.reading() as connection:
-        page = access.list_entries(connection, query.limit, query.cursor)
+        page = access.list_entries(connection, **query.asked())
     return page_response(request, page)
 
 

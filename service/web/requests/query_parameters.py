@@ -136,6 +136,9 @@ class AuditQuery(Query):
 
     limit: PageLimit = 100
     cursor: Cursor = None
+    person: Annotated[str, Field(max_length=80, description="Who signed, or the token.")] = ""
+    action: Annotated[str, Field(max_length=64, description="Part of the operation's name.")] = ""
+    about: Annotated[str, Field(max_length=200, description="Part of the path and query.")] = ""
 
 
 class BatchQuery(PeriodPageQuery):

@@ -22,8 +22,11 @@ ROWS = 100
 
 
 class AuditPageQuery(PageQuery):
-    """Where the page of the list begins."""
+    """Which changes, and where the page of the list begins."""
 
+    person: Annotated[str, Field(max_length=80)] = ""
+    action: Annotated[str, Field(max_length=64)] = ""
+    about: Annotated[str, Field(max_length=200)] = ""
     cursor: Cursor = None
 
 
@@ -31,8 +34,16 @@ class AuditPageQuery(PageQuery):
 def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
     """Who changed what and when, the newest first."""
     with context.app.context.reading() as connection:
-        page = list_entries(connection, ROWS, query.cursor)
-    return context.rendered("audit.html.jinja", query.run, page=page)
+        page = list_entries(
+            connection,
+            ROWS,
+            query.cursor,
+            person=query.person.strip(),
+            # As the page writes an action, or as the API names it.
+            action=query.action.strip().replace(" ", "_"),
+            about=query.about.strip(),
+        )
+    return context.rendered("audit.html.jinja", query.run, page=page, query=query)
 
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")

@@ -1,4 +1,4 @@
-// Asks for name and comment before something is adopted, and says what that will change.
+// Asks for name and reason before something is adopted, and says what that will change.
 import { rememberWho } from "./actions.js";
 
 function element(name, properties = {}, ...children) {
@@ -10,12 +10,12 @@ function element(name, properties = {}, ...children) {
 // Resolves to { who, comment }, or to null if the reader changed their mind.
 export function signed(title, changes, action) {
   const who = element("input", { name: "who", required: true, maxLength: 64, autocomplete: "name", size: 16 });
-  const comment = element("input", { name: "comment", maxLength: 2000 });
+  const comment = element("input", { name: "comment", required: true, maxLength: 2000 });
   const form = element(
     "form",
     { className: "form", method: "dialog" },
     element("label", {}, "Name ", who),
-    element("label", { className: "grow" }, "Comment ", comment),
+    element("label", { className: "grow" }, "Reason ", comment),
     element("button", { className: "main", value: "yes", textContent: action }),
     element("button", { value: "no", type: "button", textContent: "Cancel", onclick: () => dialog.close("no") }),
   );
@@ -23,7 +23,7 @@ export function signed(title, changes, action) {
     "dialog",
     { ariaLabel: title },
     element("h2", { textContent: title }),
-    element("ul", {}, ...changes.map((each) => element("li", { textContent: each }))),
+    element("ul", {}, ...changes.map((each) => element("li", { textContent: each, className: each.startsWith("▲") ? "problem" : "" }))),
     form,
   );
   rememberWho(who);

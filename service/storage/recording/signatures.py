@@ -1,0 +1,48 @@
+"""Who signed a change and why, from the body of its request in the audit list."""
+
+import json
+from contextlib import suppress
+from typing import Any
+
+from sqlalchemy import Connection, select
+
+from service.storage.models.answers import Signature
+from service.storage.sql.tables import audit
+
+REASONS = ("comment", "note", "text")
+"""Fields of requests that say why something is done."""
+
+
+def signed_in(body: str | None) -> tuple[str | None, str | None]:
+    """The author and the reason that a request names; None where it names none."""
+    sent: Any = None
+    with suppress(ValueError):
+        sent = json.loads(body or "null")
+    texts = sent if isinstance(sent, dict) else {}
+    who, *reasons = (texts.get(name) for name in ("who", *REASONS))
+    reason = next((each for each in reasons if isinstance(each, str) and each), None)
+    return (who if isinstance(who, str) and who else None), reason
+
+
+def naming_result(body: str | None, id: str) -> str:
+    """The body of a what-if with the id of its result and its signature in front.
+
+    A long body is stored without its end.
+    """
+    sent = json.loads(body or "{}")
+    first = {"result": id} | {name: sent[name] for name in ("who", "comment") if name in sent}
+    return json.dumps(first | sent, ensure_ascii=False)
+
+
+def signature_of(connection: Connection, parent: str, id: str) -> Signature | None:
+    """Who recorded the what-if of `parent` that has the id; None where no entry names it."""
+    start = json.dumps({"result": id}).removesuffix("}")
+    query = select(audit).where(
+        audit.c.about == f"/api/v1/batches/{parent}/what-if",
+        audit.c.body.startswith(start, autoescape=True),
+    )
+    row = connection.execute(query).mappings().first()
+    if row is None:
+        return None
+    who, reason = signed_in(row["body"])
+    return Signature(who=who or row["who"], at=row["moment"], comment=reason)
