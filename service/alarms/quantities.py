@@ -119,8 +119,13 @@ class Quantity:
 
     @property
     def is_share(self) -> bool:
-        """True if it is a share, which pages show in percent."""
+        """True if it is a share of stars or batches, which rollups count."""
         return isinstance(self.source, StarShare | BatchShare)
+
+    @property
+    def is_percent(self) -> bool:
+        """True if pages show it in percent."""
+        return self.is_share or isinstance(self.source, SmoothedShare)
 
     @property
     def value_of(self) -> Callable[[Mapping[str, Any]], float | None]:

@@ -64,7 +64,7 @@ class Alarms:
             )
 
     def active(self, run: str = LIVE) -> list[records.Alarm]:
-        """Every alarm of a run that is not cleared, the worst first."""
+        """Every alarm of a run that is not cleared, the one that is worst now first."""
         with self._context.reading() as connection:
             return alarms.active_alarms(connection, run, utc_now().text)
 

@@ -120,26 +120,6 @@ class Runs:
         with self._context.reading() as connection:
             return run_rates(connection, spacecraft, (run, other), start, end)
 
-    def comparable(
-        self, spacecraft: Collection[str], run: str | None = None
-    ) -> tuple[str, str, str] | None:
-        """Two runs with one of these spacecraft on the same days, and that spacecraft.
-
-        The first is `run`, or without one the live run or the newest.  None without such a pair.
-        """
-        found = sorted(
-            self.all(spacecraft), key=lambda each: (each.run == LIVE, each.created), reverse=True
-        )
-        for one in found:
-            if run is not None and one.run != run:
-                continue
-            for other in found:
-                common = sorted({*one.spacecraft} & {*other.spacecraft} & {*spacecraft})
-                same_days = other.first_day <= one.last_day and one.first_day <= other.last_day
-                if other.run != one.run and common and same_days:
-                    return one.run, other.run, common[0]
-        return None
-
     def reprocess(
         self,
         run: str | None,

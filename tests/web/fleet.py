@@ -147,11 +147,15 @@ def _alarm(name: str, number: int, run: str) -> dict[str, Any]:
 
 
 def put_alarm(
-    app: App, name: str, actions: Sequence[tuple[str, float]], in_limits: bool = False
+    app: App,
+    name: str,
+    actions: Sequence[tuple[str, float]],
+    in_limits: bool = False,
+    **columns: Any,
 ) -> None:
     """An alarm of a spacecraft with what its value did, by hours after the day's start."""
     begin = shifted(END, -DAY_S)
-    alarm = _alarm(name, 0, "live")
+    alarm = _alarm(name, 0, "live") | columns
     places = [(action, shifted(begin, 3600.0 * hours)) for action, hours in actions]
     alarm |= _place("raised", places[0][1]) | _place("latest", places[-1][1])
     if in_limits:

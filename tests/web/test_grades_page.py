@@ -276,7 +276,7 @@ def test_the_definitive_attitude_is_made_with_a_button_and_shows_its_progress(br
     browser.run("definitive.elements.who.value = 'J. Operator'")
     browser.run("document.querySelector('#definitive .main').click()")
     browser.wait(lambda: "Done: 1 of 1 days" in browser.run("message.innerText"), 120)
-    browser.wait(lambda: "Stretches and status" in browser.run(body))
+    browser.wait(lambda: "Segments and status" in browser.run(body))
     browser.wait(lambda: "by J. Operator: done, 1 of 1 days" in browser.run("jobs.innerText"))
     assert_fits(browser, page)
     api = f"{address}/api/v1/spacecraft/XTE"

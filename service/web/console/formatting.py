@@ -12,7 +12,7 @@ from typing import Any
 from markupsafe import Markup
 
 from service.alarms.quantities import quantity_named
-from service.times import Utc, recorded_utc, utc_now
+from service.times import Utc, recorded_utc, shifted, utc_now
 
 DASH = "–"
 THIN = "\N{NARROW NO-BREAK SPACE}"
@@ -47,9 +47,33 @@ STATES: Mapping[str, tuple[str, str]] = {
 """Shape and word of every state there is."""
 
 
+_TYPED = re.compile(
+    r"(\d{4}-(?:\d\d-\d\d|\d{3}))(?:[T ](\d\d:\d\d)(:\d\d(?:\.\d{1,9})?)?"
+    r" ?(Z|UTC|[+-]\d\d(?::?\d\d)?)?)?",
+    re.ASCII | re.IGNORECASE,
+)
+
+
+def completed_utc(text: str) -> str:
+    """A time as people type it in the form that `parse_utc` reads; any other text as it is.
+
+    A blank may stand for `T`, and the time of day, its seconds and the zone may be missing.
+    """
+    match = _TYPED.fullmatch(text.strip())
+    if match is None:
+        return text
+    day, clock, seconds, zone = match.groups("")
+    return f"{day}T{clock or '00:00'}{seconds or ':00'}{zone.upper().replace('UTC', 'Z')}"
+
+
 def present() -> Utc:
     """This moment, to the second."""
     return recorded_utc(utc_now().text[:19])
+
+
+def second_after(time: str) -> Utc:
+    """The whole second after a batch: a period that ends there holds the batch."""
+    return shifted(recorded_utc(time[:19] + "Z"), 1.0)
 
 
 def with_day_of_year(moment: Utc | str, seconds: bool = True) -> str:
@@ -171,15 +195,47 @@ def sigmas(covariance_arcsec2: Sequence[Sequence[float]]) -> list[float]:
     return [math.sqrt(max(covariance_arcsec2[k][k], 0.0)) for k in range(3)]
 
 
+REASONS: Mapping[str, str] = {
+    "fewer_than_two_unique_stars": "fewer than two unique stars",
+    "degenerate_geometry": "the stars lie too close together, or on one line",
+    "fewer_than_three_stars": "fewer than three stars, too few to search the whole sky",
+    "no_match": "no attitude explains three of the stars",
+    "doubtful_match": "an attitude explains some stars, but chance may as well",
+}
+"""Why there is no attitude, in a sentence."""
+
+
+def reason(code: str | None) -> str:
+    """A reason for reading; a code of another version without its underscores."""
+    return REASONS.get(code or "", plain(code))
+
+
+def warning(text: str) -> tuple[str, str]:
+    """The sentence and the code of a warning."""
+    code, _, said = text.partition(":")
+    said = said.strip()
+    if said in REASONS:
+        return f"The search of the whole sky gave nothing better: {REASONS[said]}.", code
+    return said or plain(code).capitalize(), code
+
+
+def typed_time(moment: Utc | str | None) -> str:
+    """A time as a field of a form has it: to the second where nothing follows."""
+    if moment is None or moment == "":
+        return ""
+    text = moment if isinstance(moment, str) else moment.text
+    return re.sub(r"(\.\d*?)0+Z$", r"\1Z", text).replace(".Z", "Z")
+
+
 def plain(word: str | None) -> str:
     """A word of the interface for reading: `no_attitude` without its underscore."""
     return (word or "").replace("_", " ")
 
 
-def state(name: str | None) -> Markup:
-    """Shape and word of a state, with a class to colour it by."""
+def state(name: str | None, words: str | None = None) -> Markup:
+    """Shape and word of a state, or other words, with a class to colour it by."""
     name = name or "no_attitude"
-    shape, word = STATES[name]
+    shape, word = STATES[name][0], words or STATES[name][1]
     return Markup('<span class="state {}"><span aria-hidden="true">{}</span> {}</span>').format(
         name, shape, word
     )
@@ -199,7 +255,7 @@ def quantity(value: float | None, name: str) -> str:
     if value is None:
         return DASH
     known = quantity_named(name)
-    if known.is_share:
+    if known.is_percent:
         return share(value)
     if (shown := UNITS.get(known.unit)) is not None:
         return shown(value)
@@ -209,14 +265,14 @@ def quantity(value: float | None, name: str) -> str:
 def unit_of(name: str) -> str:
     """The unit in which a quantity is written and entered; shares are percent."""
     known = quantity_named(name)
-    return "%" if known.is_share else ENTERED_UNITS.get(known.unit, known.unit)
+    return "%" if known.is_percent else ENTERED_UNITS.get(known.unit, known.unit)
 
 
 def entered(value: float | None, name: str) -> str:
     """A bound of a quantity in `unit_of` it, as a field of a form has it; empty without one."""
     if value is None:
         return ""
-    return f"{100 * value if quantity_named(name).is_share else value:.6g}"
+    return f"{100 * value if quantity_named(name).is_percent else value:.6g}"
 
 
 def bounds(settings: Mapping[str, Any], name: str) -> str:
@@ -232,7 +288,7 @@ def bounds(settings: Mapping[str, Any], name: str) -> str:
     if not parts:
         return "no bounds, so it raises no alarm"
     held = f"hysteresis {quantity(settings['hysteresis'], name)}"
-    count = f"over {settings['minimum_count']} batches"
+    count = f"mean of {settings['minimum_count']} batches"
     return f"{', '.join(parts)}; {held}, {count}, for {age(settings['duration_s'])}"
 
 
@@ -273,6 +329,9 @@ FILTERS: Mapping[str, Callable[..., Any]] = {
     "size": size,
     "sigmas": sigmas,
     "plain": plain,
+    "reason": reason,
+    "warning": warning,
+    "typed": typed_time,
     "state": state,
     "quantity": quantity,
     "unit_of": unit_of,

@@ -28,8 +28,8 @@ from service.app.factory import App
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
 from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
-from service.times import Utc
-from service.web.console.formatting import FILTERS, present
+from service.times import Utc, parse_utc
+from service.web.console.formatting import FILTERS, completed_utc, present
 from service.web.requests import problems
 from service.web.requests.access import POLICIES, AppDep, CallerDep, Policy
 from service.web.requests.problems import ProblemType, faults_in_query, on_http_error, root_path
@@ -93,6 +93,11 @@ class PageQuery(Query):
             name: str(value).lower() if isinstance(value, bool) else value
             for name, value in kept.items()
         }
+
+
+def typed_utc(text: str, field: str) -> Utc:
+    """A time as people type it; raises `BadInput` naming the field."""
+    return parse_utc(completed_utc(text), field)
 
 
 class SortedQuery(PageQuery):
@@ -293,6 +298,16 @@ def _to(context: Context, path: str, /, **query: object) -> str:
     return f"{quote(path)}?{urlencode(asked)}" if asked else quote(path)
 
 
+_DOCUMENTED = re.compile(r'href="(/(?:docs|problems)[^"#]*)')
+
+
+def _of_run(text: Markup, run: str) -> Markup:
+    """A kept part of a page whose links to other pages keep the shown run."""
+    if run == LIVE:
+        return text
+    return Markup(_DOCUMENTED.sub(rf'href="\1?{urlencode({"run": run})}', str(text)))
+
+
 def _data(value: object) -> Markup:
     """Values for a script, in a `template` element: escaped like any text."""
     return Markup("<template data-json>{}</template>").format(msgspec.json.encode(value).decode())
@@ -308,6 +323,7 @@ def _environment() -> Environment:
         lstrip_blocks=True,
     )
     environment.filters.update(FILTERS)
+    environment.filters["of_run"] = _of_run
     environment.globals.update(to=_to, data=_data, version=__version__)
     return environment
 

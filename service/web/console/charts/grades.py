@@ -306,7 +306,13 @@ def _attitude(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
 
 
 def _rate(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
-    rates = _by_grade(found, "rate_deg_per_s")
+    # Without a gyro the rate is not measured: until it is confirmed it is only the first guess.
+    rates: dict[str, Vector] = {
+        grade: np.where((found.is_gyro | (each.status == Status.GOOD))[:, None], rate, np.nan)
+        for (grade, each), rate in zip(
+            found.samples.items(), _by_grade(found, "rate_deg_per_s").values(), strict=True
+        )
+    }
     if not any(np.isfinite(each).any() for each in rates.values()):
         return None
     largest = max(float(np.nanmax(np.abs(each))) for each in rates.values())

@@ -13,9 +13,9 @@ from service.alarms.quantities import limited_trackers, quantity_named, trend_na
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName
-from service.storage.queries.alarms import TimeOut
-from service.times import Utc, parse_utc, recorded_utc, shifted
-from service.web.console.formatting import with_day_of_year
+from service.storage.queries.alarms import TimeOut, present_rank
+from service.times import Utc, recorded_utc, shifted
+from service.web.console.formatting import second_after, with_day_of_year
 from service.web.console.page import (
     ContextDep,
     FromQuery,
@@ -23,6 +23,7 @@ from service.web.console.page import (
     PageQuery,
     SortedQuery,
     console_page,
+    typed_utc,
 )
 from service.web.console.pages.spacecraft import charts_by_quantity, history_address
 from service.web.requests.access import Policy
@@ -164,7 +165,7 @@ def _sorted(lines: list[AlarmLine], query: AlarmsQuery) -> list[AlarmLine]:
     """The alarms in the asked order; of equals, those that left their limits last come first."""
     keys: dict[Order, Callable[[AlarmLine], Any]] = {
         "last": lambda line: (line.last[1] is None, line.last_ns),
-        "severity": lambda line: Severity[line.alarm.severity.upper()],
+        "severity": lambda line: present_rank(line.alarm),
         "spacecraft": lambda line: line.alarm.spacecraft,
         "quantity": lambda line: (line.alarm.quantity, line.alarm.tracker or ""),
         "times": lambda line: len(line.times),
@@ -245,7 +246,7 @@ def _end(alarm: Alarm) -> Utc:
     """Some time after the alarm was raised, or its latest batch, whichever is later."""
     after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
     # The latest batch belongs to the period, the end of which does not.
-    latest = shifted(recorded_utc(alarm.latest.time), 0.001)
+    latest = second_after(alarm.latest.time)
     return max(after, latest, key=lambda moment: moment.tai_ns)
 
 
@@ -355,8 +356,8 @@ def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) ->
         query = query.model_copy(update={"spacecraft": context.first_spacecraft})
     page = context.app.annotations.page(
         spacecraft=query.spacecraft or None,
-        start=parse_utc(query.start, "start") if query.start else None,
-        end=parse_utc(query.end, "end") if query.end else None,
+        start=typed_utc(query.start, "start") if query.start else None,
+        end=typed_utc(query.end, "end") if query.end else None,
         limit=ANNOTATION_ROWS,
         cursor=query.cursor,
     )

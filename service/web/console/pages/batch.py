@@ -22,9 +22,10 @@ from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.tracks import TrackList
-from service.times import Utc, parse_utc, shifted
+from service.times import Utc, recorded_utc
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
+from service.web.console.formatting import arcsec
 from service.web.console.options import (
     asked_options,
     batch_settings,
@@ -39,6 +40,7 @@ from service.web.console.page import (
     PageContext,
     PageQuery,
     console_page,
+    typed_utc,
 )
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import Cursor
@@ -46,6 +48,8 @@ from service.web.requests.query_parameters import Cursor
 VIEWS = ("all", "field")
 """The content of the chart: all candidates of the answer, or the field of view alone."""
 
+MUCH_WORSE = 2.0
+"""A new residual of more than so many times the former and the predicted one is warned of."""
 SCALE = 3.0
 """The least range of the bars of the trackers' residuals, in predicted residuals."""
 
@@ -116,7 +120,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         fields=fields,
         options=options.model_dump(exclude_none=True, exclude_unset=True),
         toml=toml_of(fields),
-        adoption=_adoption(answer, shown),
+        adoption=adoption(answer, shown),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
         tracks=_tracks(context, id, answer),
@@ -125,7 +129,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     )
 
 
-def _adoption(before: Answer, after: Answer) -> list[str]:
+def adoption(before: Answer, after: Answer) -> list[str]:
     """The changes that adopting a what-if will make, in sentences."""
     words = ("unique", "ambiguous", "unmatched")
     changes = [
@@ -137,6 +141,7 @@ def _adoption(before: Answer, after: Answer) -> list[str]:
     if statuses[0] != statuses[1]:
         changes.append(f"attitude {statuses[0]} to {statuses[1]}")
     return [
+        *_worse_fit(before, after),
         f"1 batch changes: {', '.join(changes) or 'its counts and its status stay the same'}.",
         f"Lists, rates and every trend of {after.spacecraft} show the new result at {after.time}.",
         (
@@ -144,6 +149,21 @@ def _adoption(before: Answer, after: Answer) -> list[str]:
             "To undo it, adopt the former result, which stays readable."
         ),
     ]
+
+
+def _worse_fit(before: Answer, after: Answer) -> list[str]:
+    """A warning with both figures where the residuals of the new attitude are much larger."""
+    if after.attitude is None:
+        return ["▲ The new result has no attitude."] if before.attitude else []
+    if after.attitude.residual_rms_arcsec is None:
+        return []
+    new, predicted = after.attitude.residual_rms_arcsec, after.attitude.predicted_rms_arcsec
+    old = before.attitude.residual_rms_arcsec if before.attitude else None
+    usual = max(filter(None, (old, predicted)), default=0.0)
+    if new <= MUCH_WORSE * usual:
+        return []
+    was = "no attitude" if old is None else arcsec(old)
+    return [f"▲ The new attitude fits its stars worse: residual rms {was} to {arcsec(new)}."]
 
 
 @console_page("/latest/{name}", "Latest batch", Policy("read", "path"), section="/batches")
@@ -243,41 +263,50 @@ def batches_page(query: FromQuery[BatchesQuery], context: ContextDep) -> Respons
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
         query = query.model_copy(update={"spacecraft": context.first_spacecraft})
+    moment, nearest = None, list[tuple[Summary, float]]()
     if text := query.find.strip():
         try:
-            return _at(query, parse_utc(text, "find"))
+            moment = typed_utc(text, "find")
         except BadInput:
             found = named(context, query, text)
-        if len(found) == 1:
-            address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
-            return RedirectResponse(address, 303)
-        return context.rendered(
-            "batches.html.jinja",
-            query.run,
-            query=query,
-            page=Page(found, None),
-            spacecraft=context.spacecraft,
+            if len(found) == 1:
+                address = f"/batches/{found[0].id}?{urlencode({'run': found[0].run})}"
+                return RedirectResponse(address, 303)
+        else:
+            nearest = _nearest(context, query, moment)
+            found = [each for each, _ in nearest]
+        page = Page(found, None)
+    else:
+        page = context.app.results.page(
+            spacecraft=query.spacecraft or None,
+            run=query.run,
+            start=typed_utc(query.start, "start") if query.start else None,
+            end=typed_utc(query.end, "end") if query.end else None,
+            outcome=query.outcome or None,
+            status=query.status or None,
+            limit=ROWS,
+            cursor=query.cursor,
         )
-    page = context.app.results.page(
-        spacecraft=query.spacecraft or None,
-        run=query.run,
-        start=parse_utc(query.start, "start") if query.start else None,
-        end=parse_utc(query.end, "end") if query.end else None,
-        outcome=query.outcome or None,
-        status=query.status or None,
-        limit=ROWS,
-        cursor=query.cursor,
-    )
     return context.rendered(
-        "batches.html.jinja", query.run, query=query, page=page, spacecraft=context.spacecraft
+        "batches.html.jinja",
+        query.run,
+        query=query,
+        page=page,
+        moment=moment,
+        nearest=nearest,
+        spacecraft=context.spacecraft,
     )
 
 
-def _at(query: BatchesQuery, moment: Utc) -> Response:
-    """The list that begins with the latest batch at a time."""
-    end = shifted(moment, 1.0).text
-    asked = {"run": query.run, "spacecraft": query.spacecraft, "end": end}
-    return RedirectResponse(f"/batches?{urlencode(asked)}", 303)
+def _nearest(context: PageContext, query: BatchesQuery, moment: Utc) -> list[tuple[Summary, float]]:
+    """The batches before and after a time, the nearer first, and how many seconds off each is."""
+    found = context.app.results.around(moment, query.run, query.spacecraft or None)
+    offsets = [
+        (each, (recorded_utc(each.time).tai_ns - moment.tai_ns) * 1e-9)
+        for each in (found.earlier, found.later)
+        if each is not None
+    ]
+    return sorted(offsets, key=lambda each: abs(each[1]))
 
 
 def named(context: PageContext, query: BatchesQuery, text: str) -> list[Summary]:

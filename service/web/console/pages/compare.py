@@ -1,5 +1,6 @@
 """The pages of runs and replays, and the one that compares runs or sets of options."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -13,13 +14,13 @@ from starlette.responses import Response
 from service.app.runs import MOST_COMPARED
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.runs import Comparison
-from service.times import DAY_S, parse_utc, recorded_utc, unix_seconds, utc_now
+from service.storage.models.runs import Comparison, RefusedLine
+from service.times import DAY_S, recorded_utc, unix_seconds, utc_now
 from service.vectors import Vector
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.console import options
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, sparkline
-from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
+from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page, typed_utc
 from service.web.requests.access import READ, Policy
 
 SAMPLE = 2_000
@@ -71,14 +72,16 @@ async def _query(request: Request) -> CompareQuery:
 def compare_page(
     request: Request, query: Annotated[CompareQuery, Depends(_query)], context: ContextDep
 ) -> Response:
-    """A comparison of two runs, first of two that have data; or one of options, once asked for."""
-    pair = _pair(request, query, context)
+    """A comparison of the shown run with another, or of two sets of options, once asked for."""
     start, end = (
-        parse_utc(text, name) if text.strip() else None
+        typed_utc(text, name) if text.strip() else None
         for name, text in (("start", query.start), ("end", query.end))
     )
+    name = query.spacecraft or context.filled_spacecraft(query.run)
     runs = rates = None
-    if pair is not None and (query.other is not None or query.spacecraft is None):
+    if query.other is not None:
+        context.caller.require(name)
+        pair = query.run, query.other, name
         runs = context.app.runs.compare_latest(*pair, start, end)
         rates = context.app.runs.rates(*pair, start, end)
     asked = {side: options.asked_options(request.query_params, f"{side}.") for side in SIDES}
@@ -96,15 +99,12 @@ def compare_page(
             b=b,
             limit_s=COMPARISON_S,
         )
-    run = pair[0] if pair and runs else query.run
-    name = query.spacecraft or (pair[2] if pair else context.filled_spacecraft(run))
     mission = context.app.context.known.get(name)
     return context.rendered(
         "compare.html.jinja",
-        run,
+        query.run,
         query=query,
         name=name,
-        other=pair[1] if pair else None,
         runs=runs,
         rates=rates,
         rate_trends=rates and _drawn(rates.cell_s, [each.shares for each in rates.runs]),
@@ -117,19 +117,6 @@ def compare_page(
         sides=SIDES,
         matrix=_matrix(result),
     )
-
-
-def _pair(
-    request: Request, query: CompareQuery, context: PageContext
-) -> tuple[str, str, str] | None:
-    """The run and the run that it is compared with, and the spacecraft; None without such two."""
-    run = query.run if "run" in request.query_params else None
-    found = context.app.runs.comparable(context.spacecraft, run)
-    if query.other is None:
-        return found
-    name = query.spacecraft or (found[2] if found else context.filled_spacecraft(query.run))
-    context.caller.require(name)
-    return query.run, query.other, name
 
 
 def _drawn(cell_s: int, sides: Sequence[Mapping[str, Vector]]) -> DrawnTrends:
@@ -181,5 +168,14 @@ def runs_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 
 @console_page("/replays/{id}", "Replay", READ, section="/runs")
 def replay_page(id: str, query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """One replay: how far it is, and every line that was refused."""
-    return context.rendered("replay.html.jinja", query.run, replay=context.app.replays.get(id))
+    """One replay: how far it is, and the faults of lines, each once with how many have it."""
+    replay = context.app.replays.get(id)
+    alike: dict[str, list[RefusedLine]] = {}
+    for each in replay.errors:
+        # Numbers differ from line to line: of messages alike in words the first is shown.
+        alike.setdefault(_NUMBER.sub("0", each.problem.detail), []).append(each)
+    faults = [(each[0].line, len(each), each[0].problem.detail) for each in alike.values()]
+    return context.rendered("replay.html.jinja", query.run, replay=replay, faults=faults)
+
+
+_NUMBER = re.compile(r"[-+\d.]*\d")

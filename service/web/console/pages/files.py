@@ -44,11 +44,14 @@ class FilesQuery(spacecraft.SpacecraftQuery):
 class GradeOfFile:
     """One grade of a period: how many attitudes, in how many stretches, and its largest gap.
 
+    `missing` says why there is none, where something is known to be missing.
+
     `is_cut` says that only the first `MOST_COUNTED` of them were counted.
     """
 
     grade: ProductGrade
     what: str
+    missing: str
     attitudes: int
     stretches: int
     largest_gap_s: float
@@ -98,6 +101,7 @@ def _grades(
     context: PageContext, name: str, query: FilesQuery, shown: spacecraft.ShownPeriod
 ) -> list[GradeOfFile]:
     found = []
+    missing = without_gyro(context, name, query.run, shown)
     for grade, what in GRADES.items():
         series = context.app.products.attitudes(
             name,
@@ -107,11 +111,34 @@ def _grades(
             grade=grade,
             largest_gap_s=query.gap_s,
         )
-        found.append(_counted(grade, what, series))
+        found.append(_counted(grade, what, "" if grade == "raw" else missing, series))
     return found
 
 
-def _counted(grade: ProductGrade, what: str, series: AttitudeSeries) -> GradeOfFile:
+def without_gyro(context: PageContext, name: str, run: str, shown: spacecraft.ShownPeriod) -> str:
+    """What a filter lacks in a period, and what that means; empty where it has gyro data."""
+    if context.app.gyro.page(name, run=run, start=shown.start, end=shown.end, limit=1).items:
+        return ""
+    mission = context.app.context.known[name]
+    told = "" if mission.gyro else ", and the mission file has no table [gyro]"
+    return (
+        f"There are no gyro data in this period{told}. Without them the filter takes the rate for "
+        "constant: where the spacecraft turns, or batches are far apart, none of its attitudes is "
+        "good. The raw attitudes, one for each batch, do not need a gyro."
+    )
+
+
+def has_attitudes(
+    context: PageContext, name: str, run: str, shown: spacecraft.ShownPeriod, grade: ProductGrade
+) -> bool:
+    """True if a file of the grade would hold an attitude."""
+    series = context.app.products.attitudes(
+        name, run=run, start=shown.start, end=shown.end, grade=grade
+    )
+    return next(iter(series.blocks), None) is not None
+
+
+def _counted(grade: ProductGrade, what: str, missing: str, series: AttitudeSeries) -> GradeOfFile:
     attitudes = stretches = 0
     last = None
     for block in islice(series.blocks, MOST_COUNTED):
@@ -122,4 +149,6 @@ def _counted(grade: ProductGrade, what: str, series: AttitudeSeries) -> GradeOfF
         if attitudes >= MOST_COUNTED:
             break
     is_cut = attitudes >= MOST_COUNTED
-    return GradeOfFile(grade, what, attitudes, stretches, series.about.largest_gap_s, is_cut)
+    return GradeOfFile(
+        grade, what, missing, attitudes, stretches, series.about.largest_gap_s, is_cut
+    )

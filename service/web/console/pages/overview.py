@@ -1,6 +1,8 @@
 """The first page: the state of every spacecraft, a row each, the worst first."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -11,10 +13,11 @@ from service.alarms.limits import Severity
 from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
 from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
 from service.storage.recording.unsaved_result import LIVE
-from service.times import DAY_S, parse_utc, shifted
+from service.times import DAY_S, shifted
 from service.vectors import Matrix
 from service.web.console import page
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline
+from service.web.console.formatting import second_after
 from service.web.requests.access import Policy
 
 STALE_AFTER_S = 3600.0
@@ -33,8 +36,8 @@ SHOWN: dict[Shown, str] = {
 }
 MARKED_SHARE = 0.15
 """The share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
-_STATES = ("good", "suspect", "no_attitude")
-"""States from the best to the worst."""
+_RANKS = {"no_attitude": 5, "critical": 5, "silent": 4, "behind": 4, "suspect": 3, "warning": 2}
+"""How bad each state is; every other fault has the rank 1."""
 SPARK_QUANTITIES = ("ambiguous_share", "unmatched_share")
 
 
@@ -51,6 +54,19 @@ class OverviewQuery(page.SortedQuery):
     q: Annotated[str, Field(max_length=64)] = ""
     show: Shown = "all"
     heat: Annotated[str, OneOf(share_names)] | None = None
+
+
+@dataclass(frozen=True)
+class StateFault:
+    """Something that is wrong with a spacecraft: a state of `formatting.STATES`, and words."""
+
+    state: str
+    words: str
+
+    @property
+    def rank(self) -> int:
+        """How bad it is."""
+        return _RANKS.get(self.state, 1)
 
 
 @dataclass(frozen=True)
@@ -72,23 +88,58 @@ class OverviewLine:
         """True if it is silent or behind the run; a retired one sends nothing any more."""
         return self.is_silent or (not self.item.retired and _is_long(self.item.age_s))
 
+    @cached_property
+    def faults(self) -> list[StateFault]:
+        """What is wrong with its attitude, trackers, alarms and freshness, the worst first."""
+        found = [*self._of_attitude(), *self._of_trackers()]
+        if self.is_stale:
+            state = "silent" if self.is_silent else "behind"
+            found.append(StateFault(state, state))
+        if self.item.alarms_now:
+            word = self.item.alarms_now[0].current_severity or "watch"
+            found.append(StateFault(word, f"{word} alarm"))
+        return sorted(found, key=lambda each: -each.rank)
+
+    def _of_attitude(self) -> Iterator[StateFault]:
+        """The faults of the latest attitude, or else of those of the last hour."""
+        item, hour = self.item, self.item.last_hour
+        if item.state in ("suspect", "no_attitude"):
+            yield StateFault(item.state, item.state.replace("_", " "))
+            return
+        if hour is None or not hour.batches:
+            return
+        for state, count in (
+            ("no_attitude", hour.batches - hour.solved),
+            ("suspect", hour.suspect),
+        ):
+            if count > MARKED_SHARE * hour.batches:
+                of = f"{count} of {hour.batches} of the last hour"
+                yield StateFault("acquiring", f"{state.replace('_', ' ')} in {of}")
+
+    def _of_trackers(self) -> Iterator[StateFault]:
+        """The trackers that identify none of their stars while others do."""
+        if not self.item.has_attitude or len(self.item.trackers) < 2:
+            return
+        for each in self.item.trackers:
+            if each.observed and not each.unique:
+                yield StateFault("suspect", f"{each.tracker} 0 of {each.observed}")
+
     @property
     def state(self) -> str:
-        """The state that the row shows: that of an old batch says nothing of now."""
-        return "silent" if self.is_silent else "behind" if self.is_stale else self.item.state
+        """The worst of its faults; without any the state of its latest batch."""
+        return self.faults[0].state if self.faults else self.item.state
 
     @property
     def in_trouble(self) -> bool:
-        """True if it needs a look: out of limits, without a good attitude, or behind."""
-        item = self.item
-        return bool(item.alarms_now) or self.is_stale or item.state in ("suspect", "no_attitude")
+        """True if it needs a look."""
+        return bool(self.faults)
 
     @property
     def last_day(self) -> dict[str, str]:
         """The bounds of the day that ends with its latest batch."""
         assert self.item.latest_batch is not None
         # The latest batch belongs to it, and the end of a stretch does not.
-        end = shifted(parse_utc(self.item.latest_batch.time), 0.001)
+        end = second_after(self.item.latest_batch.time)
         return {"start": shifted(end, -DAY_S).text, "end": end.text}
 
     def share(self, outcome: str) -> float:
@@ -196,7 +247,7 @@ def _is_shown(line: OverviewLine, query: OverviewQuery) -> bool:
         case "stale":
             return line.is_stale
         case state:
-            return line.state == state
+            return state == line.state or state in [each.state for each in line.faults]
 
 
 def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLine]:
@@ -215,11 +266,10 @@ def _sorted(lines: list[OverviewLine], query: OverviewQuery) -> list[OverviewLin
     return sorted(ordered, key=lambda line: line.item.latest_batch is None)
 
 
-def _badness(line: OverviewLine) -> tuple[float, ...]:
-    item = line.item
-    state = _STATES.index(item.state) if item.state in _STATES else -1
-    share = line.share("ambiguous") + line.share("unmatched")
-    return _severity(line), state, line.is_stale, len(item.alarms_returned), share
+def _badness(line: OverviewLine) -> tuple[Any, ...]:
+    """The ranks of its faults from the worst on; then its share of ambiguous stars."""
+    ranks = [each.rank for each in line.faults]
+    return ranks, line.share("ambiguous"), line.share("unmatched"), len(line.item.alarms_returned)
 
 
 def _severity(line: OverviewLine) -> int:

@@ -18,6 +18,7 @@ from service.web.console.charts.histogram import (
 )
 from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
 from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.pages import files
 from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
@@ -124,7 +125,12 @@ def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
         "grades.html.jinja",
         query.run,
         name=name,
-        has_gyro=mission.gyro is not None,
+        missing=files.without_gyro(context, name, query.run, shown) if shown else "",
+        files_of=[
+            grade
+            for grade in files.GRADES
+            if shown and files.has_attitudes(context, name, query.run, shown, grade)
+        ],
         stretch=shown,
         ranges=list(RANGES_S),
         drawn=drawn,

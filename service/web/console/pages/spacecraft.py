@@ -23,7 +23,16 @@ from service.storage.models.answers import Summary
 from service.storage.models.base import Page
 from service.storage.models.spacecraft import MissionThen, Ranking
 from service.storage.recording.unsaved_result import LIVE
-from service.times import DAY_S, HOUR_S, Utc, parse_utc, recorded_utc, shifted, utc_now
+from service.times import (
+    DAY_S,
+    HOUR_S,
+    Utc,
+    parse_utc,
+    recorded_utc,
+    shifted,
+    utc_now,
+)
+from service.web.console.formatting import completed_utc, second_after
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 from service.web.requests.query_parameters import End, Start
@@ -96,7 +105,10 @@ class SpacecraftQuery(PageQuery):
     def _without_empty_fields(cls, value: object, info: ValidationInfo) -> object:
         """A field of the form that was left empty counts as not given."""
         default = cls.model_fields[info.field_name or ""].default
-        return default if value == "" else value
+        if value == "":
+            return default
+        is_time = info.field_name != "range" and isinstance(value, str)
+        return completed_utc(str(value)) if is_time else value
 
 
 def range_s(text: str) -> int:
@@ -191,7 +203,7 @@ def shown_period(
     if not latest:
         return None
     # The latest batch belongs to the stretch, whose end does not.
-    end = query.end or shifted(parse_utc(latest[0].time), 0.001)
+    end = query.end or second_after(latest[0].time)
     if query.until == "now" and query.run == LIVE and not query.end:
         end = max(end, utc_now(), key=lambda moment: moment.tai_ns)
     if query.start or query.end:

@@ -71,6 +71,9 @@ sound.addEventListener("click", () => {
 });
 document.addEventListener("critical", () => localStorage.getItem("sound") === "on" && ring());
 
+const copies = () => document.querySelectorAll("button[data-copy]").forEach((each) => (each.hidden = false));
+copies();
+document.addEventListener("drawn", copies);
 document.addEventListener("click", async (event) => {
   const button = event.target.closest("[data-copy]");
   if (!button) return;
@@ -80,6 +83,7 @@ document.addEventListener("click", async (event) => {
     button.textContent = "Copied";
   } catch {
     // Without permission for the clipboard: select the text, so that the keyboard can copy it.
+    source.hidden = false;
     getSelection().selectAllChildren(source);
     button.textContent = "Marked: press Ctrl-C";
   }

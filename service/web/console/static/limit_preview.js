@@ -32,8 +32,8 @@ export function clearPreview(quantity) {
   holderOf(quantity).hidden = true;
 }
 
-function value(number, { percent, unit } = { percent: false, unit: "\u202fs" }) {
-  return `${+(percent ? 100 * number : number).toPrecision(3)}${unit}`.replace("-", "−");
+function value(number, { percent, unit }) {
+  return `${+(percent ? 100 * number : number).toPrecision(3)}${"″°".includes(unit) ? "" : "\u202f"}${unit}`.replace("-", "−");
 }
 
 function alarmsIn(count) {
@@ -47,13 +47,13 @@ function sentence(name, trial) {
   return `${name}: ${alarmsIn(trial.alarms)}; ${told}.`;
 }
 
-function listOf(excursions, chart) {
+function listOf(excursions, measure) {
   const list = document.createElement("ol");
   // Numbered as the marks of the trend.
   list.start = Math.max(0, excursions.length - MOST_LISTED) + 1;
   for (const each of excursions.slice(-MOST_LISTED)) {
     const end = each.end === null ? "to the end" : `to ${utc(posix(each.end))} UTC`;
-    list.append(element("li", `${each.severity}, ${utc(posix(each.start))} UTC ${end}: ${value(each.worst, chart)}, bound ${value(each.bound, chart)}`));
+    list.append(element("li", `${each.severity}, ${utc(posix(each.start))} UTC ${end}: ${value(each.worst, measure)}, bound ${value(each.bound, measure)}`));
   }
   return list;
 }
@@ -76,7 +76,8 @@ async function draw(holder, found, chart) {
   new Trend(place, readout, { ...chart, quantities: lines, marks: "times out of these limits" }, limits, `preview-${found.quantity}`, () => {}).show(history, posix(found.start), posix(found.end), marks);
 }
 
-export async function showPreview(found) {
+// `measure` says how values are written, as in the form.
+export async function showPreview(found, measure) {
   const holder = holderOf(found.quantity);
   const chart = charts[found.quantity];
   if (!found.batches) {
@@ -88,7 +89,7 @@ export async function showPreview(found) {
     element("p", `${found.batches} batches${cut}, ${utc(posix(found.start))} to ${utc(posix(found.end))} UTC.`, "soft"),
     element("p", sentence("These limits", found.proposed)),
     element("p", sentence("The limits in force", found.in_force)),
-    listOf(found.proposed.excursions, chart),
+    listOf(found.proposed.excursions, measure),
   );
   if (chart) await draw(holder, found, chart);
 }

@@ -41,7 +41,7 @@ function addressOf(form, query = {}, part = "") {
 async function preview(form) {
   const query = { days: signed.elements.days.value, run: document.body.dataset.run };
   const found = await send("POST", addressOf(form, query, "/preview"), JSON.stringify({ settings: settingsIn(form) }));
-  await showPreview(found);
+  await showPreview(found, { percent: form.dataset.percent !== undefined, unit: form.dataset.unit });
   return "Preview: nothing is changed.";
 }
 

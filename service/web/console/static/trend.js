@@ -19,13 +19,13 @@ function colour(name) {
   return getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 }
 
-// Ticks: the time of day within a day, the date beyond; the day of the year below the date.
+// Ticks: the time of day, where a day begins its date below; the day of the year below the date.
 function tickLabels(_, splits, __, ___, step) {
   let before = "";
   return splits.map((seconds) => {
     const moment = new Date(seconds * 1000);
-    const day = `${moment.toISOString().slice(0, 10)} (${dayOfYear(moment)})`;
-    if (step >= DAY_S) return day.replace(" ", "\n");
+    const day = `${moment.toISOString().slice(0, 10)}\n(${dayOfYear(moment)})`;
+    if (step >= DAY_S) return day;
     const clock = `${twoDigits(moment.getUTCHours())}:${twoDigits(moment.getUTCMinutes())}`;
     const label = step < 60 ? `${clock}:${twoDigits(moment.getUTCSeconds())}` : clock;
     const shown = day === before ? label : `${label}\n${day}`;
@@ -78,9 +78,10 @@ function drawLimits(chart, lines) {
   ctx.strokeStyle = ctx.fillStyle = colour("--limit");
   ctx.textAlign = "left";
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
-  const labels = [];
+  const px = devicePixelRatio;
+  let last = null;
   // A label is above its line, or below it if there is no room.
-  const isHigh = (y) => y - bbox.top < LABEL_PX * devicePixelRatio;
+  const isHigh = (y) => y - bbox.top < LABEL_PX * px;
   const shown = lines.map((line) => ({ ...line, y: chart.valToPos(line.value, "y", true) }));
   for (const { severity, text, y } of shown.sort((a, b) => b.y - a.y)) {
     if (y < bbox.top || y > bbox.top + bbox.height) continue;
@@ -89,14 +90,12 @@ function drawLimits(chart, lines) {
     ctx.moveTo(bbox.left, y);
     ctx.lineTo(bbox.left + bbox.width, y);
     ctx.stroke();
-    // Lines that are close to each other share a label.
-    const last = labels.at(-1);
-    if (last && last.y - y < (isHigh(y) ? 2 : 1) * LABEL_PX * devicePixelRatio) last.text += `, ${text}`;
-    else labels.push({ text, y });
-  }
-  for (const { text, y } of labels) {
+    // The labels of lines that are close to each other stand side by side.
+    const isClose = last !== null && last.y - y < (isHigh(y) ? 2 : 1) * LABEL_PX * px;
+    const x = isClose ? last.right : bbox.left + 4 * px;
     ctx.textBaseline = isHigh(y) ? "top" : "bottom";
-    ctx.fillText(text, bbox.left + 4 * devicePixelRatio, y + (isHigh(y) ? 3 : -2) * devicePixelRatio);
+    ctx.fillText(text, x, y + (isHigh(y) ? 3 : -2) * px);
+    last = { y, right: x + ctx.measureText(text).width + 12 * px };
   }
   ctx.restore();
 }
@@ -285,7 +284,7 @@ export class Trend {
     this.others.forEach((_, k) => series.push({ stroke: colour(TONES[k % TONES.length]), width: 1.3, spanGaps: true, points: { show: false } }));
     const scale = this.definition.percent ? 100 : 1;
     const names = known.map(({ name }) => name);
-    const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale }));
+    const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale, text: `${line.text} ${this.text(line.value * scale)}` }));
     return {
       ...this.size(),
       padding: this.annotations.length ? [MARK_PX, ...PADDING.slice(1)] : PADDING,
@@ -296,7 +295,7 @@ export class Trend {
       series,
       bands,
       axes: [
-        { ...axis, values: tickLabels, space: 74, size: 46 },
+        { ...axis, values: tickLabels, space: 74, size: 58 },
         { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {

@@ -1,0 +1,342 @@
+"""What the console says first is what holds now: the run, the worst alarm, the nearest batch."""
+
+import json
+import re
+from dataclasses import replace
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import pytest
+from msgspec import structs
+
+from service.alarms import quantities
+from service.app.factory import open_app
+from service.observations.telemetry import read_lines
+from service.storage.models.spacecraft import WindowCounts
+from service.storage.queries.fleet import FleetRow, TrackerCounts
+from service.storage.queries.results import answer_from_json
+from service.times import parse_utc, shifted
+from service.web.app import create_app
+from service.web.console import formatting
+from service.web.console.formatting import arcsec
+from service.web.console.pages.batch import adoption
+from service.web.console.pages.overview import OverviewLine
+from tests.waiting import wait_until
+from tests.web import fleet
+from tests.web.console_pages import console_addresses
+from tests.web.markup import Markup
+from tests.web.serving import Server, in_process_settings
+
+
+def text_of(answer):
+    Markup(answer.raise_for_status().text)
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", answer.text))
+
+
+@pytest.fixture(scope="module")
+def small_fleet(chosen_database, tmp_path_factory):
+    """A service of eight spacecraft and its client."""
+    missions = fleet.write_missions(tmp_path_factory.mktemp("fleet") / "missions", 8)
+    app = open_app(in_process_settings(chosen_database(), missions=missions))
+    fleet.fill(app, 8)
+    with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+        yield app, client
+
+
+# ---- the chosen run ------------------------------------------------------------------------------
+
+OF_NO_RUN = ("/static/", "/api/", "/metrics", "/readyz", "#")
+
+
+def test_no_link_of_any_page_changes_the_chosen_run(client, post, batch, full_run):
+    """Save those whose text names the other run, and the list of runs."""
+    for address in console_addresses():
+        if address == "/runs":
+            continue
+        page = client.get(f"{address}?run={full_run}").text
+        for href, text in re.findall(r'<a [^>]*href="([^"]*)"[^>]*>(.*?)</a>', page, re.DOTALL):
+            if href.startswith(OF_NO_RUN):
+                continue
+            asked = parse_qs(urlsplit(href.replace("&amp;", "&")).query).get("run", ["live"])
+            named = re.sub(r"<[^>]+>", "", text).strip()
+            assert asked == [full_run] or asked == [named], (address, href, named)
+
+
+def test_comparing_runs_waits_until_a_second_run_is_chosen(client, full_run):
+    page = client.get("/compare").text
+    assert 'data-run="live"' in page
+    assert f"<option>{full_run}</option>" in page
+    assert "runs-outcome" not in page
+
+
+def cell_of(page, name, column):
+    """The text of a column of a spacecraft's row in the overview."""
+    row = re.search(rf'<tr[^>]*>(?:(?!</tr>).)*/{name}"(?:(?!</tr>).)*</tr>', page, re.DOTALL)
+    cell = re.search(rf'class="c-{column}">(.*?)</td>', row[0], re.DOTALL)[1]
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", cell)).strip()
+
+
+# ---- alarms --------------------------------------------------------------------------------------
+
+
+def test_of_several_alarms_the_one_that_is_worst_now_stands_for_all(small_fleet):
+    """An alarm that was critical once and is a warning now comes behind the critical ones."""
+    app, client = small_fleet
+    name = "SAT-000"
+    was = {"quantity": "ambiguous_share", "severity": "critical", "current_severity": "warning"}
+    fleet.put_alarm(app, name, [("raised", 1.0)], **was)
+    for k, hour in enumerate((2.0, 3.0)):
+        of = {"quantity": "suspect_share", "tracker": f"STARTRACKER_{k + 1}"}
+        fleet.put_alarm(app, name, [("raised", hour)], **of)
+    text = cell_of(client.get("/").text, name, "alarms")
+    assert "critical batches with a suspect attitude, STARTRACKER_2" in text
+    assert "+2" in text
+    items = client.get("/api/v1/overview").json()["items"]
+    (item,) = [each for each in items if each["name"] == name]
+    shown = [(each["current_severity"], each["raised"]["time"][11:13]) for each in item["alarms"]]
+    assert shown == [("critical", "03"), ("critical", "02"), ("warning", "01")]
+
+
+# ---- finding a batch by its time -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "typed",
+    [
+        "1999-03-01T12:00:00Z",
+        "1999-03-01T12:00:00",
+        "1999-03-01 12:00",
+        "1999-060T12:00:00.000Z",
+        "1999-060 12:00",
+        " 1999-03-01 12:00:00 utc ",
+    ],
+)
+def test_a_time_in_any_common_form_finds_the_batch(small_fleet, typed):
+    _, client = small_fleet
+    page = text_of(client.get("/batches", params={"find": typed, "spacecraft": "SAT-001"}))
+    assert "A batch at 1999-03-01 (060) 12:00:00 UTC" in page
+
+
+def test_a_time_without_a_batch_finds_the_nearest_and_says_how_far_it_is(small_fleet):
+    _, client = small_fleet
+    before_all = shifted(fleet.END, -2 * 86_400.0).text
+    for typed, said in (
+        ("1999-03-01 12:10", "10 min earlier"),
+        ("1999-03-01 12:20", "10 min later"),
+        ("1999-03-05", "3 d earlier"),
+        (before_all, "1 d later"),
+    ):
+        page = text_of(client.get("/batches", params={"find": typed, "spacecraft": "SAT-001"}))
+        assert f"the nearest is {said}" in page, page
+    assert parse_utc(before_all).tai_ns < fleet.END.tai_ns
+
+
+def test_what_the_example_in_a_field_shows_is_read_as_it_stands(client, full_run):
+    """Every time in a placeholder of the filters, without any script."""
+    for address in ("/batches", "/annotations", "/compare"):
+        page = client.get(address, params={"run": full_run}).text
+        pattern = r'name="(start|end|find)"[^>]*placeholder="([^"]*\d)"'
+        for name, example in re.findall(pattern, page):
+            for typed in example.split(" or "):
+                answer = client.get(address, params={"run": full_run, name: typed})
+                assert answer.status_code == 200, (address, name, typed)
+
+
+# ---- the state of a spacecraft -------------------------------------------------------------------
+
+
+def test_a_state_names_the_worst_of_attitude_tracker_alarms_and_freshness():
+    """A latest batch with a good attitude alone makes no spacecraft good."""
+    counts = {"observed": 10, "unique": 5, "ambiguous": 0, "unmatched": 5}
+    hour = WindowCounts(start="", end="", batches=60, solved=60, suspect=59, **counts)
+    row = FleetRow(
+        name="X",
+        description="",
+        retired=False,
+        state="good",
+        alarms=(),
+        trackers=(TrackerCounts("A", 5, 5), TrackerCounts("B", 5, 5)),
+        age_s=0.0,
+        received_age_s=60.0,
+    )
+    blind = (TrackerCounts("A", 5, 5), TrackerCounts("B", 5, 0))
+    for changed, words in (
+        ({}, []),
+        ({"trackers": blind}, ["B 0 of 5"]),
+        ({"last_hour": hour}, ["suspect in 59 of 60 of the last hour"]),
+        ({"received_age_s": 7200.0}, ["silent"]),
+        ({"state": "no_attitude"}, ["no attitude"]),
+        (
+            {"trackers": blind, "last_hour": hour, "received_age_s": 7200.0},
+            ["silent", "B 0 of 5", "suspect in 59 of 60 of the last hour"],
+        ),
+    ):
+        line = OverviewLine(replace(row, **changed), 0, None)
+        assert [each.words for each in line.faults] == words
+        assert line.in_trouble is bool(words)
+        assert (line.state == "good") is not bool(words)
+
+
+# ---- files that are sent -------------------------------------------------------------------------
+
+
+def ended(client, answer):
+    place = answer.raise_for_status().headers["Location"]
+    wait_until(lambda: client.get(place).json()["state"] not in ("running", "waiting"), 60.0)
+    return client.get(place).json()
+
+
+def send(client, run, body, kind):
+    return client.post(
+        "/api/v1/replays", params={"run": run}, content=body, headers={"Content-Type": kind}
+    )
+
+
+CSV = (
+    "spacecraft,batch,time,tracker,h_deg,v_deg,magnitude,q1,q2,q3,qc\n"
+    "XTE,c-1,1999-03-01T00:00:00Z,STARTRACKER_1,0.5,0.25,5.1,0,0,0,1\n"
+    "XTE,c-1,1999-03-01T00:00:00Z,STARTRACKER_1,-0.5,0.75,5.6,0,0,0,1\n"
+    "XTE,c-2,1999-03-01T00:01:00Z,STARTRACKER_1,0.1,0.2,5.1,0,0,0,1\n"
+)
+
+
+def test_a_csv_file_is_replayed_as_the_command_replays_it(client, run, tmp_path):
+    file = tmp_path / "pass.csv"
+    file.write_text(CSV)
+    expected = [json.loads(each.body) for each in read_lines(file)]
+    assert len(expected) == 2
+    # Each kind of line end and coding that the command reads.
+    with_returns = CSV.replace("\n", "\r").encode()
+    for k, body in enumerate((CSV.encode(), with_returns, CSV.encode("utf-16"))):
+        replay = ended(client, send(client, f"{run}-{k}", body, "text/csv"))
+        assert (replay["state"], replay["counts"]["new"]) == ("done", 2), replay
+        found = client.get("/api/v1/batches", params={"run": f"{run}-{k}"}).json()["items"]
+        assert {each["batch"] for each in found} == {each["batch"] for each in expected}
+
+
+def test_a_csv_file_that_is_sent_as_lines_is_refused_at_once(client, run):
+    answer = send(client, run, CSV.encode(), "application/x-ndjson")
+    assert answer.status_code == 422
+    assert "looks like CSV" in answer.json()["detail"]
+
+
+def test_a_file_of_which_nothing_is_recorded_is_never_done(client, run, batch):
+    """Equal faults are one row of its page."""
+    lines = [json.dumps(batch | {"batch": f"b{k}", "time": "yesterday"}) for k in range(301)]
+    replay = ended(client, send(client, run, "\n".join(lines).encode(), "application/x-ndjson"))
+    assert (replay["state"], replay["lines"]["refused"]) == ("failed", 301)
+    page = client.get(f"/replays/{replay['id']}").text
+    assert page.count("<tr>") == 2
+    assert re.search(r'<th scope="row" class="number">1</th><td class="number">301</td>', page)
+
+
+# ---- adopting ------------------------------------------------------------------------------------
+
+
+def test_an_adopted_result_says_who_adopted_it_and_why(client, post, batch, run):
+    first = post(batch | {"run": run}).json()
+    signed = {"who": "A. Nyberg", "comment": "é, “why”"}
+    asked = {"options": {"solver": "triad"}, "adopt": True, **signed}
+    adopted = client.post(f"/api/v1/batches/{first['id']}/what-if", json=asked).json()
+    record = client.get(f"/api/v1/batches/{adopted['id']}").json()
+    assert (record["signature"]["who"], record["signature"]["comment"]) == ("A. Nyberg", "é, “why”")
+    page = text_of(client.get(f"/batches/{adopted['id']}"))
+    assert re.search(r"made from this result by A\. Nyberg , .* UTC, wall clock: é, “why”", page)
+    assert "signature" not in client.get(f"/api/v1/batches/{first['id']}").json()
+    for asked, is_listed in (
+        ({"person": "A. Nyberg"}, True),
+        ({"action": "what_if", "about": first["id"]}, True),
+        ({"person": "local"}, True),
+        ({"person": "B. Nyberg"}, False),
+        ({"action": "acknowledge"}, False),
+    ):
+        items = client.get("/api/v1/audit", params=asked).json()["items"]
+        found = [each for each in items if first["id"] in each["about"]]
+        assert [(each["person"], each["reason"]) for each in found] == [
+            ("A. Nyberg", "é, “why”")
+        ] * is_listed
+        listed = client.get("/audit", params=asked).text
+        assert (f"/api/v1/batches/{first['id']}/what-if" in listed) is is_listed
+
+
+def test_adopting_a_much_worse_fit_is_warned_of_with_both_figures(post, batch, run):
+    answer = answer_from_json(post(batch | {"run": run}).content)
+    attitude = answer.attitude
+    assert attitude is not None
+    for new, is_warned in ((attitude.residual_rms_arcsec, False), (2991.0, True)):
+        after = structs.replace(answer, attitude=structs.replace(attitude, residual_rms_arcsec=new))
+        told = [each for each in adoption(answer, after) if each.startswith("▲")]
+        assert bool(told) is is_warned
+        if is_warned:
+            was = arcsec(attitude.residual_rms_arcsec)
+            assert told == [
+                f"▲ The new attitude fits its stars worse: residual rms {was} to 2991″."
+            ]
+    assert adoption(answer, structs.replace(answer, attitude=None))[0].startswith("▲")
+
+
+# ---- definitive attitude without a gyro ----------------------------------------------------------
+
+
+def test_without_gyro_data_the_pages_say_what_is_missing_and_link_no_file_that_is_not_there(
+    chosen_database, drawn
+):
+    app = open_app(in_process_settings(chosen_database()))
+    with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+        for each in drawn("XTE", 12, cadence_s=3600.0):
+            client.post("/api/v1/batches", json=each).raise_for_status()
+        before = text_of(client.get("/spacecraft/XTE/grades"))
+        assert before.count("There are no gyro data in this period") == 1
+        app.grades.smooth("XTE")
+        after = client.get("/spacecraft/XTE/grades").text
+        files = client.get("/spacecraft/XTE/files").text
+        assert "None is good. There are no gyro data in this period" in files
+        assert "Make them" not in files
+        for page in (after, files):
+            links = re.findall(r'href="(/api/v1/spacecraft/XTE/attitude[^"]*)"', page)
+            for link in links:
+                assert client.get(link.replace("&amp;", "&")).status_code == 200, link
+        assert "grade=raw" in files
+
+
+# ---- figures and words ---------------------------------------------------------------------------
+
+
+def test_no_page_shows_a_bare_code_or_a_time_of_a_thousandth(client, full_run):
+    for address in console_addresses():
+        page = client.get(f"{address}?run={full_run}").text
+        assert not re.findall(r'value="[^"]*\.001Z"', page), address
+        shown = re.sub(r"<(template|code|pre).*?</\1>|<[^>]+>", " ", page, flags=re.DOTALL)
+        assert not re.findall(r"none so far|\bno_match\b|lost_in_space_refused", shown), address
+
+
+@pytest.mark.parametrize("text", ["lost_in_space_refused: no_match", "same_star_twice", "a: b c"])
+def test_a_warning_is_a_sentence_beside_its_code(text):
+    said, code = formatting.warning(text)
+    assert code == text.partition(":")[0]
+    assert "_" not in said
+
+
+def test_a_share_of_rejected_attitudes_is_written_in_percent_with_its_unit():
+    name = quantities.REJECTED
+    assert formatting.quantity(0.005, name) == "0.50\u202f%"
+    assert (formatting.unit_of(name), formatting.entered(0.005, name)) == ("%", "0.5")
+
+
+def test_advice_without_batches_draws_no_table(client):
+    page = client.get("/advice/SOHO?run=nothing").text
+    assert "There are no batches in this period" in page
+    assert "With other settings" not in page
+
+
+def test_the_link_to_a_period_names_its_ends(client, full_run):
+    """Whoever follows it sees the same period, whenever that is."""
+    for path in ("", "/period", "/grades", "/files"):
+        page = client.get(f"/spacecraft/XTE{path}?run={full_run}&range=day").text
+        link = re.search(r'id="period-link" hidden>([^<]*)<', page)[1].replace("&amp;", "&")
+        asked = parse_qs(urlsplit(link).query)
+        assert link.startswith(f"{client.base_url}/spacecraft/XTE{path}?")
+        assert {"start", "end"} <= set(asked)
+        assert "range" not in asked
+        again = client.get(link).text
+        assert asked["start"][0].removesuffix(".000Z") in again
