@@ -128,7 +128,6 @@ def filled(address: str, app: App) -> Mapping[str, str]:
         "limits": f"/spacecraft/XTE/limits?{run}",
         "runs": f"/runs?{run}",
         "replay": f"/replays/{replays[0]['id']}?{run}",
-        "zones": f"/zones?{run}",
         "missions": f"/missions?{run}",
         "advice": f"/advice/XTE?{run}&sample=60",
         "grades": f"/spacecraft/XTE/grades?{run}&{DAY}",

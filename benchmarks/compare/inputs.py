@@ -625,7 +625,7 @@ def reads(batches: Sequence[Request]) -> list[Request]:
         paths.append(("read: page", f"/batches/{{{one.name}:id}}"))
     paths.append(("read: batch", f"{API}/batches/{{frame-0:id}}"))
     paths.append(("read: batch", f"{API}/batches/{{what-if-1:id}}"))
-    for page in ("/", "/alarms", "/batches", "/runs", "/zones", "/missions", "/about", "/compare"):
+    for page in ("/", "/alarms", "/batches", "/runs", "/missions", "/about", "/compare"):
         paths.append(("read: page", page))
     for page in ("/spacecraft/XTE", "/spacecraft/SOHO/limits", "/spacecraft/NOPE", "/sign-in"):
         paths.append(("read: page", page))

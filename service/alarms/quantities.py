@@ -123,11 +123,6 @@ class Quantity:
         return isinstance(self.source, StarShare | BatchShare)
 
     @property
-    def is_percent(self) -> bool:
-        """True if pages show it in percent."""
-        return self.is_share or isinstance(self.source, SmoothedShare)
-
-    @property
     def value_of(self) -> Callable[[Mapping[str, Any]], float | None]:
         """The function that gives the value of one result, a row; None where it has none."""
         match self.source:

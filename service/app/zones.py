@@ -51,19 +51,14 @@ class Zones:
         )
 
     def advised_size(self, name: str, run: str | None) -> tuple[ZoneSize, list[ZoneCost]]:
-        """As `size`, with the costs only where another size is advised."""
+        """Advice on the size of a spacecraft's zone by a run's a priori errors.
+
+        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
+        has none.  The costs are those of the sizes, where another size is advised.
+        """
         size, cost_of = self._size(name, run)
         changes = size.verdict in ("too_small", "larger_than_needed")
         return size, [cost_of(each) for each in size.sizes_deg] if changes else []
-
-    def size(self, name: str, run: str | None = None) -> tuple[ZoneSize, list[ZoneCost]]:
-        """Advice on the size of a spacecraft's zone by a run's a priori errors, and the costs.
-
-        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
-        has none.
-        """
-        size, cost_of = self._size(name, run)
-        return size, [cost_of(each) for each in size.sizes_deg]
 
     def _size(self, name: str, run: str | None) -> tuple[ZoneSize, Callable[[float], ZoneCost]]:
         mission = self._context.mission(name)

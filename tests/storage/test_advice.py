@@ -129,7 +129,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
         recorded[-1]["time"],
         BATCHES,
     ]
-    zone = zone_statements(mission, *app.zones.size("XTE", "night"))
+    zone = zone_statements(mission, *app.zones.advised_size("XTE", "night"))
     # Batches came in another order, which sums of floats may tell in their last digit.
     expected = to_builtins(advice_record("XTE", "night", sample, plain, zone))
     given = to_builtins(found)

@@ -524,7 +524,7 @@ def test_what_is_changed_is_noted_with_who_changed_it(guarded, anybody, drawn):
     listed = anybody.get("/api/v1/audit", headers=shown(guarded.all)).json()["items"]
     newest = [(each["who"], each["action"], each["status"]) for each in listed[:2]]
     assert newest == [("all", "what_if", 201), ("operate", "drop_zones", 200)]
-    assert json.loads(listed[0]["body"]) == {"record": True}
+    assert json.loads(listed[0]["body"]).items() >= {"record": True}.items()
     assert listed[1]["about"] == "/api/v1/zones?spacecraft=SWAS"
     page = anybody.get("/api/v1/audit?limit=1", headers=shown(guarded.all))
     following = re.match("<([^>]+)>", page.headers["Link"])[1]

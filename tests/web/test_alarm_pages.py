@@ -58,7 +58,7 @@ def test_the_page_of_an_alarm_says_why_and_what_to_do(fleet_client):
 
 
 def test_every_page_counts_the_open_alarms_in_header_and_title(fleet_client):
-    for page in ("/", "/alarms", "/zones", f"/spacecraft/{fleet.troubled(SIZE)[0]}"):
+    for page in ("/", "/alarms", f"/spacecraft/{fleet.troubled(SIZE)[0]}"):
         answer = fleet_client.get(page)
         assert f"<title>◆ ({fleet.IN_TROUBLE}) " in answer.text, page
         assert f"{fleet.IN_TROUBLE} alarms open" in text_of(answer)

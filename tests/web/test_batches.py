@@ -148,7 +148,9 @@ def test_a_what_if_answers_and_leaves_no_trace(post, batch, client):
     assert client.get(f"{URL}/{id}").json() == before
 
 
-def test_a_setting_that_changes_nothing_is_refused_by_name_and_shown_idle(post, batch, run, client):
+def test_a_setting_that_changes_nothing_is_refused_by_name_and_not_offered(
+    post, batch, run, client
+):
     id = post(batch | {"run": run}).json()["id"]
     idle = {"tests": {"fov_rotation": True}, "tolerances": {"separation_deg": 1e-6}}
     compared = {"spacecraft": batch["spacecraft"], "run": run, "b": idle}
@@ -161,7 +163,11 @@ def test_a_setting_that_changes_nothing_is_refused_by_name_and_shown_idle(post, 
         for name in ("tests.fov_rotation", "tolerances.separation_deg"):
             assert f"{field}.{name}" in answer.text
         assert "is not used by the identifier verified" in answer.text
-    assert "is not used by the identifier verified" in client.get(f"/batches/{id}").text
+    page = client.get(f"/batches/{id}").text
+    assert 'name="tolerances.pair_separation_max_deg"' in page
+    for left_out in ("tolerances.separation_deg", "tests.fov_rotation", "zone_grid_deg"):
+        assert f'name="{left_out}"' not in page
+    assert 'name="tolerances.separation_deg"' in client.get(f"/batches/{id}?identifier=starid").text
 
 
 def test_a_recorded_what_if_stands_beside_the_first_result(post, batch, client):

@@ -134,7 +134,6 @@ def test_with_nothing_recorded_it_says_what_to_do(empty):
     # Commands to copy, with the address at which the reader found the service.
     assert f"acquire replay xte.ndjson --run live --url {empty.base_url}" in answer.text
     assert "No live batches of XTE yet" in text_of(empty.get("/spacecraft/XTE"))
-    assert "No zones are cached" in text_of(empty.get("/zones"))
 
 
 def test_with_only_named_runs_it_leads_to_them(empty, batch):
@@ -145,16 +144,16 @@ def test_with_only_named_runs_it_leads_to_them(empty, batch):
     assert "acquire replay xte.ndjson --run live" in text
 
 
+CHOSEN_RANGE = re.compile(r"<option selected>(hour|day|week|month|year)</option>")
+
+
 def test_a_named_run_is_first_shown_over_the_range_that_holds_it(client, full_run):
     # 20 batches of XTE last ten minutes, those of SOHO more than an hour and a half.
     for name, fitting in (("XTE", "hour"), ("SOHO", "day")):
         page = client.get(f"/spacecraft/{name}", params={"run": full_run}).text
-        (current,) = re.findall(
-            r'<a class="button" data-go href="[^"]*" aria-current="true">(\w+)', page
-        )
-        assert current == fitting
+        assert CHOSEN_RANGE.findall(page) == [fitting]
     page = client.get("/spacecraft/XTE", params={"run": full_run, "range": "year"}).text
-    assert re.findall(r'aria-current="true">(\w+)</a>', page) == ["year"]
+    assert CHOSEN_RANGE.findall(page) == ["year"]
 
 
 @pytest.mark.parametrize(
@@ -197,7 +196,7 @@ def test_a_failed_solve_shows_no_attitude_as_the_present_one(client, post, batch
     shown = [f"{abs(q):.6f}" for q in first["attitude"]["quaternion"]]
     assert not any(each in row for each in shown)
     page = text_of(client.get(f"/spacecraft/XTE?run={run}"))
-    latest = page[page.index("Latest batch") : page.index("CSV")]
+    latest = page[page.index("Latest batch") : page.index("sky, residuals")]
     assert "05:00:00" in latest
     assert "no attitude" in latest
     assert "σ" not in latest
@@ -358,7 +357,7 @@ def test_fields_that_stand_as_they_stood_are_no_what_if(client, full_run):
         for tag, attributes in Markup(client.get(address).text).elements
         if tag == "input" and "data-before" in attributes
     }
-    assert len(fields) > 8
+    assert len(fields) >= 2
     assert "What-if, not recorded" not in client.get(address, params=fields).text
 
 
@@ -370,13 +369,11 @@ def test_settings_as_toml_read_back_as_what_was_asked():
             "tests.magnitude": "off",
             "tolerances.separation_deg": "0.01",
             "tolerances.magnitude_mag": str(held["tolerances"]["magnitude_mag"]),
-            "zone_grid_deg": "0",
         }
     )
     text = options.toml_of(options.fields_of(asked, held))
     assert tomllib.loads(text) == {
         "identifier": "starid",
-        "zone": {"grid_deg": 0.0},
         "tests": {"magnitude": False},
         "tolerances": {"separation_deg": 0.01},
     }
@@ -411,7 +408,7 @@ def test_a_sparkline_has_a_gap_where_nothing_was_recorded():
     assert [part[0][0] for part in parts] == [
         round(PAD + k * (WIDTH - 2 * PAD) / 8) for k in (0, 4, 6)
     ]
-    assert path == "M2 20l16 -9l15 9M64 2h0M95 16h15l16 -5"
+    assert path == "M2 36l18 -17l19 17M76 2h0M113 28h19l18 -9"
     assert parts[1] == [(64, PAD), (64, PAD)]
     for x, y in itertools.chain(*parts):
         assert 0 <= x <= WIDTH

@@ -87,7 +87,8 @@ def test_dark_and_light_follow_the_system_until_chosen(browser, address, full_ru
 def test_every_control_can_be_reached_by_keyboard_and_shows_it(browser, address, full_run):
     browser.open(f"{address}/spacecraft/XTE?run={full_run}")
     browser.wait(lambda: browser.run(DRAWN))
-    wanted = {"Skip to the content", "Batches", "run", "theme", "hour", "Zoom in", "by"}
+    browser.run("document.getElementById('more').open = true")
+    wanted = {"Skip to the content", "Overview", "run", "theme", "More", "Zoom in", "by"}
     reached = set()
     # What other tests recorded is on the page, too: each alarm and note is a link more.
     for _ in range(200):
@@ -106,6 +107,29 @@ def test_every_control_can_be_reached_by_keyboard_and_shows_it(browser, address,
         )
     assert wanted <= reached
     assert "stars" in reached
+    # The navigation is one stop; arrow keys go from page to page.
+    browser.run("document.querySelector('nav a').focus()")
+    browser.press("ArrowRight")
+    assert browser.run("document.activeElement.textContent") == "Alarms"
+
+
+BEFORE_THE_CHART = """(() => {
+  const chart = document.querySelector("[data-chart]");
+  const kinds = "a[href], button, input, select, textarea, summary, [tabindex]";
+  return [...document.querySelectorAll(kinds)]
+    .filter((each) => each.tabIndex >= 0 && !each.disabled && each.checkVisibility())
+    .filter((each) => each.compareDocumentPosition(chart) & Node.DOCUMENT_POSITION_FOLLOWING)
+    .map((each) => each.name || each.textContent.trim());
+})()"""
+
+
+def test_the_first_chart_is_ambiguity_and_few_controls_stand_before_it(browser, address, full_run):
+    browser.open(f"{address}/spacecraft/XTE?run={full_run}", width=400)
+    browser.wait(lambda: browser.run(DRAWN))
+    assert browser.run("document.querySelector('[data-chart]').dataset.chart") == "stars"
+    controls = browser.run(BEFORE_THE_CHART)
+    assert len(controls) <= 8, controls
+    assert browser.run("document.querySelector('[data-chart]').getBoundingClientRect().top") < 500
 
 
 def test_a_chart_zooms_and_pans_and_the_address_says_where(browser, address, full_run):
@@ -169,8 +193,8 @@ def test_a_point_of_a_trend_leads_to_its_batches_and_lines_can_be_hidden(
 ):
     browser.open(f"{address}/spacecraft/XTE?run={full_run}&beside=SOHO")
     browser.wait(lambda: browser.run(DRAWN))
-    browser.wait(lambda: "SOHO" in text(browser, "[data-readout=stars] + .chart-keys"))
-    key = "document.querySelector('[data-readout=stars] + .chart-keys button')"
+    browser.wait(lambda: "SOHO" in text(browser, "[data-chart=stars] + .chart-keys"))
+    key = "document.querySelector('[data-chart=stars] + .chart-keys button')"
     browser.run(f"{key}.click()")
     assert browser.run(f"{key}.ariaPressed") == "false"
     browser.wait(lambda: browser.run(f"document.activeElement === {key}"))
@@ -666,6 +690,7 @@ def test_a_new_critical_alarm_sounds_once_if_that_is_switched_on(browser, addres
     receive()
     assert browser.run(rung) == 0
     # A browser makes no sound before somebody has clicked.
+    browser.run("sound.scrollIntoView()")
     x, y = browser.run("(b => [b.x + 9, b.y + 9])(sound.getBoundingClientRect())")
     for kind in ("mousePressed", "mouseReleased"):
         browser.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)

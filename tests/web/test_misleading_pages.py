@@ -13,7 +13,7 @@ from service.alarms import quantities
 from service.app.factory import open_app
 from service.observations.telemetry import read_lines
 from service.storage.models.spacecraft import WindowCounts
-from service.storage.queries.fleet import FleetRow, TrackerCounts
+from service.storage.queries.fleet import DayCounts, FleetRow, TrackerCounts
 from service.storage.queries.results import answer_from_json
 from service.times import parse_utc, shifted
 from service.web.app import create_app
@@ -175,6 +175,30 @@ def test_a_state_names_the_worst_of_attitude_tracker_alarms_and_freshness():
         assert [each.words for each in line.faults] == words
         assert line.in_trouble is bool(words)
         assert (line.state == "good") is not bool(words)
+
+
+def test_a_rate_says_how_far_it_is_from_yesterdays_and_on_how_many_stars():
+    """Against counts by hand: 3 of 100 stars after 10 of 200."""
+    days = DayCounts(100, 3, 200, 10)
+    assert days.points == pytest.approx(-2.0)
+    assert DayCounts(100, 3, 0, 0).points is None
+    assert DayCounts(0, 0, 200, 10).points is None
+
+
+def test_the_change_since_yesterday_counts_the_hours_of_both_days(small_fleet):
+    """As the rates of the API have them, hour by hour."""
+    app, client = small_fleet
+    hour = "{}T01:00:00Z"
+    for name in ("SAT-000", "SAT-005"):
+        (row,) = app.spacecraft.fleet([name], "live", "day").rows
+        counted = []
+        for day, next_day in (("1999-03-01", "1999-03-02"), ("1999-02-28", "1999-03-01")):
+            asked = {"start": hour.format(day), "end": hour.format(next_day)}
+            rates = client.get(f"/api/v1/spacecraft/{name}/rates", params=asked).json()["items"]
+            counted += [sum(each[part] for each in rates) for part in ("observed", "ambiguous")]
+        assert counted[0] > counted[2] > 0
+        assert row.days == DayCounts(*counted)
+        assert f"of {counted[0]}</small>" in client.get("/").text
 
 
 # ---- files that are sent -------------------------------------------------------------------------

@@ -84,8 +84,8 @@ def test_a_new_format_is_written_by_the_command(ndjson, app, full_run, capsys):
 
 
 def test_a_new_format_is_offered_by_the_page(ndjson, client, full_run):
-    page = client.get("/spacecraft/XTE", params={"run": full_run}).text
-    assert "NDJSON:" in page
+    page = client.get("/spacecraft/XTE/files", params={"run": full_run}).text
+    assert ">NDJSON</a>" in page
     assert "format=ndjson" in page
 
 

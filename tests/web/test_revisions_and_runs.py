@@ -1,4 +1,4 @@
-"""Pages that compare: missions before and after a change, two runs, a zone and its errors."""
+"""Pages that compare: missions before and after a change, and two runs."""
 
 import re
 
@@ -179,28 +179,6 @@ def test_a_mission_shows_what_changed_between_its_revisions(chosen_database, mis
         ("trackers.STARTRACKER_1.sigma_arcsec", "2.1213203", "4.5"),
     ]
     assert "× 2<" in table
-
-
-def test_the_page_of_zones_weighs_the_zone_of_a_spacecraft_with_batches(two_runs):
-    page = text_of(two_runs.get("/zones?run=votes"))
-    assert "Size of the zone of XTE" in page
-    assert "The zone of 10.66° leaves room for an error of 6.66°" in page
-    assert "0.4224" in page
-    found = two_runs.get("/api/v1/spacecraft/XTE/history?run=votes&strategy=latest&size=100").json()
-    angles = [each for each in found["series"]["a_priori_angle_deg"]["value"] if each is not None]
-    assert f"The a priori attitude of the latest {len(angles)} batches of run votes" in page
-    assert "No batch of run votes" in text_of(two_runs.get("/zones?run=votes&spacecraft=SOHO"))
-    assert two_runs.get("/zones?spacecraft=NOPE").status_code == 404
-
-
-def test_only_operators_are_offered_to_change_the_cache(chosen_database):
-    service = Guarded(chosen_database())
-    reader, operator = (
-        shown(service.token(name, "read", *more)) for name, more in (("r", ()), ("o", ("operate",)))
-    )
-    with Server(create_app(service.app)) as url:
-        assert "Build a zone" not in httpx.get(f"{url}/zones", headers=reader, timeout=60).text
-        assert "Build a zone" in httpx.get(f"{url}/zones", headers=operator, timeout=60).text
 
 
 def test_without_a_partner_options_are_offered_for_a_spacecraft_with_batches(two_runs):

@@ -257,6 +257,14 @@ class Summary(Model, frozen=True, kw_only=True):
     archived: bool
 
 
+class Signature(Model, frozen=True, kw_only=True):
+    """Who recorded or adopted a what-if, when and why."""
+
+    who: str
+    at: str
+    comment: str | None
+
+
 class Result(Model, frozen=True, kw_only=True):
     """A result with its batch as it was sent, and the other results of that batch."""
 
@@ -269,6 +277,7 @@ class Result(Model, frozen=True, kw_only=True):
     archived: bool
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None
+    signature: Signature | None = None
 
 
 class PictureAttitude(Model, frozen=True, kw_only=True):

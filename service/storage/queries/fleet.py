@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Literal
 
@@ -62,6 +62,24 @@ class KnownAttitude:
 
 
 @dataclass(frozen=True)
+class DayCounts:
+    """Observed and ambiguous stars of the day that ends with the run's latest hour, and before."""
+
+    observed: int = 0
+    ambiguous: int = 0
+    observed_before: int = 0
+    ambiguous_before: int = 0
+
+    @property
+    def points(self) -> float | None:
+        """How many percent points the ambiguous share rose; None where a day has no star."""
+        if not self.observed or not self.observed_before:
+            return None
+        before = self.ambiguous_before / self.observed_before
+        return 100.0 * (self.ambiguous / self.observed - before)
+
+
+@dataclass(frozen=True)
 class FleetRow:
     """The state of one spacecraft in a run; None without a batch."""
 
@@ -82,6 +100,7 @@ class FleetRow:
     received_age_s: float | None = None
     """Since the service received its latest batch."""
     last_hour: WindowCounts | None = None
+    days: DayCounts = DayCounts()
 
     @property
     def alarms_now(self) -> list[Alarm]:
@@ -166,6 +185,7 @@ class _Facts:
         solved_ids |= _latest_ids(connection, unsolved, run, now, solved=True)
         self.attitudes = _attitudes(connection, solved_ids)
         self.last_hour = _last_hours(connection, names, run, as_of)
+        self.days = _days(connection, names, run, as_of)
 
 
 def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alarm]) -> FleetRow:
@@ -185,6 +205,7 @@ def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alar
         age_s=max(0.0, (facts.as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9),
         received_age_s=(now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9,
         last_hour=facts.last_hour.get(name),
+        days=facts.days.get(name, DayCounts()),
     )
 
 
@@ -350,6 +371,28 @@ def _hours(
         (name, number * width_s - UNIX_DAY * DAY_S, *counts)
         for name, number, *counts in connection.execute(query)
     ]
+
+
+def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dict[str, DayCounts]:
+    """The counts of the latest 24 hours with the run's latest batch, and of the 24 before."""
+    last_s = float(unix_seconds([as_of.tai_ns])[0]) // HOUR_S * HOUR_S
+    found: dict[str, DayCounts] = {}
+    for name, at_s, *counts in _hours(connection, names, run, as_of, 2 * DAY_S, HOUR_S):
+        one, known = dict(zip(COUNTS, map(int, counts), strict=True)), found.get(name, DayCounts())
+        if at_s > last_s - DAY_S:
+            known = replace(
+                known,
+                observed=known.observed + one["observed"],
+                ambiguous=known.ambiguous + one["ambiguous"],
+            )
+        elif at_s > last_s - 2 * DAY_S:
+            known = replace(
+                known,
+                observed_before=known.observed_before + one["observed"],
+                ambiguous_before=known.ambiguous_before + one["ambiguous"],
+            )
+        found[name] = known
+    return found
 
 
 _IN_NAMES = results.c.spacecraft.in_(bindparam("names", expanding=True))

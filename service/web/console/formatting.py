@@ -11,7 +11,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from service.alarms.quantities import quantity_named
+from service.alarms.quantities import Quantity, SmoothedShare, quantity_named
 from service.times import Utc, recorded_utc, shifted, utc_now
 
 DASH = "–"
@@ -250,12 +250,16 @@ UNITS: Mapping[str, Callable[[float], str]] = {
 }
 
 
+def _in_percent(known: Quantity) -> bool:
+    return known.is_share or isinstance(known.source, SmoothedShare)
+
+
 def quantity(value: float | None, name: str) -> str:
     """A value of a quantity with its unit."""
     if value is None:
         return DASH
     known = quantity_named(name)
-    if known.is_percent:
+    if _in_percent(known):
         return share(value)
     if (shown := UNITS.get(known.unit)) is not None:
         return shown(value)
@@ -265,14 +269,14 @@ def quantity(value: float | None, name: str) -> str:
 def unit_of(name: str) -> str:
     """The unit in which a quantity is written and entered; shares are percent."""
     known = quantity_named(name)
-    return "%" if known.is_percent else ENTERED_UNITS.get(known.unit, known.unit)
+    return "%" if _in_percent(known) else ENTERED_UNITS.get(known.unit, known.unit)
 
 
 def entered(value: float | None, name: str) -> str:
     """A bound of a quantity in `unit_of` it, as a field of a form has it; empty without one."""
     if value is None:
         return ""
-    return f"{100 * value if quantity_named(name).is_percent else value:.6g}"
+    return f"{100 * value if _in_percent(quantity_named(name)) else value:.6g}"
 
 
 def bounds(settings: Mapping[str, Any], name: str) -> str:

@@ -42,8 +42,6 @@ class FormField:
     before: Any
     choices: tuple[str, ...] = ()
     group: str = ""
-    idle: str | None = None
-    """Why it changes nothing; None where it may."""
 
     @property
     def changed(self) -> bool:
@@ -137,51 +135,46 @@ def fields_of(
 ) -> list[FormField]:
     """The fields of a form; without settings `before`, they start empty.
 
-    With a mission, those that change nothing under the form's identifier and tests say so.
+    With a mission, those that change nothing under the form's identifier and tests are left out.
     """
     held = before or {}
     in_force = before or ({} if mission is None else settings_of_mission(mission))
 
-    def idle(leaf: str) -> str | None:
+    def acts(leaf: str) -> bool:
         if mission is None:
-            return None
+            return True
         tests = Tests.model_validate({**in_force["tests"], **asked.get("tests", {})})
         identifier = asked.get("identifier", in_force["identifier"])
-        return idle_reason(leaf, identifier, tests, mission.zone)
+        return idle_reason(leaf, identifier, tests, mission.zone) is None
 
     def field(leaf: str, group: str = "", choices: Iterable[str] = ()) -> FormField:
         at = held.get(group, {}) if group else held
         wanted = asked.get(group, {}) if group else asked
         was = at.get(leaf)
         label, _, unit = leaf.rpartition("_")
-        if group != "tolerances" and leaf != "zone_grid_deg":
+        if group != "tolerances":
             label, unit = leaf, ""
         name = f"{prefix}{group}.{leaf}" if group else f"{prefix}{leaf}"
         value = wanted.get(leaf, was)
         words = label.replace("_", " ")
         symbol = SYMBOLS.get(leaf, "") if group == "tolerances" else ""
-        why = idle(leaf) if group else None
-        group = group or "method"
-        return FormField(name, words, symbol, unit, value, was, tuple(choices), group, why)
+        return FormField(name, words, symbol, unit, value, was, tuple(choices), group or "method")
 
     return [
         field("identifier", choices=tuple(IDENTIFIERS)),
         field("solver", choices=get_args(SolverName)),
-        field("zone_grid_deg"),
-        *(field(leaf, "tests", SWITCH) for leaf in Tests.model_fields),
-        *(field(leaf, "tolerances") for leaf in Tolerances.model_fields),
+        *(field(leaf, "tests", SWITCH) for leaf in Tests.model_fields if acts(leaf)),
+        *(field(leaf, "tolerances") for leaf in Tolerances.model_fields if acts(leaf)),
     ]
 
 
 def toml_of(fields: Iterable[FormField]) -> str:
     """The changed settings as lines of a mission file, each with the value that it replaces."""
-    tables: dict[str, list[str]] = {"": [], "zone": [], "tests": [], "tolerances": []}
+    tables: dict[str, list[str]] = {"": [], "tests": [], "tolerances": []}
     for each in fields:
         if not each.changed:
             continue
         group, _, leaf = each.name.rpartition(".")
-        if leaf == "zone_grid_deg":
-            group, leaf = "zone", "grid_deg"
         tables[group].append(f"{leaf} = {_toml(each.value)}  # was {_toml(each.before)}")
     parts = [
         "\n".join([*([f"[{name}]"] if name else []), *lines])

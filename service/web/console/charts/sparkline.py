@@ -8,7 +8,7 @@ import numpy as np
 
 from service.vectors import Matrix, Vector
 
-WIDTH, HEIGHT = 128, 22
+WIDTH, HEIGHT = 152, 38
 PAD = 2
 TOPS = (0.05, 0.1, 0.25, 0.5, 1.0)
 """Values for the top of a sparkline: a handful of stars shall not look like a lot."""

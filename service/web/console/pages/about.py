@@ -38,9 +38,11 @@ class Check:
 def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     """The service's health, version, catalog, missions, database and credits."""
     about = context.app.service.about(context.caller.spacecraft)
-    # Queues and machine tell what others send: a token of some spacecraft does not see them.
-    checks = list(_checks(context)) if context.caller.spacecraft is None else []
-    return context.rendered("about.html.jinja", query.run, about=about, checks=checks)
+    # Queues, machine and cache tell what others send: a token of some spacecraft sees none.
+    sees_all = context.caller.spacecraft is None
+    checks = list(_checks(context)) if sees_all else []
+    cache = context.app.zones.state() if sees_all else None
+    return context.rendered("about.html.jinja", query.run, about=about, checks=checks, cache=cache)
 
 
 def _checks(context: PageContext) -> Iterator[Check]:

@@ -13,6 +13,7 @@ from starlette.responses import RedirectResponse, Response
 from service.alarms.quantities import QUANTITIES
 from service.app.context import ALL_RUNS
 from service.errors import BadBatch, BadInput, Fault, NotFound, shown_value
+from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
 from service.observations.schema import Key
 from service.storage.models.answers import Answer, Summary
 from service.storage.models.answers import Star as FoundStar
@@ -25,7 +26,7 @@ from service.storage.tracks import TrackList
 from service.times import Utc, recorded_utc
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
-from service.web.console.formatting import arcsec
+from service.web.console.formatting import arcsec, share
 from service.web.console.options import (
     asked_options,
     batch_settings,
@@ -66,6 +67,30 @@ class VoteRow:
     found: FoundStar
     before: FoundStar | None
     catalog_magnitude: float | None
+
+    @property
+    def why(self) -> str:
+        """Why it is not unique, with the rivals, and what would make it so; empty if it is."""
+        found = self.found
+        if found.outcome == "unique":
+            return ""
+        rivals = found.rivals or []
+        chances = found.rival_probabilities or []
+        if chances:
+            told = [f"{star} {share(chance)}" for star, chance in zip(rivals, chances, strict=True)]
+            told.append(f"no star {share(max(0.0, 1.0 - sum(chances)))}")
+            return (
+                f"{', '.join(told)}; unique needs {share(UNIQUE_PROBABILITY)}: a smaller sigma, or "
+                "more stars in the field that agree with one of them"
+            )
+        if rivals:
+            return (
+                f"{', '.join(rivals)} have {found.votes} votes each; unique needs one star with "
+                "more: narrower tolerances, or more stars in the field"
+            )
+        if found.probability is not None:
+            return f"no star {share(found.probability)}"
+        return "no star of the catalog here has a vote"
 
     @property
     def changed(self) -> bool:

@@ -1,4 +1,4 @@
-"""The pages of missions: their settings with history, advice on these, and zones."""
+"""The pages of missions: their settings with history, and advice on these."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,6 @@ from urllib.parse import urlencode
 from pydantic import model_validator
 from starlette.responses import Response
 
-from service.advice.zone_size import LEAST_BATCHES, Verdict
 from service.app.advice import no_changes_text
 from service.errors import BadConfiguration
 from service.missions.mission import Tolerances
@@ -17,7 +16,7 @@ from service.storage.models.spacecraft import MissionThen
 from service.web.api.spacecraft import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.web.console.options import SYMBOLS
 from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page
-from service.web.requests.access import READ, Policy
+from service.web.requests.access import Policy
 
 MOST_SHOWN = 8
 """Missions whose settings are shown whole without being asked for."""
@@ -137,43 +136,6 @@ def _entries(history: Sequence[MissionThen]) -> list[SettingsEntry]:
         entries.append(SettingsEntry(each.digest, each.since, changes, is_first=not entries))
         before = after
     return entries
-
-
-MOST_ZONES_SHOWN = 60
-VERDICTS: dict[Verdict, str] = {
-    "too_few": f"No advice on its size: that needs {LEAST_BATCHES} batches.",
-    "fits": "The size fits.",
-    "too_small": "The zone is too small.",
-    "larger_than_needed": "The zone is larger than needed.",
-}
-
-
-class ZonesQuery(PageQuery):
-    """Whose zone is weighed: by default the first spacecraft with batches in the run."""
-
-    spacecraft: Key | None = None
-
-
-@console_page("/zones", "Zones", READ, position=75)
-def zones_page(query: FromQuery[ZonesQuery], context: ContextDep) -> Response:
-    """The size of a zone, and cached zones and run catalogs, the most recently used first."""
-    name = query.spacecraft or context.filled_spacecraft(query.run)
-    size, costs = context.app.zones.size(name, query.run)
-    cache = context.app.zones.state()
-    epochs = {each.digest: each.epoch_year for each in cache.run_catalogs}
-    return context.rendered(
-        "zones.html.jinja",
-        query.run,
-        cache=cache,
-        zones=cache.items[::-1][:MOST_ZONES_SHOWN],
-        epochs=epochs,
-        spacecraft=context.spacecraft,
-        name=name,
-        size=size,
-        costs=costs,
-        verdicts=VERDICTS,
-        may_write=context.may_operate,
-    )
 
 
 class AdviceForm(AdviceQuery):

@@ -34,6 +34,8 @@ SHOWN: dict[Shown, str] = {
     "no_attitude": "no attitude",
     "no_batches": "no batches",
 }
+UNFOLDED = 20
+"""Rows that are shown without being asked for."""
 MARKED_SHARE = 0.15
 """The share of ambiguous or unmatched stars in the last hour: by default the bound of `watch`."""
 _RANKS = {"no_attitude": 5, "critical": 5, "silent": 4, "behind": 4, "suspect": 3, "warning": 2}
@@ -54,6 +56,8 @@ class OverviewQuery(page.SortedQuery):
     q: Annotated[str, Field(max_length=64)] = ""
     show: Shown = "all"
     heat: Annotated[str, OneOf(share_names)] | None = None
+    all: bool = False
+    """True if every row is shown; else the first ones, of what has sent something."""
 
 
 @dataclass(frozen=True)
@@ -172,22 +176,39 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
         replace(_line(fleet, place, shares, top), is_live=query.run == LIVE)
         for place in range(len(fleet.rows))
     ]
-    lines = _sorted([line for line in every if _is_shown(line, query)], query)
+    found = _sorted([line for line in every if _is_shown(line, query)], query)
+    sent = [line for line in found if line.item.latest_batch] or found
+    lines = found if query.all or query.q or query.show != "all" else sent[:UNFOLDED]
+    folded = [line for line in found if line not in lines]
     return context.rendered(
         "overview.html.jinja",
         query.run,
         query=query,
         fleet=fleet,
         lines=lines,
+        folded=len(folded),
+        folded_words=_words_of(folded),
         any_batch=fleet.as_of is not None and any(line.item.latest_batch for line in every),
         every=every,
         top=top,
         periods=list(PERIODS_S),
         shown=SHOWN,
-        heat=_heat(fleet, lines, shares, query.period),
+        heat=_heat(fleet, found, shares, query.period),
         alarms=page.alarm_counts([each for line in every for each in line.item.alarms]),
         webhooks=_webhooks_in_trouble(context),
     )
+
+
+def _words_of(lines: list[OverviewLine]) -> str:
+    """How many of some rows are in trouble, without trouble, and without any batch."""
+    silent = [line for line in lines if not line.item.latest_batch]
+    trouble = [line for line in lines if line.in_trouble and line.item.latest_batch]
+    parts = (
+        (len(trouble), "in trouble"),
+        (len(lines) - len(trouble) - len(silent), "without trouble"),
+        (len(silent), "that never sent a batch"),
+    )
+    return ", ".join(f"{count} {words}" for count, words in parts if count)
 
 
 def _webhooks_in_trouble(context: page.PageContext) -> list[str]:

@@ -17,7 +17,6 @@ from service.alarms.quantities import (
     trend_names,
 )
 from service.observations.schema import Key
-from service.products.formats import table_formats
 from service.storage.models.alarms import Annotation
 from service.storage.models.answers import Summary
 from service.storage.models.base import Page
@@ -80,13 +79,15 @@ class SpacecraftQuery(PageQuery):
     until: Literal["latest", "now"] = "latest"
     """Where a range of live batches ends."""
     y: Vertical = "robust"
-    beside: Annotated[str, Field(max_length=300)] = ""
-    """Other spacecraft in the same charts, with commas between them."""
+    beside: list[Annotated[str, Field(max_length=300)]] = Field(default_factory=list)
+    """Other spacecraft in the same charts; one text may name several, with commas between them."""
+    before: Literal["", "day", "week"] = ""
+    """How much earlier the period is that charts draw in grey."""
 
     @property
     def others(self) -> list[str]:
         """The other spacecraft, as many as can be told apart."""
-        names = (name.strip() for name in self.beside.split(","))
+        names = (name.strip() for name in ",".join(self.beside).split(","))
         return list(dict.fromkeys(filter(None, names)))[:MOST_BESIDE]
 
     @property
@@ -97,7 +98,8 @@ class SpacecraftQuery(PageQuery):
             "tracker": self.tracker,
             "until": self.until if self.until == "now" else None,
             "y": self.y if self.y != "robust" else None,
-            "beside": self.beside or None,
+            "beside": ",".join(self.others) or None,
+            "before": self.before or None,
         }
 
     @field_validator("start", "end", "range", mode="before")
@@ -174,8 +176,8 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         limits=context.app.limits.all(
             name, query.tracker if query.tracker in limited_trackers(mission) else None
         ),
-        formats=table_formats(),
         query=query,
+        before=_before(name, query, stretch),
         vertical=VERTICAL,
         others=_others(context, query, stretch),
         spacecraft=[each for each in context.spacecraft if each != name],
@@ -202,7 +204,9 @@ def shown_period(
         latest = context.app.results.page(spacecraft=name, run=query.run, limit=1).items
     if not latest:
         return None
-    # The latest batch belongs to the stretch, whose end does not.
+    if query.range and query.start and query.end:
+        # A length that is typed beside both ends replaces them.
+        query = query.model_copy(update={"start": None, "end": None})
     end = query.end or second_after(latest[0].time)
     if query.until == "now" and query.run == LIVE and not query.end:
         end = max(end, utc_now(), key=lambda moment: moment.tai_ns)
@@ -283,6 +287,22 @@ def _others(context: PageContext, query: SpacecraftQuery, stretch: ShownPeriod |
         history_address(other, query.run, None, stretch.start, stretch.end)
         for other in query.others
     ]
+
+
+@dataclass(frozen=True)
+class PeriodBefore:
+    """The history of the same length some time earlier, and how much earlier."""
+
+    history: str
+    shift_s: int
+
+
+def _before(name: str, query: SpacecraftQuery, shown: ShownPeriod | None) -> PeriodBefore | None:
+    if shown is None or not query.before:
+        return None
+    shift_s = RANGES_S[query.before]
+    start, end = (shifted(each, -float(shift_s)) for each in (shown.start, shown.end))
+    return PeriodBefore(history_address(name, query.run, query.tracker, start, end), shift_s)
 
 
 @dataclass(frozen=True)

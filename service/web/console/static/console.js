@@ -31,9 +31,37 @@ system.addEventListener("change", () => {
 nameTheme();
 
 const runs = document.querySelector("[data-run-form]");
-runs.querySelector("button:not([type])").hidden = true;
 // The menu itself is replaced when the list of runs changes.
 runs.addEventListener("change", () => runs.requestSubmit());
+
+// On a narrow screen the content stands before the filter.
+if (matchMedia("(max-width: 720px)").matches) {
+  for (const each of document.querySelectorAll(".filter")) each.open = each.querySelector("[aria-invalid]") !== null;
+}
+
+// The range is chosen by the menu alone; the charts of a spacecraft are drawn without loading the page anew.
+document.addEventListener("change", ({ target }) => {
+  const form = target.closest("[data-period]");
+  if (form && target.value && !document.getElementById("charts")) form.requestSubmit();
+});
+
+// The navigation is one stop of the Tab key; arrow keys go from page to page.
+const pages = document.querySelector("nav");
+function oneStop() {
+  const links = [...pages.querySelectorAll("a")];
+  const stop = links.find((each) => each === document.activeElement) ?? links.find((each) => each.ariaCurrent) ?? links[0];
+  for (const each of links) each.tabIndex = each === stop ? 0 : -1;
+}
+oneStop();
+document.addEventListener("drawn", oneStop);
+pages.addEventListener("keydown", (event) => {
+  const links = [...pages.querySelectorAll("a")];
+  const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+  if (!step) return;
+  event.preventDefault();
+  links[(links.indexOf(event.target) + step + links.length) % links.length].focus();
+  oneStop();
+});
 
 // A sound at a new critical alarm, if it is switched on in this browser.
 const sound = document.getElementById("sound");

@@ -29,18 +29,8 @@ function palette() {
 
 const bytes = (text) => Uint8Array.from(atob(text), (each) => each.charCodeAt(0));
 
-// The quantity to show first: the one with the worst spacecraft.
-function worstQuantity({ quantities, columns }) {
-  const weights = quantities.map(({ cells }) => {
-    const rows = [];
-    bytes(cells).forEach((each, at) => {
-      const row = Math.floor(at / columns);
-      rows[row] = (rows[row] ?? 0) + Math.max(each - 1, 0);
-    });
-    return Math.max(...rows);
-  });
-  return quantities[weights.indexOf(Math.max(...weights))].name;
-}
+// The quantity to show first: the one that was chosen last in this browser.
+const FIRST = localStorage.getItem("heat") ?? "ambiguous_share";
 
 export class HeatMap {
   constructor(section) {
@@ -66,7 +56,7 @@ export class HeatMap {
     this.shown = shown;
     this.section.hidden = shown === null;
     if (shown === null) return;
-    const asked = new URLSearchParams(location.search).get("heat") ?? (this.choice.value || worstQuantity(shown));
+    const asked = new URLSearchParams(location.search).get("heat") ?? (this.choice.value || FIRST);
     this.choice.replaceChildren(
       ...shown.quantities.map(({ name, label }) => new Option(label, name, false, name === asked)),
     );
@@ -77,6 +67,7 @@ export class HeatMap {
   choose() {
     const address = new URL(location.href);
     address.searchParams.set("heat", this.choice.value);
+    localStorage.setItem("heat", this.choice.value);
     history.replaceState(null, "", address);
     this.draw();
   }

@@ -30,11 +30,13 @@ function make() {
 
 async function draw() {
   const mine = ++asked;
-  const { history, start, end, alarms, y, others } = stretch().dataset;
+  const { history, start, end, alarms, y, others, before, shift } = stretch().dataset;
   delete document.getElementById("charts").dataset.drawn;
   try {
-    const [found, ...beside] = await Promise.all([history, ...JSON.parse(others ?? "[]")].map((each) => requestJson(each)));
+    const wanted = [history, ...JSON.parse(others ?? "[]"), ...(before ? [before] : [])];
+    const [found, ...beside] = await Promise.all(wanted.map((each) => requestJson(each)));
     if (mine !== asked) return;
+    if (before) Object.assign(beside.at(-1), { unix_s: beside.at(-1).unix_s.map((each) => each + Number(shift)), shift: Number(shift) });
     shown = found;
     for (const trend of trends) {
       // Held is what the chart had when that was chosen, or has at first.
@@ -108,13 +110,13 @@ if (stretch()) {
     go(link.href);
   });
   document.addEventListener("change", (event) => {
-    const form = event.target.closest("[data-worst], [data-view]");
-    if (!form) return;
+    const form = event.target.closest("[data-worst], [data-view], [data-period]");
+    if (!form || (form.dataset.period !== undefined && !event.target.value)) return;
     event.target.blur();
     go(`${form.action}?${new URLSearchParams(new FormData(form))}`);
   });
   document.addEventListener("submit", (event) => {
-    if (!event.target.matches("[data-view]")) return;
+    if (!event.target.matches("[data-view], [data-period]")) return;
     event.preventDefault();
     go(`${event.target.action}?${new URLSearchParams(new FormData(event.target))}`);
   });

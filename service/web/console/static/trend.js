@@ -239,6 +239,9 @@ export class Trend {
     this.chart?.destroy();
     this.chart = null;
     this.holder.replaceChildren();
+    // A chart without a value is not drawn, but for the first one of the page.
+    const section = this.holder.closest("section");
+    section.hidden = !known.length && section.previousElementSibling !== null;
     if (!known.length) {
       const note = document.createElement("p");
       note.className = "chart-note";
@@ -281,7 +284,7 @@ export class Trend {
     known.forEach(({ name }, k) => {
       for (let part = 1; part <= 3; part++) series[3 * k + part].show = !this.hidden.has(name);
     });
-    this.others.forEach((_, k) => series.push({ stroke: colour(TONES[k % TONES.length]), width: 1.3, spanGaps: true, points: { show: false } }));
+    this.others.forEach(({ shift }, k) => series.push({ stroke: colour(shift ? "--soft" : TONES[k % TONES.length]), width: 1.3, spanGaps: true, points: { show: false } }));
     const scale = this.definition.percent ? 100 : 1;
     const names = known.map(({ name }) => name);
     const lines = merged(limitLines(this.limits, names), names).map((line) => ({ ...line, value: line.value * scale, text: `${line.text} ${this.text(line.value * scale)}` }));
@@ -295,7 +298,7 @@ export class Trend {
       series,
       bands,
       axes: [
-        { ...axis, values: tickLabels, space: 74, size: 58 },
+        { ...axis, values: tickLabels, space: 74, size: 64 },
         { ...axis, size: labelWidth, values: (_, splits) => splits.map((value) => `${+value.toPrecision(6)}${this.definition.unit}`) },
       ],
       hooks: {
@@ -378,8 +381,8 @@ export class Trend {
     });
     const { min: least, max: most } = chart.scales.y;
     const beyond = this.data[0].filter((_, index) => this.known.some((__, k) => this.data[3 * k + 3][index] > most || (this.data[3 * k + 2][index] !== null && this.data[3 * k + 2][index] < least))).length;
-    const names = this.known.map(({ label, dash }) => `${dash ? "╌" : "━"} ${label}`);
-    this.legend = [...names, "shaded: least to greatest", ...(beyond ? [`▲ at the edge: ${beyond} beyond it`] : [])].join("; ");
+    const names = this.known.length > 1 ? [] : this.known.map(({ label }) => label);
+    this.legend = [...names, ...(beyond ? [`▲ at the edge: ${beyond} beyond it`] : [])].join("; ") || "\u00a0";
     this.readout.textContent = this.legend;
     this.drawKeys();
     const marked = this.annotations.length ? `; ${this.definition.marks ?? "annotations"}: ${this.annotations.length}, listed below` : "";
@@ -388,21 +391,21 @@ export class Trend {
 
   // A button for each line of several, which hides it and shows it; names of other spacecraft.
   drawKeys() {
-    const keys = this.readout.nextElementSibling?.matches(".chart-keys") ? this.readout.nextElementSibling : document.createElement("p");
+    const keys = this.holder.nextElementSibling?.matches(".chart-keys") ? this.holder.nextElementSibling : document.createElement("p");
     keys.className = "chart-keys range";
-    const buttons = this.known.length > 1 ? this.known.map(({ name, label }) => this.key(name, label)) : [];
-    const names = this.others.map(({ spacecraft }, k) => {
+    const buttons = this.known.length > 1 ? this.known.map(({ name, label, dash }) => this.key(name, `${dash ? "╌" : "━"} ${label}`)) : [];
+    const names = this.others.map(({ spacecraft, shift }, k) => {
       const key = document.createElement("span");
       const mark = document.createElement("span");
       mark.textContent = "━ ";
-      mark.className = TONES[k % TONES.length].slice(2);
+      mark.className = shift ? "soft" : TONES[k % TONES.length].slice(2);
       mark.ariaHidden = "true";
-      key.append(mark, spacecraft);
+      key.append(mark, `${spacecraft}: ${this.known[0].label}${shift ? `, ${shift / DAY_S} d before` : ""}`);
       return key;
     });
     keys.replaceChildren(...buttons, ...names);
     keys.hidden = !keys.childElementCount;
-    this.readout.after(keys);
+    this.holder.after(keys);
     // The button that was pressed was replaced.
     keys.children[this.pressed ?? -1]?.focus({ preventScroll: true });
     this.pressed = null;
