@@ -37,7 +37,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 UV = $(BIN)/uv pip install --quiet --python $(BIN)/python
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header
 
-IMAGE_EXTRAS = postgresql nats spice tle packets tables dask plots images raw
+IMAGE_EXTRAS = postgresql nats sign spice tle packets tables dask plots images raw
 
 RUNTIME = $(VENV)/.installed-runtime
 DEV = $(VENV)/.installed-dev

@@ -48,6 +48,7 @@ class Settings:
     durable consumer `follow_consumer`, answers to the subject `follow_answers`, the file of
     credentials, and the CA certificate (PEM) that the NATS server's certificate is checked with.
     `features_off` are the features (`service.feature`) that the service leaves out.
+    `record_key` signs the heads of the record: a file with a private key of Ed25519, or its PEM.
     """
 
     database: str = "sqlite:///acquire.db"
@@ -77,6 +78,7 @@ class Settings:
     follow_credentials: Path | None = None
     follow_authority: Path | None = None
     features_off: str = ""
+    record_key: str | None = None
 
     def __post_init__(self) -> None:
         if not self.database.strip():

@@ -546,6 +546,12 @@ def test_the_database_is_made_checked_and_its_migrations_are_whole(acquire, tmp_
     assert "acquire database upgrade" in out
 
 
+def sound(batches):
+    """What `verify` says of a sound record without the key of its heads."""
+    accidents = "without --public-key and --head this finds accidents, not intruders"
+    return f"nothing is wrong with {batches} batches\n{accidents}\n"
+
+
 def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
     telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 8, "--nominal")
     assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
@@ -556,15 +562,17 @@ def test_records_are_copied_verified_and_pruned(acquire, tmp_path):
     assert acquire(*before, "--dry-run")[:2] == (0, told)
     told = "3 batches before 1999-03-01T00:01:30.000Z were deleted\n"
     assert acquire(*before)[:2] == (0, told)
-    assert acquire("database", "verify")[:2] == (0, "nothing is wrong with 5 batches\n")
+    assert acquire("database", "verify")[:2] == (0, sound(5))
     with closing(sqlite3.connect(tmp_path / "acquire.db")) as connection:
         # The dry run left none.
         (entry,) = connection.execute("SELECT action, body FROM audit").fetchall()
         assert entry == ("prune", '{"before": "1999-03-01T00:01:30.000Z", "run": null}')
     copy = ("--database", "sqlite:///copy.db")
-    assert acquire("database", "verify", *copy)[:2] == (0, "nothing is wrong with 8 batches\n")
+    assert acquire("database", "verify", *copy)[:2] == (0, sound(8))
     with closing(sqlite3.connect(tmp_path / "copy.db")) as connection:
         # As after an upgrade.
+        for table in ("record_leaves", "record_facts", "record_heads"):
+            connection.execute(f"DELETE FROM {table}")
         connection.execute("UPDATE results SET digest = NULL, seq = 0")
         connection.execute("UPDATE seals SET digests = 0")
         connection.commit()
@@ -591,7 +599,7 @@ def test_old_batches_are_archived_verified_and_restored(acquire, tmp_path):
     code, out, _ = acquire("archive", "--before", "1999-061T00:00:00Z", "--to", "away")
     assert code == 0
     assert out.startswith("3 batches before 1999-03-02T00:00:00.000Z were archived\n1 files, ")
-    assert acquire("database", "verify")[:2] == (0, "nothing is wrong with 1 batches\n")
+    assert acquire("database", "verify")[:2] == (0, sound(1))
     verify = ("archive", "verify", "--archive", "away")
     assert acquire(*verify)[:2] == (0, "nothing is wrong with 3 batches\n")
     again = ("archive", "restore", "--archive", "away", "--database", "sqlite:///again.db")

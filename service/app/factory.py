@@ -25,10 +25,12 @@ from service.settings import Settings, is_loopback
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
+from service.storage.projections.heads import HeadMaker, Sign
 from service.storage.projections.projector import Projector
 from service.storage.queries.histories import retired
 from service.storage.queries.replays import mark_interrupted
 from service.storage.recording.results import register
+from service.storage.recording.signing import Signer
 from service.storage.store import Store
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade, TrackerSplitter
@@ -42,14 +44,19 @@ class App:
     live one, so replays never show in live lists and rates.
     """
 
-    def __init__(self, context: Context, kernels: KernelBuild | None = None) -> None:
+    def __init__(
+        self,
+        context: Context,
+        kernels: KernelBuild | None = None,
+        head_maker: HeadMaker | None = None,
+    ) -> None:
         self.context = context
         self.settings = context.settings
         self.missions = context.missions
         self.sky = context.sky
         self.store = context.store
         self.single_projector = SingleProjector(context.store)
-        self.projector = Projector(context.store)
+        self.projector = Projector(context.store, head_maker)
         self.access = Access(
             context.store.reading_record,
             context.change,
@@ -110,6 +117,13 @@ class App:
         self.service.close()
 
 
+def _signer_of(settings: Settings) -> Sign | None:
+    """What signs heads of the record; None without a key."""
+    if settings.record_key is None:
+        return None
+    return Signer(settings.record_key).sign
+
+
 def open_app(
     settings: Settings,
     mission: Mission | None = None,
@@ -130,6 +144,8 @@ def open_app(
     missions = load_missions(settings.missions)
     if mission is not None:
         missions[mission.name] = mission
+    # A key that cannot be used is named before the database is opened.
+    head_maker = None if reads_only else HeadMaker(_signer_of(settings))
     catalog, cache = open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20)
     kernels = KernelBuild() if serving else None
     sky = SkyModel(catalog, cache)
@@ -143,7 +159,7 @@ def open_app(
     )
     with store.reading() as connection:
         context = Context(settings, missions, sky, store, retired(connection, missions))
-    app = App(context, kernels)
+    app = App(context, kernels, head_maker)
     # A mission that is given takes the place of what was adopted, too.
     leave = mission.name if mission is not None else None
 

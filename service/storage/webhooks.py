@@ -25,6 +25,7 @@ from service.storage.models.base import (
     list_record,
     page_record,
 )
+from service.storage.recording import chain
 from service.storage.recording.events import EventKind
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
@@ -156,6 +157,7 @@ def change_webhook(connection: Connection, id: str, changes: Row) -> None:
     )
     if not changed.rowcount:
         raise _unknown(id)
+    chain.note_changed(connection, webhooks, id)
 
 
 def delete_webhook(connection: Connection, id: str) -> None:
@@ -163,6 +165,7 @@ def delete_webhook(connection: Connection, id: str) -> None:
     connection.execute(delete(webhook_deliveries).where(webhook_deliveries.c.webhook_id == id))
     if not connection.execute(delete(webhooks).where(webhooks.c.id == id)).rowcount:
         raise _unknown(id)
+    chain.note_removed(connection, webhooks, [id])
 
 
 def count_webhooks(connection: Connection) -> int:

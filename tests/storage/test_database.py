@@ -142,7 +142,7 @@ def test_a_read_only_file_is_verified_and_exported(database, opened, make, tmp_p
         command += ["--database", f"sqlite:///{source}"]
         return subprocess.run(command, capture_output=True, text=True, check=False)
 
-    assert acquire("database", "verify").stdout == "nothing is wrong with 1 batches\n"
+    assert "nothing is wrong with 1 batches\n" in acquire("database", "verify").stdout
     assert acquire("export", "batches", "--spacecraft", "XTE").stdout.count("\n") == 2
     refused = acquire("database", "prune", "--before", "2000-001T00:00:00Z")
     assert refused.returncode == 2

@@ -50,6 +50,17 @@ def add(commands: Any) -> None:
     parser.add_argument("backup", type=Path, metavar="FILE", help="made by `database backup`")
     arguments.add_database(parser)
     parser = arguments.add_command(group, "verify", verify)
+    parser.add_argument(
+        "--public-key",
+        type=Path,
+        metavar="FILE",
+        help="the public key (PEM) of the key that signs the heads of the record",
+    )
+    parser.add_argument(
+        "--head",
+        metavar="FILE|VALUE",
+        help="heads that were noted elsewhere: a log, or `NUMBER SHA256`",
+    )
     arguments.add_json(parser, "the faults")
     arguments.add_database(parser)
     parser = arguments.add_command(group, "copy", copy)
@@ -162,13 +173,21 @@ def verify(parsed: Namespace) -> int:
 
     acquire database verify
     acquire database verify --database sqlite:///night.db
+    acquire database verify --public-key record.pub.pem --head heads.log
     """
+    from service.storage.recording.signing import PublicKey
     from service.storage.upkeep.verify import earlier_results
     from service.storage.upkeep.verify import verify as verify_records
+    from service.storage.upkeep.verify_chain import anchors_in
 
     database = settings_of(parsed).database
+    public_key = None if parsed.public_key is None else PublicKey(parsed.public_key)
+    anchors = []
+    if parsed.head is not None:
+        file = Path(parsed.head)
+        anchors = anchors_in(file.read_text(encoding="utf-8") if file.is_file() else parsed.head)
     with progress_bar("batches", "reading") as bar:
-        problems = verify_records(database, bar)
+        problems = verify_records(database, bar, public_key=public_key, anchors=anchors)
     if parsed.json:
         arguments.print_json({"batches": bar.done, "faults": problems})
         return 1 if problems else 0
@@ -176,6 +195,8 @@ def verify(parsed: Namespace) -> int:
     if problems:
         return 1
     print(f"nothing is wrong with {bar.done} batches")
+    if public_key is None and not anchors:
+        print("without --public-key and --head this finds accidents, not intruders")
     without, later = earlier_results(database)
     if later:
         print(f"{later} results got their digest at an upgrade: changes before it are not found")

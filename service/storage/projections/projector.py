@@ -10,21 +10,25 @@ so that they take turns.
 """
 
 import logging
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeVar
 
 from sqlalchemy import Connection, select, update
 
 from service.errors import BadConfiguration, Busy
 from service.storage.projections import alarms, rollups, seals
+from service.storage.projections.heads import NOTHING, HeadMaker
 from service.storage.projections.rollups import RecordedResult, lock_position, recorded_after
 from service.storage.queries.pages import newest_first
 from service.storage.recording import events
 from service.storage.recording.answer import state_in
+from service.storage.recording.chain import Statement
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
 from service.storage.sql.columns import Row, unpack
 from service.storage.sql.projector_lock import NotProjecting
@@ -33,6 +37,8 @@ from service.storage.sql.tables import projector, results
 from service.storage.store import Store
 
 log = logging.getLogger(__name__)
+
+T = TypeVar("T")
 
 
 def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
@@ -103,6 +109,8 @@ HOURS_AT_ONCE = 24
 """The hours of trends that are counted anew in one transaction."""
 CLOSE_S = 5.0
 """The longest time that is spent on what is left when the service stops."""
+MOST_LAST_HEADS = 10
+"""The most heads of the record that are made then."""
 
 
 @dataclass(frozen=True)
@@ -128,9 +136,13 @@ class _Gap:
 class Projector:
     """A thread that projects what the writer records, some of it in each turn."""
 
-    def __init__(self, store: Store) -> None:
-        """Readers of the store wait for the projections once the thread is started."""
+    def __init__(self, store: Store, head_maker: HeadMaker | None = None) -> None:
+        """Readers of the store wait for the projections once the thread is started.
+
+        Without `head_maker` no heads of the record are made.
+        """
         self._store, self._progress = store, store.progress
+        self._head_maker = head_maker
         self._closing = threading.Event()
         self._most = MOST_AT_ONCE
         self._position = 0
@@ -156,6 +168,8 @@ class Projector:
         while not self._closing.is_set():
             begun_s = time.monotonic()
             step = self._turn()
+            if self._is_head_due():
+                self._try_to_make_heads(1)
             if step is None or step.is_all:
                 self._progress.wait_for_reader(begun_s + EVERY_S - time.monotonic())
             elif step.is_blocked:
@@ -164,6 +178,26 @@ class Projector:
         while (step := self._turn()) is not None and not step.is_all:
             if time.monotonic() > end_s:
                 return
+        self._try_to_make_heads(MOST_LAST_HEADS)
+
+    def _is_head_due(self) -> bool:
+        maker = self._head_maker
+        is_due = maker is not None and maker.is_due(self._position)
+        return is_due and self._progress.is_projecting
+
+    def make_heads(self, most: int = sys.maxsize) -> None:
+        """Bind what is projected into heads of the record, at most so many, now."""
+        made: Statement | None = NOTHING
+        while self._head_maker is not None and made is not None and most:
+            made = self._write(partial(_make_head, self._head_maker))
+            most -= 1
+
+    def _try_to_make_heads(self, most: int) -> None:
+        try:
+            self.make_heads(most)
+        except Exception:
+            # The next head has what this one lacks.
+            log.exception("no head of the record could be made")
 
     def _turn(self) -> _Step | None:
         """Project some results, where there are any to project, and tell the readers."""
@@ -205,7 +239,7 @@ class Projector:
             log.exception("a result could not be projected, and is passed over")
         return self._write(self._pass_over)
 
-    def _write(self, step: Callable[[Connection], _Step]) -> _Step | None:
+    def _write(self, step: Callable[[Connection], T]) -> T | None:
         try:
             with self._store.writer.projection() as connection:
                 done = step(connection)
@@ -274,6 +308,10 @@ class Projector:
             connection.execute(update(projector).values(seq=position))
             seals.apply(connection, [each])
         return _Step(position, is_all=False)
+
+
+def _make_head(maker: HeadMaker, connection: Connection) -> Statement | None:
+    return maker.make(connection, lock_position(connection))
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from sqlalchemy.pool import NullPool
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.models.alarms import Annotation, AnnotationChange
 from service.storage.models.base import Page
+from service.storage.recording import chain
 from service.storage.recording.ids import is_ulid
 from service.storage.sql.alarm_tables import annotations
 from service.storage.sql.columns import Row
@@ -240,6 +241,7 @@ def read_annotation(connection: Connection, id: str) -> Annotation:
 def delete_annotation(connection: Connection, id: str) -> Annotation:
     """Delete an annotation, and add an event; raises `NotFound`."""
     found = read_annotation(connection, id)
+    chain.note_removed(connection, annotations, [id])
     connection.execute(delete(annotations).where(annotations.c.id == id))
     _add_annotation_event(connection, found, deleted=True)
     return found

@@ -214,7 +214,23 @@ def digest_of(
     batch: Row | None = None,
     frame: Row | None = None,
 ) -> int:
-    """The digest of the rows of a result, 63 bits of BLAKE2b.
+    """The digest of the rows of a result, 63 bits of BLAKE2b; see `encoded_rows`."""
+    return digest_of_encoded(encoded_rows(result, stars, solution, batch, frame))
+
+
+def digest_of_encoded(encoded: bytes) -> int:
+    """`digest_of` of rows that are encoded already."""
+    return int.from_bytes(blake2b(encoded, digest_size=BYTES).digest(), "big") >> 1
+
+
+def encoded_rows(
+    result: Row,
+    stars: Sequence[Row],
+    solution: Row | None,
+    batch: Row | None = None,
+    frame: Row | None = None,
+) -> bytes:
+    """The rows of a result as bytes, the same from any database.
 
     `batch` and `frame` are given for the first result of a batch, and not for a what-if.
     """
@@ -228,12 +244,12 @@ def digest_of(
         (tables.frames, frame),
     ):
         content.append(None if row is None else _content(table)(row))
-    return _digest(content)
+    return _encode(content)
 
 
 def digest_of_row(table: Table, row: Row) -> int:
     """The digest of a row of `SETTINGS` or `tracker_values`."""
-    return _digest(_content(table)(row))
+    return digest_of_encoded(_encode(_content(table)(row)))
 
 
 def made_later(digest: int) -> int:
@@ -244,10 +260,6 @@ def made_later(digest: int) -> int:
 def agrees(stored: int | None, digest: int) -> bool:
     """True if a digest that is kept, if any, is this one, whenever it was made."""
     return stored in (None, digest, made_later(digest))
-
-
-def _digest(content: object) -> int:
-    return int.from_bytes(blake2b(_encode(content), digest_size=BYTES).digest(), "big") >> 1
 
 
 @cache

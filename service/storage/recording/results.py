@@ -20,6 +20,7 @@ from service.storage.recording.identity import (
 from service.storage.recording.result_metrics import split_anew
 from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql import tables
+from service.storage.sql.chain_tables import record_leaves
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
 from service.storage.sql.tables import audit
@@ -206,9 +207,10 @@ def _insert_results(
     # In order of their ids, which rise: each goes to the end of its table.
     in_order = sorted(unsaved_results, key=lambda each: each.id)
     places = zip(in_order, next_seqs(connection, len(in_order)), strict=True)
-    rows = [unsaved.result_row(answers[unsaved.id], seq) for unsaved, seq in places]
+    rows = [unsaved.rows(answers[unsaved.id], seq) for unsaved, seq in places]
     stars = [row for unsaved in in_order for row in unsaved.stars]
-    insert_all(connection, tables.results, rows)
+    insert_all(connection, tables.results, [row for row, _ in rows])
+    insert_all(connection, record_leaves, [leaf for _, leaf in rows])
     insert_all(connection, tables.star_results, stars)
     attitudes = [each.solution for each in in_order if each.solution is not None]
     insert_all(connection, tables.solutions, attitudes)
@@ -244,7 +246,10 @@ _NEXT_SEQS = {
     # Of results that were deleted before they were projected nothing is left to tell.
     "sqlite": """
         WITH RECURSIVE next(seq, n) AS (
-            SELECT max(ifnull((SELECT max(seq) FROM results), 0), (SELECT seq FROM projector)), 0
+            SELECT max(
+                ifnull((SELECT max(seq) FROM record_leaves), 0),
+                ifnull((SELECT max(seq) FROM results), 0), (SELECT seq FROM projector)
+            ), 0
             UNION ALL SELECT seq + 1, n + 1 FROM next WHERE n < :count
         ) SELECT seq FROM next WHERE n > 0
     """,

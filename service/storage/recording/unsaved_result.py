@@ -19,7 +19,8 @@ from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
 from service.storage.models.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
-from service.storage.recording.identity import digest_of
+from service.storage.recording.chain import leaf_of
+from service.storage.recording.identity import digest_of_encoded, encoded_rows
 from service.storage.recording.result_metrics import metrics_of, values_of_trackers
 from service.storage.sql.columns import Row
 from service.times import Utc
@@ -95,9 +96,15 @@ class UnsavedResult(Struct, eq=False):
 
     def result_row(self, body: bytes, seq: int = 0) -> Row:
         """The row of `results`, with the answer, its place in the record and its digest."""
+        return self.rows(body, seq)[0]
+
+    def rows(self, body: bytes, seq: int) -> tuple[Row, Row]:
+        """The rows of `results` and `record_leaves`."""
         row = self.result | {"answer": body.decode(), "seq": seq}
-        row["digest"] = digest_of(row, self.stars, self.solution, self.batch, self.frame)
-        return row
+        content = encoded_rows(row, self.stars, self.solution, self.batch, self.frame)
+        row["digest"] = digest_of_encoded(content)
+        leaf = leaf_of(self.id, row["answer"], content, bool(row["current"]))
+        return row, {"seq": seq, "leaf": leaf}
 
 
 def unsaved_submission(

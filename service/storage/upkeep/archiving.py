@@ -57,6 +57,7 @@ from service.storage.archive.rows import (
 )
 from service.storage.projections import rollups, seals
 from service.storage.projections.rollups import keep_share
+from service.storage.recording.identity import digest_of_row, made_later
 from service.storage.recording.result_metrics import is_waiting
 from service.storage.sql import tables
 from service.storage.sql.statements import count, insert_all, insert_missing, insert_runs, portions
@@ -413,8 +414,11 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     )
     for digests, table in ((part.missions, tables.missions), (part.catalogs, tables.catalogs)):
         rows_of_settings = [read_settings(folder, each).row for each in digests]
-        # An archive of an earlier version has none.
-        insert_missing(connection, table, [{"row_digest": None} | row for row in rows_of_settings])
+        for row in rows_of_settings:
+            # Of an archive of an earlier version they have none.
+            digest = row.get("row_digest")
+            row["row_digest"] = made_later(digest_of_row(table, row)) if digest is None else digest
+        insert_missing(connection, table, rows_of_settings)
     created = pc.min(rows["batches"]["received"]).as_py()
     insert_runs(connection, {part.run: created}, tracked=part.tracked)
     if part_id is not None:
@@ -449,7 +453,8 @@ def _placed(rows: Rows, position: int) -> Rows:
     """
     made = rows["results"]
     places = pc.fill_null(made["seq"], 0)
-    places = pc.if_else(pc.less_equal(places, position), places, pa.scalar(0, pa.int64()))
+    is_kept = pc.and_(pc.less_equal(places, position), bool(position))
+    places = pc.if_else(is_kept, places, pa.scalar(0, pa.int64()))
     return rows | {"results": made.set_column(made.column_names.index("seq"), "seq", places)}
 
 

@@ -248,6 +248,7 @@ def _set_sequences(connection: sa.Connection, tables: Sequence[sa.Table]) -> Non
     connection.execute(
         sa.text(
             "SELECT setval('results_seq', 1 + greatest((SELECT max(seq) FROM results), "
+            "(SELECT max(seq) FROM record_leaves), "
             "(SELECT seq FROM projector)), false)"
         )
     )

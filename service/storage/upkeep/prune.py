@@ -11,6 +11,7 @@ from functools import partial
 from sqlalchemy import ColumnElement, Connection, Table, delete, select
 
 from service.storage.projections import rollups, seals
+from service.storage.recording import chain
 from service.storage.sql.grade_tables import graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.statements import count, portions
 from service.storage.sql.tables import (
@@ -107,6 +108,7 @@ def delete_days(connection: Connection, chosen: Conditions) -> int:
     """Delete some of the graded days that are chosen, with their samples; how many."""
     ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
     connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
+    chain.note_removed(connection, graded_days, ids)
     connection.execute(delete(graded_days).where(graded_days.c.id.in_(ids)))
     return len(ids)
 
@@ -115,6 +117,7 @@ def delete_blocks(connection: Connection, chosen: Conditions) -> int:
     """Delete some of the blocks that are chosen; how many."""
     chunk = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
     ids = list(connection.scalars(chunk))
+    chain.note_removed(connection, gyro_blocks, ids)
     connection.execute(delete(gyro_blocks).where(gyro_blocks.c.id.in_(ids)))
     return len(ids)
 
@@ -142,6 +145,7 @@ def delete_batches(connection: Connection, batch_ids: Sequence[str]) -> None:
     """Delete batches with all that was made of them, what refers to others first."""
     for ids in portions(batch_ids):
         seals.take_out(connection, ids)
+        chain.note_results_removed(connection, ids)
         made = list(connection.scalars(select(results.c.id).where(results.c.batch_id.in_(ids))))
         for table in OF_A_RESULT:
             connection.execute(delete(table).where(table.c.result_id.in_(made)))

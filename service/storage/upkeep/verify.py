@@ -34,12 +34,14 @@ from service.storage.projections import rollups, seals
 from service.storage.queries.time_buckets import Bucket
 from service.storage.recording.identity import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.result_metrics import is_waiting
+from service.storage.recording.signing import PublicKey
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, metadata
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.migrations import check, disposed, reading, reported
 from service.storage.sql.statements import count, owned_rows, rows_of
+from service.storage.upkeep.verify_chain import Anchor, faults_of_the_chain
 from service.times import unix_seconds, utc_of_unix
 
 AT_ONCE, BLOCKS_AT_ONCE = 500, 50
@@ -51,12 +53,19 @@ Step = Callable[[int, int], object]
 """Called with the batches that were looked at and those there are."""
 
 
-def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
+def verify(
+    database: str,
+    step: Step = lambda done, total: None,
+    *,
+    public_key: PublicKey | None = None,
+    anchors: Sequence[Anchor] = (),
+) -> list[str]:
     """The faults of a database, a sentence each; empty: none.
 
     Looks at the file itself (SQLite), the schema, every batch with all that
     was made of it, the trends, the gyro blocks, the filtered and smoothed attitudes, and
-    which batches are archived.  Raises `BadConfiguration` where there is no database.
+    which batches are archived, and the chain, with the key that signed its heads and with heads
+    noted elsewhere.  Raises `BadConfiguration` where there is no database.
     """
     problems = check(database)
     if problems:
@@ -73,6 +82,7 @@ def verify(database: str, step: Step = lambda done, total: None) -> list[str]:
             found += _of_the_batches(engine, step)
             found += _of_the_missions(engine)
             found += _of_the_seals(engine)
+            found += faults_of_the_chain(engine, public_key, anchors)
             found += _of_the_trends(engine)
             found += _of_the_gyro_blocks(engine)
             found += _of_the_archived(engine)
@@ -176,6 +186,9 @@ def _of_the_trackers(
     A batch of several trackers that has none must be waiting for it.
     """
     current = {row["id"]: row["batch_id"] for row in made if row["current"]}
+    # Those of an earlier version got one at an upgrade, and are negative.
+    own = [row for row in made if row["current"] and row["digest"] is not None]
+    digested = {row["batch_id"] for row in own if row["digest"] >= 0}
     stars = tables.star_results.c
     groups = stars.result_id, stars.tracker, stars.outcome
     counted = sa.select(*groups, sa.func.count()).where(stars.result_id.in_(current))
@@ -190,6 +203,8 @@ def _of_the_trackers(
         of_batch[row["tracker"]] = Counter({name: row[name] for name in OUTCOMES})
         if not agrees(row["row_digest"], digest_of_row(tables.tracker_values, row)):
             yield f"batch {row['batch_id']}: {row['tracker']}'s values are not what was recorded"
+        elif row["row_digest"] is None and row["batch_id"] in digested:
+            yield f"batch {row['batch_id']}: {row['tracker']}'s values have no digest"
     for id, batch in chunk.items():
         of_stars, of_rows = seen.get(id, {}), stored.get(id, {})
         if of_rows:

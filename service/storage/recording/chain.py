@@ -1,0 +1,245 @@
+"""The chain of the record: what a leaf, a fact and a head are, and how they are hashed.
+
+Every result has a leaf, a hash over all that is kept of it.  Rows of other tables have facts.  A
+head is a statement over the leaves and facts since the head before it: their number, the root of
+a Merkle tree over them (RFC 6962, section 2.1, with SHA-256), and the hash of the head before.
+"""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import msgspec
+from sqlalchemy import Connection, Double, LargeBinary, Table, insert, select
+
+from service.storage.sql import alarm_tables, grade_tables, tables
+from service.storage.sql.chain_tables import record_facts
+from service.storage.sql.columns import Row
+from service.storage.sql.statements import rows_of
+
+LEAF_BYTES = 16
+"""The size of a leaf: to find another record with the same leaf takes 2^128 trials."""
+HELD_BYTES, LARGE_BYTES = 2_047, 65_536
+"""Python lets other threads run while it hashes more than the former at a time.
+
+To get its turn back takes the writer longer than the hash, unless that is of more than the latter.
+"""
+
+_encode = msgspec.json.Encoder(order="sorted").encode
+
+
+class Statement(msgspec.Struct, frozen=True, kw_only=True):
+    """What a head states; its JSON, with sorted names, is what is hashed and signed."""
+
+    version: int = 1
+    number: int
+    previous: str
+    """SHA-256 of the statement before; of the first one empty."""
+    made: str
+    """UTC."""
+    first: int
+    """The lowest place of a result that has a leaf; negative: of before the chain."""
+    last: int
+    """The highest place."""
+    counts: dict[str, int]
+    """Leaves and facts since the head before, by kind."""
+    root: str
+    """The root of the Merkle tree over them."""
+
+    def encoded(self) -> bytes:
+        """The bytes that are hashed and signed."""
+        return _encode(self)
+
+
+def sha256_of(statement: Statement) -> str:
+    """The hash of a statement, by which the next one and everybody outside name it."""
+    return hashlib.sha256(statement.encoded()).hexdigest()
+
+
+def leaf_of(id: str, answer: str, content: bytes, adopted: bool) -> bytes:
+    """The leaf of a result: its id, its answer as sent, and the encoding of all of its rows.
+
+    `adopted` is True if the result was current when it was recorded.
+    """
+    answer_sha256 = _hashed(hashlib.sha256(), answer.encode())
+    return leaf_of_hashes(id, answer_sha256, digest_of_content(content), adopted)
+
+
+def digest_of_content(content: bytes) -> bytes:
+    """The BLAKE2b (32 bytes) of the encoding of all rows of a result."""
+    return _hashed(hashlib.blake2b(digest_size=32), content)
+
+
+def _hashed(state: Any, content: bytes) -> bytes:
+    """The digest of some kilobytes, without giving the interpreter's lock away."""
+    view = memoryview(content)
+    step = HELD_BYTES if len(content) <= LARGE_BYTES else len(content)
+    for first in range(0, len(content), step):
+        state.update(view[first : first + step])
+    digest: bytes = state.digest()
+    return digest
+
+
+def leaf_of_hashes(id: str, answer_sha256: bytes, content: bytes, adopted: bool) -> bytes:
+    """`leaf_of` with the SHA-256 of the answer and the digest of the content in their place."""
+    mark = b"\x01" if adopted else b"\x00"
+    whole = b"result\x00" + id.encode() + b"\x00" + mark + answer_sha256 + content
+    return hashlib.sha256(whole).digest()[:LEAF_BYTES]
+
+
+def leaf_of_fact(kind: str, key: str, sha256: str) -> bytes:
+    """The leaf of a fact."""
+    whole = f"fact\x00{kind}\x00{key}\x00{sha256}".encode()
+    return hashlib.sha256(whole).digest()[:LEAF_BYTES]
+
+
+# ---- Merkle trees (RFC 6962, section 2.1) -------------------------------------------------------
+
+
+def root_of(leaves: Sequence[bytes]) -> bytes:
+    """The root over leaves in order; of none the hash of nothing."""
+    if not leaves:
+        return hashlib.sha256(b"").digest()
+    level = [_of_leaf(each) for each in leaves]
+    while len(level) > 1:
+        level = _above(level)
+    return level[0]
+
+
+def path_to(leaves: Sequence[bytes], index: int) -> list[bytes]:
+    """The audit path of a leaf: the hashes that lead from it to the root, from below."""
+    level, path = [_of_leaf(each) for each in leaves], []
+    while len(level) > 1:
+        beside = index ^ 1
+        if beside < len(level):
+            path.append(level[beside])
+        level, index = _above(level), index // 2
+    return path
+
+
+def root_from(leaf: bytes, index: int, size: int, path: Iterable[bytes]) -> bytes | None:
+    """The root that an audit path leads to (RFC 9162, section 2.1.3.2); None for a wrong path."""
+    if not 0 <= index < size:
+        return None
+    last, found = size - 1, _of_leaf(leaf)
+    for beside in path:
+        if not last:
+            return None
+        if index & 1 or index == last:
+            found = _of_pair(beside, found)
+            while not index & 1 and index:
+                index, last = index >> 1, last >> 1
+        else:
+            found = _of_pair(found, beside)
+        index, last = index >> 1, last >> 1
+    return found if not last else None
+
+
+def _of_leaf(leaf: bytes) -> bytes:
+    return hashlib.sha256(b"\x00" + leaf).digest()
+
+
+def _of_pair(left: bytes, right: bytes) -> bytes:
+    return hashlib.sha256(b"\x01" + left + right).digest()
+
+
+def _above(level: Sequence[bytes]) -> list[bytes]:
+    """The level above; a hash without a neighbour goes up as it is."""
+    pairs = zip(level[::2], level[1::2], strict=False)
+    found = [_of_pair(left, right) for left, right in pairs]
+    return [*found, level[-1]] if len(level) % 2 else found
+
+
+# ---- facts of other tables ---------------------------------------------------------------------
+
+
+class Bound(msgspec.Struct, frozen=True):
+    """How the rows of a table are facts."""
+
+    free: frozenset[str] = frozenset()
+    """Columns that no fact has, because the service changes them."""
+    closed_by: str | None = None
+    """The column that is set once; a further fact then has all columns that are not `free`."""
+    open_free: frozenset[str] = frozenset()
+    """Columns that may change until then."""
+    rises: bool = True
+    """True if new keys are greater than old ones."""
+
+
+_OF_DELIVERIES = frozenset(
+    ("previous_secret", "previous_until", "position", "missed", "gone_at")
+) | frozenset(("held_until", "failing_since", "last_attempt", "last_delivered", "last_status"))
+_OF_PROGRESS = frozenset(("state", "done", "total", "result", "covariance", "fault"))
+_DIGESTED = Bound(frozenset({"row_digest"}), rises=False)
+BOUND: Mapping[Table, Bound] = {
+    tables.missions: _DIGESTED,
+    tables.catalogs: _DIGESTED,
+    tables.mission_uses: Bound(frozenset({"row_digest"})),
+    tables.audit: Bound(),
+    tables.access_tokens: Bound(closed_by="revoked"),
+    tables.webhooks: Bound(_OF_DELIVERIES | {"last_fault"}),
+    tables.calibrations: Bound(closed_by="ended", open_free=_OF_PROGRESS),
+    tables.calibration_adoptions: Bound(),
+    alarm_tables.limits: Bound(closed_by="until"),
+    alarm_tables.alarm_actions: Bound(),
+    alarm_tables.annotations: Bound(),
+    grade_tables.graded_days: Bound(frozenset({"current"})),
+    grade_tables.gyro_blocks: Bound(),
+}
+"""The tables whose rows are facts when they are added, and when `closed_by` is set.
+
+What changes or removes such a row otherwise calls `note_changed` or `note_removed`.  Texts and
+numbers are in a fact; binary columns are not, since another column has their digest.
+"""
+RESULTS, REMOVED = "results", "results.removed"
+
+
+def key_of(table: Table, row: Row) -> str:
+    """The key of a row in its facts."""
+    return " ".join(str(row[column.name]) for column in table.primary_key)
+
+
+def content_of(table: Table, row: Row, *, closed: bool = False) -> str:
+    """The SHA-256 of what a fact has of a row, in hexadecimal digits."""
+    bound = BOUND[table]
+    left_out = bound.free if closed else bound.free | bound.open_free | {bound.closed_by}
+    content = {
+        column.name: float(value) + 0.0 if isinstance(column.type, Double) else value
+        for column in table.columns
+        if column.name not in left_out
+        and not isinstance(column.type, LargeBinary)
+        and (value := row[column.name]) is not None
+    }
+    return hashlib.sha256(_encode(content)).hexdigest()
+
+
+def note_changed(connection: Connection, table: Table, id: str) -> None:
+    """Add a fact: the row of this id has another content from now on."""
+    (key,) = table.primary_key
+    for row in rows_of(connection, select(table).where(key == id)):
+        _note(connection, [(table.name, key_of(table, row), content_of(table, row))])
+
+
+def note_removed(connection: Connection, table: Table, ids: Sequence[object]) -> None:
+    """Add a fact for each of these rows: it is to be deleted."""
+    _note(connection, [(table.name, str(id), "") for id in ids])
+
+
+def note_results_removed(connection: Connection, batch_ids: Sequence[str]) -> None:
+    """Add a fact with the places of the results of these batches, which are to be deleted."""
+    query = select(tables.results.c.seq).where(tables.results.c.batch_id.in_(batch_ids))
+    ranges: list[list[int]] = []
+    for place in sorted(set(connection.scalars(query)) - {0}):
+        if ranges and ranges[-1][1] == place - 1:
+            ranges[-1][1] = place
+        else:
+            ranges.append([place, place])
+    if ranges:
+        key = _encode(ranges).decode()
+        _note(connection, [(REMOVED, key, hashlib.sha256(key.encode()).hexdigest())])
+
+
+def _note(connection: Connection, facts: Sequence[tuple[str, str, str]]) -> None:
+    rows = [{"kind": kind, "key": key, "sha256": sha256} for kind, key, sha256 in facts]
+    if rows:
+        connection.execute(insert(record_facts), rows)
