@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.record import SERVICE, record_of
 from benchmarks.report import Report
 from benchmarks.speed import (
+    chain,
     columns,
     exports,
     first_posts,
@@ -80,6 +81,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "first_posts": first_posts.run,
     "live_filter": live_filter.run,
     "stored": stored.run,
+    "chain": chain.run,
     "scale": scale.run,
     "soak": soak.run,
     "packets": packets.run,
