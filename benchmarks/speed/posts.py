@@ -288,7 +288,7 @@ def alarms(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any],
                 )
             )
             loading.start()
-            delays_s = []
+            delays_s: list[float] = []
             while loading.is_alive():
                 # One batch leaves the limits, the next one is back in them.
                 for is_out in (True, False):
