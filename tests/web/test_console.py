@@ -409,7 +409,8 @@ def test_a_sparkline_has_a_gap_where_nothing_was_recorded():
         round(PAD + k * (WIDTH - 2 * PAD) / 8) for k in (0, 4, 6)
     ]
     assert path == "M2 36l18 -17l19 17M76 2h0M113 28h19l18 -9"
-    assert parts[1] == [(64, PAD), (64, PAD)]
+    middle = round(PAD + 4 * (WIDTH - 2 * PAD) / 8)
+    assert parts[1] == [(middle, PAD), (middle, PAD)]
     for x, y in itertools.chain(*parts):
         assert 0 <= x <= WIDTH
         assert 0 <= y <= HEIGHT

@@ -7,7 +7,7 @@ import { rooted } from "./requests.js";
 const TALLEST_PX = matchMedia("(max-width: 720px)").matches ? 100 : 240;
 const MOST_ROW_PX = 14;
 const NAMES_FROM_PX = 11;
-// More rows than have room for their names are shown if asked for.
+// The worst rows, as many as have room for their names.
 const MOST_NAMED = Math.floor(TALLEST_PX / 12);
 const NAMES_PX = 120;
 const CELLS_AROUND = 3;
@@ -40,7 +40,6 @@ export class HeatMap {
     this.readout = section.querySelector("#heat-readout");
     this.at = null;
     this.choice.addEventListener("change", () => this.choose());
-    section.querySelector("#heat-every").addEventListener("change", () => this.draw());
     this.canvas.addEventListener("pointermove", (event) => this.read(this.cellAt(event)));
     this.canvas.addEventListener("pointerleave", () => this.read(null));
     this.canvas.addEventListener("click", (event) => this.open(this.cellAt(event)));
@@ -76,10 +75,7 @@ export class HeatMap {
     const { names, columns, start, width, quantities } = this.shown;
     const quantity = quantities[this.choice.selectedIndex] ?? quantities[0];
     this.cells = bytes(quantity.cells);
-    const every = this.section.querySelector("#heat-every");
-    every.hidden = names.length <= MOST_NAMED;
-    every.querySelector("span").textContent = `all ${names.length} rows, without names`;
-    this.rows = every.querySelector("input").checked ? names.length : Math.min(names.length, MOST_NAMED);
+    this.rows = Math.min(names.length, MOST_NAMED);
     const row = Math.min(MOST_ROW_PX, Math.max(1, Math.floor(TALLEST_PX / this.rows)));
     const across = this.section.querySelector(".heat-axis").clientWidth;
     this.left = row >= NAMES_FROM_PX ? Math.min(NAMES_PX, across / 4) : 0;
