@@ -17,6 +17,7 @@ from benchmarks.report import Report
 from benchmarks.speed import (
     chain,
     columns,
+    compiling,
     exports,
     first_posts,
     kernels,
@@ -79,6 +80,7 @@ BENCHMARKS: dict[str, Callable[[bool, int], Report]] = {
     "columns": columns.run,
     "posts": posts.run,
     "first_posts": first_posts.run,
+    "compiling": compiling.run,
     "live_filter": live_filter.run,
     "stored": stored.run,
     "chain": chain.run,

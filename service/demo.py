@@ -24,7 +24,7 @@ from service.child_processes import command_of
 from service.errors import BadConfiguration, BadInput, Busy, Fault
 from service.missions.mission import load_missions
 from service.replay.items import items_of
-from service.replay.over_http import replay_over_http
+from service.replay.over_http import GIVE_UP_AFTER_S, replay_over_http
 from service.replay.summary import ReplaySummary
 from service.resources import shipped
 from service.settings import PREFIX, Settings, require_free, url_of
@@ -91,20 +91,7 @@ def run_demo(
         _wait_until_ready(server, url, folder / "server.log")
         ready_s = time.perf_counter() - started
         run = f"demo-{_digest(files)}"
-        scores = {}
-        for name, file in zip(MISSIONS, files, strict=True):
-            results = file.with_name(f"{file.stem}.results.ndjson")
-            with ReplaySummary([file], results, title=f"{name:<4}") as summary:
-                replay_over_http(
-                    url,
-                    items_of([file], run),
-                    summary.add,
-                    concurrency=CONCURRENCY,
-                    watched_run=run,
-                )
-            scores[name] = score(
-                _answers(results), telemetry.read_objects(telemetry.truth_path(file))
-            )
+        scores = _scores(url, files, run, ready_s)
         whole_s = time.perf_counter() - started
         if as_json:
             seconds = {"seconds": whole_s, "seconds_until_ready": ready_s}
@@ -113,6 +100,8 @@ def run_demo(
             print(score_table(scores))
             print()
             print(f"That took {whole_s:.1f} s, {ready_s:.1f} s of them until the server was ready.")
+            if KernelBuild().is_needed:
+                print(f"Still {kernel_progress().line(whole_s)}; the next start goes on with it.")
             print("Where to look next:")
             for place, what in _where_next(url, run, folder, settings, once):
                 print(f"  {place}\n      {what}")
@@ -211,6 +200,36 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
     return files
 
 
+def _scores(url: str, files: Sequence[Path], run: str, ready_s: float) -> dict[str, Any]:
+    """Send the passes to the server, which was ready after so many seconds; scores by mission.
+
+    The kernels of the whole sky may not be compiled by then: a batch that needs them waits.
+    """
+    give_up_after_s = GIVE_UP_AFTER_S
+    if KernelBuild().is_needed:
+        give_up_after_s = COMPILING_S
+        print(
+            f"ready for batches with an a priori attitude after {ready_s:.0f} s; compiled "
+            "behind them: kernels of the whole sky, then of filter, tracks and pictures",
+            file=sys.stderr,
+            flush=True,
+        )
+    scores = {}
+    for name, file in zip(MISSIONS, files, strict=True):
+        results = file.with_name(f"{file.stem}.results.ndjson")
+        with ReplaySummary([file], results, title=f"{name:<4}") as summary:
+            replay_over_http(
+                url,
+                items_of([file], run),
+                summary.add,
+                concurrency=CONCURRENCY,
+                give_up_after_s=give_up_after_s,
+                watched_run=run,
+            )
+        scores[name] = score(_answers(results), telemetry.read_objects(telemetry.truth_path(file)))
+    return scores
+
+
 def _answers(results: Path) -> Iterator[dict[str, Any]]:
     """The answers to the batches, without the records that answer gyro blocks."""
     return (each for each in telemetry.read_objects(results) if "block" not in each)
@@ -267,8 +286,7 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
                 output = log.read_text(encoding="utf-8", errors="replace").strip()
                 raise BadConfiguration(f"the server did not start:\n{output}")
             try:
-                # Its batches with a wrong a priori attitude need the kernels of the whole sky, too.
-                if not KernelBuild().is_needed and client.get("/readyz").status_code == 200:
+                if client.get("/readyz").status_code == 200:
                     return
             except httpx.TransportError:
                 pass

@@ -5,13 +5,14 @@ Children can be killed, and the parent goes on answering probes; it then loads t
 kernels from the cache on disk.
 """
 
+import gc
 import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from logging import Logger
 from multiprocessing import connection
@@ -23,7 +24,7 @@ from typing import Any, NamedTuple
 import llvmlite.binding  # type: ignore[import-untyped]
 import numba
 
-from service.acquire.prewarm import prewarm_kernels
+from service.acquire.prewarm import compile_beside_batches, prewarm_kernels
 from service.child_processes import Source, own_source, require_source, safe_path
 from service.compiled.checked_file import count_whole
 from service.errors import Busy, Stopping
@@ -34,6 +35,11 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 
 RETRY_S = 10
+WHOLE_SKY_RETRY_S = 2
+"""Shorter: a demonstration sends its batches while the kernels of the whole sky are compiled."""
+COLLECT_EVERY = 100_000
+"""New objects between two collections of garbage while kernels are compiled, of which few are
+garbage: with Python's 700 an eighth of the time goes there."""
 
 _CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -45,8 +51,10 @@ class _Share(NamedTuple):
 
     zones: list[str]
     """Identifiers that search zones."""
-    others: list[str]
-    seldom: bool
+    whole_sky: list[str]
+    """Identifiers that search the whole sky."""
+    beside_batches: bool
+    """Whether it compiles what no batch needs: links of points, filter, pictures."""
 
 
 class KernelBuild:
@@ -60,20 +68,42 @@ class KernelBuild:
         """True until a build has succeeded: an answer must not depend on what is compiled."""
         self.zones_needed = self.is_needed
         """True until the kernels of batches with a zone are compiled."""
+        self.whole_sky_needed = self.is_needed
+        """True until the kernels of searches of the whole sky are compiled, too."""
+
+    @property
+    def being_compiled(self) -> list[str]:
+        """The kinds of work that are refused until their kernels are compiled."""
+        kinds = {
+            "batches with an a priori attitude": self.zones_needed,
+            "searches of the whole sky": self.whole_sky_needed,
+            "frames, what-ifs, replays and filtered attitudes": self.is_needed,
+        }
+        return [kind for kind, needed in kinds.items() if needed]
 
     def require_built(self) -> None:
         """Raise `Busy` until the kernels are compiled."""
         if self.is_needed:
             raise Busy("the service is compiling its kernels", RETRY_S)
 
+    def require_whole_sky(self) -> None:
+        """Raise `Busy` until the kernels that search the whole sky are compiled."""
+        if self.whole_sky_needed:
+            raise Busy(
+                "the service is compiling the kernels that search the whole sky", WHOLE_SKY_RETRY_S
+            )
+
     def run(
-        self, missions: Mapping[str, Mission], zones_built: Callable[[], None] = lambda: None
+        self,
+        missions: Mapping[str, Mission],
+        zones_built: Callable[[], None] = lambda: None,
+        whole_sky_built: Callable[[], None] = lambda: None,
     ) -> None:
         """Compile what is not compiled, in two children; in one, without a second processor.
 
-        Both begin with what batches with a zone need.  When that is compiled, `zones_built` is
-        called while they compile the rest.  Raises `Busy` where a child fails, `Stopping`
-        if cancelled.
+        Both begin with what batches with a zone need, and go on with searches of the whole sky.
+        `zones_built` and `whole_sky_built` are called when these are compiled, while the
+        children compile the rest.  Raises `Busy` where a child fails, `Stopping` if cancelled.
         """
         if not self.is_needed:
             return
@@ -94,9 +124,15 @@ class KernelBuild:
                 # The child alone holds this end: when it has ended there is nothing to wait for.
                 sender.close()
                 receivers.append(receiver)
-        if all(_has_reported(each) for each in receivers):
-            self.zones_needed = False
-            zones_built()
+        with ExitStack() as ends:
+            for receiver in receivers:
+                ends.enter_context(receiver)
+            if all(_has_reported(each) for each in receivers):
+                self.zones_needed = False
+                zones_built()
+            if all(_has_reported(each) for each in receivers):
+                whole_sky_built()
+                self.whole_sky_needed = False
         for child in self._children:
             child.join()
         if self._cancelled:
@@ -106,7 +142,7 @@ class KernelBuild:
         if failed:
             raise Busy("the kernels could not be compiled; the log says why", RETRY_S)
         mark_built()
-        self.is_needed = False
+        self.is_needed = self.whole_sky_needed = False
 
     def cancel(self) -> None:
         """End a build that is running, and let none begin."""
@@ -180,43 +216,48 @@ def _shares(processors: int) -> list[_Share]:
     def named(is_meant: Callable[[IdentifierEntry], bool]) -> list[str]:
         return [name for name, entry in IDENTIFIERS.items() if is_meant(entry)]
 
-    others = named(lambda entry: not entry.searches_zone)
+    whole_sky = named(lambda entry: not entry.searches_zone)
     if processors < 2:
-        return [_Share(named(lambda entry: entry.searches_zone), others, True)]
+        return [_Share(named(lambda entry: entry.searches_zone), whole_sky, True)]
     weighing = named(lambda entry: entry.searches_zone and entry.weighs_hypotheses)
     counting = named(lambda entry: entry.searches_zone and not entry.weighs_hypotheses)
-    return [_Share(weighing, [], True), _Share(counting, others, False)]
+    return [_Share(weighing, [], True), _Share(counting, whole_sky, False)]
 
 
 def _has_reported(child: connection.Connection) -> bool:
-    """Wait until a child has compiled its kernels of zones; False if it ends before that."""
-    with child:
-        try:
-            child.recv_bytes()
-        except EOFError:
-            return False
+    """Wait until a child has compiled its next share; False if it ends before that."""
+    try:
+        child.recv_bytes()
+    except EOFError:
+        return False
     return True
 
 
 def _compile(
     missions: Mapping[str, Mission],
     share: _Share,
-    zones_built: connection.Connection,
+    compiled: connection.Connection,
     parent: Source,
 ) -> None:
     end_with_parent()
     require_source(parent)
+    gc.freeze()
+    gc.set_threshold(COLLECT_EVERY)
     sky = SkyModel(load_embedded(), LruCache(64 << 20), opens_files=False)
-    prewarm_kernels(sky, missions, share.zones)
-    zones_built.send_bytes(b"zones")
-    prewarm_kernels(sky, missions, share.others, share.seldom)
+    prewarm_kernels(sky, missions, share.zones, seldom=True)
+    compiled.send_bytes(b"zones")
+    if share.whole_sky:
+        prewarm_kernels(sky, missions, share.whole_sky)
+    compiled.send_bytes(b"whole sky")
+    if share.beside_batches:
+        compile_beside_batches()
 
 
 # How far the compiling of the kernels is, seen from the files that it leaves in the cache.
 #
 # The size of machine code grows evenly with the time that its compiling takes.
 
-KERNEL_BYTES = 3_010_000
+KERNEL_BYTES = 2_930_000
 """The size of the machine code of all kernels, about; other processors differ by a tenth."""
 MOST_SHARE = 0.99
 """The largest share shown until it is over, since the size is not known to the last byte."""

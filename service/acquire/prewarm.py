@@ -69,8 +69,8 @@ def prewarm_kernels(
     """Load the kernels, or compile them, by running a batch of real stars of each kind of zone.
 
     Those of the named identifiers (None: of the missions' own and of the whole sky: to load
-    others takes a batch that needs them some ms), and what is used `seldom`: by few batches, or
-    over many, as links of points, filter and smoother.
+    others takes a batch that needs them some ms), and what few of their batches need (`seldom`):
+    two groups of stars, match groups, a misaligned tracker.
     The zones that this builds go into a cache of its own, which it drops at the end.
     What builds run catalogs and indexes is compiled only for a sky that opens no files.
     """
@@ -130,15 +130,20 @@ def prewarm_kernels(
                 searched = searched.model_copy(update={"lost_in_space_fallback": False})
             acquire(batch, searched, apart)
         if seldom and kind == first:
-            _prewarm_seldom(apart, mission, body)
-    if seldom:
-        compile_linking()
-        compile_filtering()
-        compile_walk()
+            _prewarm_seldom(apart, mission, body, identifiers)
 
 
-def _prewarm_seldom(sky: SkyModel, mission: Mission, body: dict[str, Any]) -> None:
-    """Compile votes in steps, and what two groups of stars and a misaligned tracker need."""
+def compile_beside_batches() -> None:
+    """Load the kernels, or compile them, of what is computed over many batches, and of pictures."""
+    compile_filtering()
+    compile_linking()
+    compile_walk()
+
+
+def _prewarm_seldom(
+    sky: SkyModel, mission: Mission, body: dict[str, Any], identifiers: Collection[str]
+) -> None:
+    """Compile what two groups of stars need, or votes in steps and a misaligned tracker."""
     (seen,) = body["observations"]
     tracker, stars = mission.trackers[0], seen["stars"]
 
@@ -157,6 +162,8 @@ def _prewarm_seldom(sky: SkyModel, mission: Mission, body: dict[str, Any]) -> No
         ([seen | {"stars": stars + turned(0.5)}], {"identifier": "verified"}),
         ([seen, {"tracker": misaligned.name, "stars": turned(0.01)}], in_steps),
     ):
+        if options["identifier"] not in identifiers:
+            continue
         text = json.dumps(body | {"observations": observations, "options": options})
         acquire(submission_from_json(text).batch, searched, sky)
 

@@ -150,7 +150,7 @@ def open_app(
     kernels = KernelBuild() if serving else None
     sky = SkyModel(catalog, cache)
     if kernels is not None:
-        sky = SkyModel(catalog, cache, require_whole_sky=kernels.require_built)
+        sky = SkyModel(catalog, cache, require_whole_sky=kernels.require_whole_sky)
     store = Store(
         settings.database,
         create=create,

@@ -92,7 +92,9 @@ class Service:
     def _prepare(self) -> None:
         if self._kernels is not None and self._kernels.is_needed:
             with progress_logged(log):
-                self._kernels.run(self._context.missions, self._begin_with_zones)
+                self._kernels.run(
+                    self._context.missions, self._begin_with_zones, self._go_on_with_whole_sky
+                )
         prewarm_kernels(self._context.sky, self._context.missions)
         self._prewarm_sky(self._context.missions.values(), utc_now())
         self._become_warm()
@@ -111,12 +113,18 @@ class Service:
         self._become_warm()
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
 
-    def _prewarm_sky(self, missions: Iterable[Mission], time: Utc) -> None:
-        """Open or build what batches need, as far as its kernels are there."""
-        is_compiled = self._kernels is None or not self._kernels.is_needed
+    def _go_on_with_whole_sky(self) -> None:
+        """Load the kernels of searches of the whole sky, and build what these search."""
+        prewarm_kernels(self._context.sky, self._context.missions)
+        self._prewarm_sky(self._context.missions.values(), utc_now(), whole_sky=True)
+        log.info("ready for batches that need the whole sky; still compiling other kernels")
+
+    def _prewarm_sky(self, missions: Iterable[Mission], time: Utc, whole_sky: bool = False) -> None:
+        """Open or build what batches need; for the whole sky if asked, or its kernels are there."""
+        whole_sky |= self._kernels is None or not self._kernels.whole_sky_needed
         for mission in missions:
             try:
-                prewarm_sky(self._context.sky, [mission], time, whole_sky=is_compiled)
+                prewarm_sky(self._context.sky, [mission], time, whole_sky)
             except AcquisitionError as error:
                 # It is refused to the batches that need it, and no other mission waits for it.
                 log.warning("the sky of %s cannot be built: %s", mission.name, error)
@@ -127,6 +135,10 @@ class Service:
             # Collecting the present objects would take longer than a batch, each time.
             gc.freeze()
             self._is_warm = True
+
+    def being_compiled(self) -> list[str]:
+        """The kinds of work that a service which is ready refuses for want of kernels."""
+        return [] if self._kernels is None else self._kernels.being_compiled
 
     def cancel_warmup(self) -> None:
         """End the compiling of kernels, which may take minutes."""

@@ -109,10 +109,10 @@ def test_they_end_with_a_parent_that_is_killed(nothing_compiled):
 def test_every_kernel_is_compiled_by_one_child(processors):
     shares = kernel_build._shares(processors)
     assert len(shares) == processors
-    named = [name for share in shares for name in (*share.zones, *share.others)]
+    named = [name for share in shares for name in (*share.zones, *share.whole_sky)]
     assert sorted(named) == sorted(IDENTIFIERS)
     assert all(IDENTIFIERS[name].searches_zone for share in shares for name in share.zones)
-    assert [share.seldom for share in shares].count(True) == 1
+    assert [share.beside_batches for share in shares].count(True) == 1
 
 
 def test_what_batches_with_a_zone_need_is_compiled_without_the_whole_sky(
@@ -135,7 +135,8 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 
-prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions(), (), seldom=True)
+zones = ["verified", "starid"]
+prewarm_kernels(SkyModel(load_embedded(), LruCache(64 << 20)), load_missions(), zones, seldom=True)
 of_votes = _largest, cast_votes, count_votes, name_rivals
 others = fit_attitude, matched_vectors, _log_weight_of
 print(*(len(each.signatures) for each in (*others, *of_votes)))
@@ -148,43 +149,60 @@ def test_what_few_batches_need_is_compiled_before_one_comes():
     assert done.stdout.split() == [b"1"] * 7
 
 
-def _wait_between(missions, share, zones_built):
-    """In place of a child's compiling: it ends after its zones, when the folder says how."""
-    zones_built.send_bytes(b"zones")
+def _wait_between(missions, share, compiled, parent):
+    """Instead of compiling: a child that goes on, or fails, when files in the folder say so."""
     folder = Path(os.environ["NUMBA_CACHE_DIR"])
-    while not (folder / "go-on").exists():
-        if (folder / "fail").exists():
-            raise SystemExit(1)
-        time.sleep(0.01)
+    for stage in ("zones", "whole sky", "the rest"):
+        while not (folder / f"go-on {stage}").exists():
+            if (folder / "fail").exists():
+                raise SystemExit(1)
+            time.sleep(0.01)
+        if stage != "the rest":
+            compiled.send_bytes(stage.encode())
 
 
-def _fail(missions, share, zones_built):
+def _fail(missions, share, compiled, parent):
     raise SystemExit(1)
 
 
-@pytest.mark.parametrize("end", ["go-on", pytest.param("fail", marks=pytest.mark.slow)])
-@pytest.mark.slow("go-on")
-def test_zones_are_open_while_the_rest_is_compiled(nothing_compiled, monkeypatch, tmp_path, end):
+@pytest.mark.parametrize(
+    "fails_after", [None, *(pytest.param(n, marks=pytest.mark.slow) for n in (1, 2))]
+)
+@pytest.mark.slow("None")
+def test_each_kind_of_work_is_open_while_the_rest_is_compiled(
+    nothing_compiled, monkeypatch, tmp_path, fails_after
+):
     monkeypatch.setattr(kernel_build, "_compile", _wait_between)
-    build, told = KernelBuild(), []
+    build, opened = KernelBuild(), []
+
+    def go_on(stage):
+        (tmp_path / ("fail" if len(opened) == fails_after else f"go-on {stage}")).touch()
 
     def zones_built():
         assert not build.zones_needed
+        with pytest.raises(Busy, match="whole sky"):
+            build.require_whole_sky()
+        opened.append("zones")
+        go_on("whole sky")
+
+    def whole_sky_built():
         with pytest.raises(Busy, match="compiling"):
             build.require_built()
-        told.append(True)
-        (tmp_path / end).touch()
+        opened.append("whole sky")
+        go_on("the rest")
 
     assert build.zones_needed
-    if end == "go-on":
-        build.run({}, zones_built)
+    go_on("zones")
+    if fails_after is None:
+        build.run({}, zones_built, whole_sky_built)
+        build.require_whole_sky()
         build.require_built()
         assert not KernelBuild().is_needed
     else:
         with pytest.raises(Busy, match="could not be compiled"):
-            build.run({}, zones_built)
+            build.run({}, zones_built, whole_sky_built)
         assert build.is_needed
-    assert told == [True]
+    assert opened == ["zones", "whole sky"][:fails_after]
 
 
 def test_a_child_that_fails_before_its_zones_opens_nothing(nothing_compiled, monkeypatch):

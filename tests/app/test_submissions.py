@@ -168,12 +168,13 @@ def test_while_one_caller_warms_up_another_is_told_to_wait(app, monkeypatch):
 def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatch, tmp_path):
     begun, go_on = threading.Event(), threading.Event()
 
-    def run(build, missions, zones_built):
+    def run(build, missions, zones_built, whole_sky_built):
         build.zones_needed = False
         zones_built()
         begun.set()
         assert go_on.wait(30)
-        build.is_needed = False
+        whole_sky_built()
+        build.is_needed = build.whole_sky_needed = False
 
     monkeypatch.setattr(kernel_build, "_marker", lambda: Path("/none"))
     monkeypatch.setattr(KernelBuild, "run", run)
@@ -185,6 +186,7 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
         first = threads.submit(app.service.ready)
         assert begun.wait(30)
         app.service.ready()
+        assert [each.split()[0] for each in app.service.being_compiled()] == ["searches", "frames,"]
         answer = asyncio.run(app.submissions.answered(make("b1").text.encode()))
         assert json.loads(answer.body)["path"] == "zone"
         lost = json.loads(make("b2").text) | {"a_priori": None}
@@ -205,6 +207,7 @@ def test_it_is_ready_for_zones_while_other_kernels_are_compiled(make, monkeypatc
         time.sleep(0.1)
     late = app.replays.get(replay)
     assert (late.state, late.lines.done) == ("done", 1)
+    assert not app.service.being_compiled()
     assert not asyncio.run(app.submissions.answered(json.dumps(lost).encode())).replayed
     app.close()
 

@@ -19,7 +19,7 @@ from service.identify.identification import Outcome
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import load_missions
 from service.sky.geometry.star_hashes import build_star_buckets, build_star_voxels, nearest
-from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, unit
+from service.vectors import ARCSEC_PER_RADIAN, from_ra_dec, read_only, unit
 from studies.paper_1994.printed import the_paper
 from studies.paper_1994.views import EPOCH, batch_of, draw_zone
 from tests.chance import at_least, at_most
@@ -251,6 +251,7 @@ def test_the_prior_of_an_axis_on_a_circle_is_a_density(radius_deg):
 
 def scene_of(direction):
     """Zone stars all over the sky as the kernels take them."""
+    direction = read_only(direction)
     grid = build_star_buckets(direction)
     return ZoneStars(
         direction, np.zeros(len(direction)), grid.start, grid.rows, grid.direction,

@@ -13,7 +13,7 @@ from typing import IO, Any
 import httpx
 from fastapi import FastAPI
 
-from service.acquire.prewarm import prewarm_kernels
+from service.acquire.prewarm import compile_beside_batches, prewarm_kernels
 from service.app.factory import App, open_app
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission, load_missions
@@ -41,6 +41,7 @@ def compile_kernels() -> None:
     """Compile what a first request would wait for: on a fresh checkout that takes minutes."""
     sky = SkyModel(load_embedded(), LruCache(64 << 20))
     prewarm_kernels(sky, load_missions(), IDENTIFIERS, seldom=True)
+    compile_beside_batches()
 
 
 class Server:

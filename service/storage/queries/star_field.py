@@ -24,7 +24,7 @@ from service.sky.zones import SearchRegion
 from service.storage.models.answers import Answer, Star, TrackerStars
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
-from service.vectors import Matrix, Vector
+from service.vectors import Matrix, Vector, read_only
 
 MARGIN = 1.25
 """How far beyond the field of view stars are given, in fields of view."""
@@ -126,7 +126,7 @@ def presumed_attitude(
     prior = batch.a_priori
     if answer.attitude is not None and answer.path != "zone":
         # The whole sky gave it.
-        prior = QuaternionPrior(np.array(answer.attitude.quaternion))
+        prior = QuaternionPrior(read_only(np.array(answer.attitude.quaternion)))
     return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
 
 

@@ -52,7 +52,9 @@ async def readyz(request: Request, app: AppDep) -> Response:
         log.warning("not ready: %s", error)
         raise Busy("the service is not ready; its log says why", retry_after_s=5) from None
     behind = f"; trends and alarms are {lag.results} results, {lag.seconds:.0f} s behind the record"
-    return PlainTextResponse(f"ready{behind if lag.seconds > WAIT_S else ''}\n")
+    kinds = app.service.being_compiled()
+    compiling = f"; kernels are being compiled for {'; '.join(kinds)}" if kinds else ""
+    return PlainTextResponse(f"ready{compiling}{behind if lag.seconds > WAIT_S else ''}\n")
 
 
 def _ready(app: App) -> Lag:
