@@ -194,6 +194,8 @@ define install
 	@{ $(UV) --require-hashes --requirement $(1) && $(UV) --no-deps --no-build-isolation --editable . --editable ./studies; } || \
 		{ echo "uv cannot; pip takes about a minute"; \
 		$(PIP) --require-hashes --requirement $(1) && $(PIP) --no-deps --no-build-isolation --editable . --editable ./studies; }
+	@echo "$$(ls -d $(VENV)/lib/python*/site-packages/*.dist-info | wc -l) packages," \
+		"$$(du -sm $(VENV) | cut -f1) MB unpacked"
 endef
 
 $(RUNTIME): requirements.lock pyproject.toml studies/pyproject.toml | $(BIN)/python
