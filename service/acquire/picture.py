@@ -23,6 +23,7 @@ from service.imaging.detection.points import (
     SECOND_THRESHOLD,
     PointSources,
     find_points,
+    has_dark,
 )
 from service.imaging.frames.exif import is_by_rows, mirrored
 from service.imaging.frames.frame import Frame, require_light
@@ -205,7 +206,7 @@ def solve_picture(
             found = _solved(turned, flipped, sky, solver, focal, guess_px)
             if found.attitude is not None:
                 return found
-    return replace(result, points=points, remarks=tuple(advice_without_attitude(points)))
+    return replace(result, points=points, remarks=tuple(_advice(points, frame, guess_px)))
 
 
 def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:
@@ -240,7 +241,10 @@ def _solved(
     attitude = _attitude(found, places, points, frame, sky)
     if attitude.sigma_share > MOST_SIGMA_SHARE:
         return PictureResult(frame, points, None, search, ())
-    remarks = remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE)
+    remarks = [
+        *remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE),
+        *_light(points, has_dark(frame)),
+    ]
     return PictureResult(frame, points, attitude, search, tuple(remarks))
 
 
@@ -299,6 +303,9 @@ def _attitude(
     flux = points.flux_counts[seen] / (frame.exposure_s or 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
         zero = sky.magnitude_mag[row] + 2.5 * np.log10(flux)
+    if (seen >= points.clipped_stars).any():
+        # The light of stars that are cut off is not known.
+        zero = zero[seen >= points.clipped_stars]
     zero = zero[np.isfinite(zero)]
     middle = float(np.median(zero)) if len(zero) else math.nan
     spread = 1.48 * float(np.median(np.abs(zero - middle))) if len(zero) > 1 else math.nan
@@ -400,7 +407,7 @@ def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> li
         return []
     remark = (
         f"exposure_doubtful: with {exposure_stated(result.frame)}, the zero point is "
-        f" {found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
+        f"{found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
         f"factor of {10.0 ** (0.4 * abs(off_mag)):.3g}"
     )
     return [remark]
@@ -442,11 +449,11 @@ def remarks_on(
     unmatched = len(found.star) - found.matched
     if unmatched > found.matched:
         yield f"clutter: {unmatched} of {len(found.star)} candidates are no star of the catalog"
-    yield from _light(points)
 
 
-def advice_without_attitude(points: PointSources) -> Iterator[str]:
-    """Why there may be no attitude, and what to try next."""
+def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
+    """Why there may be no attitude, and what to try next that was not given already."""
+    dark = has_dark(frame)
     if points.count < 4:
         yield (
             f"too_few_points: {points.count} points of light, and four are needed: expose longer, "
@@ -455,24 +462,32 @@ def advice_without_attitude(points: PointSources) -> Iterator[str]:
     elif points.count < FEW_POINTS:
         yield f"few_points: {points.count} points of light hardly tell one field from another"
     elif points.count >= MAX_POINTS:
+        steps = ["crop what is no sky"]
+        if not points.clipped_stars:
+            steps += [] if dark else ["take off hot pixels with a dark frame (--dark FILE)"]
+            steps.append("use a shorter exposure with less noise")
+        yield f"clutter: {MAX_POINTS} candidates and more: {', or '.join(steps)}"
+    yield from _light(points, dark)
+    if guess_px is None:
+        yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
+
+
+def _light(points: PointSources, dark: bool) -> Iterator[str]:
+    if points.clipped_stars:
         yield (
-            f"clutter: {MAX_POINTS} candidates and more: crop what is no sky, take off hot pixels "
-            "with a dark frame (--dark FILE), or use a shorter exposure with less noise"
+            f"clipped_stars: {points.clipped_stars} stars are cut off at the largest count: their "
+            "places are from their flanks and less sure, their magnitudes unknown; a picture that "
+            "is not stretched shows more"
         )
-    yield from _light(points)
-    yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
-
-
-def _light(points: PointSources) -> Iterator[str]:
     if points.trail_px is not None:
         yield (
             f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure; the "
             "middles of their trails were taken, where they were at mid exposure"
         )
     if points.hot_pixels > NOTABLE_HOT:
+        more = "" if dark else "; a dark frame (--dark FILE) takes off all of them"
         yield (
-            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars; a dark "
-            "frame (--dark FILE) takes off all of them"
+            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars{more}"
         )
     if points.clipped_share > CLIPPED_SHARE:
         yield (

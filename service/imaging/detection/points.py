@@ -13,6 +13,7 @@ import numpy.typing as npt
 import sep
 from scipy import fft
 
+from service.imaging.detection.clipped import FLANK_PX, ClippedStars, clipped_stars
 from service.imaging.detection.levels import count_step, levels_of
 from service.imaging.detection.trails import (
     CLEAR_RATIO,
@@ -84,6 +85,8 @@ class PointSources:
     height_px: int
     hot_pixels: int = 0
     """Single bright pixels, which no star makes."""
+    clipped_stars: int = 0
+    """The first candidates, so many, are cut off at the largest count: see `clipped`."""
     trail_px: float | None = None
     """The typical length of the trails along which stars moved; None where they stand still."""
     trailed: str | None = None
@@ -126,11 +129,19 @@ def find_points(
         peaks = _peaks(light, GUESSED_PSF_PX, threshold, step)
     noise_counts = max(float(background.globalrms), step / math.sqrt(12.0))
     trails = _trails(light, noise_counts, *peaks)
+    discs: ClippedStars | None = None
     if trails is None:
         psf = _measured_psf(light, *peaks)
         if not 1.0 / LIKE_PSF < psf / GUESSED_PSF_PX < LIKE_PSF:
             peaks = _peaks(light, psf, threshold, step)
+        discs = clipped_stars(light)
+        if discs is not None:
+            outside = discs.are_outside(*peaks[:2])
+            u, v, ratio = peaks
+            peaks = u[outside], v[outside], ratio[outside]
         places = _still_places(light, psf, *peaks)
+        if discs is not None:
+            places = _behind(discs, places, noise_counts)
     else:
         psf = trails.sigma_px
         places = _middles_of_trails(light, noise_counts, trails, threshold)
@@ -152,6 +163,7 @@ def find_points(
         width_px=width,
         height_px=height,
         hot_pixels=int(np.count_nonzero(hot)),
+        clipped_stars=0 if discs is None else min(len(discs.u_px), MAX_POINTS),
         trail_px=None if trails is None else trails.length_px * binning,
         trailed=None if trails is None else trails.refused,
     )
@@ -193,6 +205,22 @@ def _still_places(
         np.maximum(PLACE_NOISE * psf / np.maximum(ratio, 1.0), _LEAST_SIGMA_PX),
         ratio,
         shapes.weighted[lit] * (1.0 + (psf / weight) ** 2),
+    )
+
+
+def _behind(discs: ClippedStars, places: _Places, noise_counts: float) -> _Places:
+    """The places behind discs that are cut off, which are brighter than all of them."""
+
+    def joined(first: Vector, second: Vector) -> Vector:
+        return np.concatenate([first, second])[:MAX_POINTS]
+
+    noise = noise_counts * np.sqrt(math.pi) * (discs.radius_px + FLANK_PX)
+    return _Places(
+        joined(discs.u_px, places.u_px),
+        joined(discs.v_px, places.v_px),
+        joined(discs.sigma_px, places.sigma_px),
+        joined(discs.light / noise, places.signal_ratio),
+        joined(discs.light, places.flux_counts),
     )
 
 
@@ -426,7 +454,15 @@ def without_dark(frame: Frame, dark: Frame) -> Frame:
         raise bad_frame(f"must have the size of its dark frame, {size}", wanted)
     counts = np.array(frame.counts - dark.counts)
     counts[hot_pixels(dark.counts)] = np.nan
-    return replace(frame, counts=counts)
+    return replace(frame, counts=counts, remarks=(*frame.remarks, DARK_REMARK))
+
+
+DARK_REMARK = "dark_frame: it was taken off, and its hot pixels are ignored"
+
+
+def has_dark(frame: Frame) -> bool:
+    """True for a frame whose dark frame was taken off."""
+    return DARK_REMARK in frame.remarks
 
 
 def hot_pixels(dark: CountArray) -> CountArray:

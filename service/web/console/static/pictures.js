@@ -105,6 +105,7 @@ function draw(name, picture) {
   element("numbers").hidden = picture.attitude === null;
   if (picture.attitude === null) {
     items("advice", picture.remarks);
+    element("hint-field").hidden = Boolean(element("field").value || element("camera").value);
     return `No attitude; ${picture.candidates} points of light.`;
   }
   const shown = picture.stars.slice(0, MOST_ROWS);
