@@ -47,7 +47,9 @@ class FrameSummary(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "FrameOut"
     digest: Digest
-    format: Annotated[str, DescribedAs(Literal["FITS", "TIFF", "PNG", "NPY", "JPEG", "BMP"])]
+    format: Annotated[
+        str, DescribedAs(Literal["FITS", "TIFF", "PNG", "NPY", "JPEG", "BMP", "GIF", "PGM", "RAW"])
+    ]
     tracker: str
     width_px: Count
     height_px: Count
