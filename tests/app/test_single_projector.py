@@ -1,5 +1,6 @@
 """What several services on one database do together, and what one of them does alone."""
 
+import asyncio
 import json
 import threading
 import time
@@ -64,12 +65,15 @@ def test_what_one_service_has_recorded_the_other_answers_and_shows_at_once(servi
 
 def test_events_of_one_service_wake_the_other(services, sky, missions):
     first, second = services
-    news = threading.Event()
-    second.events.listen(news.set)
     last = second.events.last()
-    submitted(first, sky, missions, "one")
-    # Without being woken it would read them a second later.
-    assert news.wait(10.0)
+
+    async def woken():
+        news = second.store.writer.bell.subscribe()
+        await asyncio.to_thread(submitted, first, sky, missions, "one")
+        # Without being woken it would read them a second later.
+        await asyncio.wait_for(news.wait(), 10.0)
+
+    asyncio.run(woken())
     wait_until(lambda: second.events.after(last, 10))
 
 

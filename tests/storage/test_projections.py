@@ -14,6 +14,7 @@ from service.app.factory import open_app
 from service.errors import Busy
 from service.observations.schema import OptionsIn
 from service.settings import Settings
+from service.storage import progress
 from service.storage.projections import projector as projecting
 from service.storage.projections.projector import Projector, rebuild_trends
 from service.storage.recording.results import next_seqs
@@ -203,7 +204,7 @@ def test_changes_beside_what_is_not_projected_yet_count_nothing_twice(app, make,
     """What is deleted or replaced first, the projector comes to later, or never."""
     with monkeypatch.context() as patch:
         patch.setattr(projecting, "PROJECTIONS", (held_up,))
-        patch.setattr(projecting, "WAIT_S", 0.1)
+        patch.setattr(progress, "WAIT_S", 0.1)
         some = [make(f"b{k}", after_s=900.0 * k) for k in range(8)]
         ids = [each.id for each in app.submissions.submit_many(some)]
         app.results.what_if(ids[7], OTHER, adopt=True)
@@ -240,11 +241,11 @@ def test_a_transaction_that_commits_late_is_neither_left_out_nor_projected_twice
         own = {"id": id, "batch_id": id, "seq": place}
         connection.execute(insert(results), row | own)
 
-    slow = other.writer.change(record_slowly)
+    slow = other.writer.later(lambda: other.writer.change(record_slowly))
     assert sleeping.wait(30)
     app.submissions.submit_many([make(f"b{k}", after_s=60.0 * k) for k in range(3)])
     # Three looks of the projector, at least, at what it can see of the record.
-    time.sleep(0.3)
+    time.sleep(3 * projecting.EVERY_S + 0.1)
     assert app.store.progress.lag().results == 3
     go_on.set()
     slow.result(30)
