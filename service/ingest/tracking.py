@@ -5,6 +5,7 @@ It becomes a part of the recorded batch: whatever is recorded later, the batch e
 
 import json
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from sqlalchemy import Connection
 from service.errors import BadInput
 from service.filtering import prediction
 from service.grades.stretches import believed, gyro_samples
+from service.interpolation import QUARTER_TURN_RAD, steps_between
 from service.missions.mission import Mission
 from service.missions.motion import MotionSettings, TrackingSettings
 from service.observations.batch import ObservationBatch
@@ -144,13 +146,50 @@ def _rate(
     if rates:
         settings = mission.tracking or TrackingSettings()
         sigma = math.radians(settings.body_rate_sigma_deg_per_s)
-        return prediction.given_rate(rates, sigma, passed_s), "body_rates"
+        given = prediction.given_rate(rates, sigma, passed_s)
+        turning = float(np.linalg.norm(given.rad_s))
+        added = 0.0
+        if turning * passed_s > QUARTER_TURN_RAD:
+            # A body that turns far may nutate: the difference of the rates is an error then.
+            added = float(np.sum((rates[-1] - rates[0]) ** 2))
+        if _contradict(before, last):
+            # The rates do not lead from one attitude to the next: they tell how fast, not where.
+            added = turning**2
+        if added:
+            given = replace(given, variance=given.variance + np.eye(3) * added)
+        return given, "body_rates"
     if before is not None and before.known.tai_ns < last.known.tai_ns:
         derived = prediction.derived_rate(before.known, last.known, passed_s)
-        # Between them there may have been a manoeuvre, such as a flip of the roll.
-        if np.abs(derived.rad_s).max() <= LARGEST_SIGMAS * motion.rate_sigma_rad_s:
+        # Between them there may have been a manoeuvre, such as a flip of the roll; or the body
+        # turned the other way round, if that is no faster than it may turn.
+        largest = LARGEST_SIGMAS * motion.rate_sigma_rad_s
+        h = (last.known.tai_ns - before.known.tai_ns) * 1e-9
+        if np.abs(derived.rad_s).max() <= largest < _other_way_rad_s(derived, h):
             return derived, "attitudes"
     return prediction.unknown_rate(motion.rate_sigma_rad_s, passed_s), "unknown"
+
+
+def _other_way_rad_s(derived: prediction.Rate, step_s: float) -> float:
+    """The largest component of the rate of a body that turned the other way round in a step."""
+    angle = float(np.linalg.norm(derived.rad_s)) * step_s
+    if angle == 0.0:
+        # About any axis: the largest component is least along a diagonal.
+        return 2.0 * math.pi / (math.sqrt(3.0) * step_s)
+    return float(np.abs(derived.rad_s).max()) * (2.0 * math.pi - angle) / angle
+
+
+def _contradict(before: RecordedAttitude | None, last: RecordedAttitude) -> bool:
+    """True if the rates of two batches do not lead from one attitude to the other."""
+    if before is None or not before.body_rates_deg_per_s.any():
+        return False
+    step_s = (last.known.tai_ns - before.known.tai_ns) * 1e-9
+    one, other = (np.radians(each.body_rates_deg_per_s)[None] for each in (before, last))
+    fastest = max(float(np.linalg.norm(one)), float(np.linalg.norm(other)))
+    if fastest * step_s <= QUARTER_TURN_RAD or not other.any():
+        return False
+    first, second = (each.known.quaternion[None] for each in (before, last))
+    steps = steps_between(first, second, np.array([step_s]), one, other)
+    return not bool(steps.is_known[0])
 
 
 def _by_gyro(

@@ -19,6 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from service.errors import BadBatch, Fault, shown_value
+from service.interpolation import QUARTER_TURN_RAD
 from service.missions import product_settings
 from service.products.tables import Column, Page, Table, number_texts, rows_of_texts
 from service.vectors import Vector, rotation_vectors
@@ -193,8 +194,9 @@ class AttitudeSeries:
 def series_of(about: SeriesInfo, pages: Iterable[AttitudeRows]) -> AttitudeSeries:
     """The series of recorded rows, which come in order of time; see `AttitudeBlock`.
 
-    Between two attitudes a stretch ends where they are farther apart than the largest gap, or
-    a batch between them has no attitude of the wanted status.
+    Between two attitudes a stretch ends where they are farther apart than the largest gap, a
+    batch between them has no attitude of the wanted status, or the body makes more than a quarter
+    turn: other programs would take it the shorter way.
     """
     return AttitudeSeries(about, _blocks(about, pages))
 
@@ -287,12 +289,32 @@ def _unfinished(rows: AttitudeRows, gaps: Integers, known: str) -> AttitudeBlock
     return AttitudeBlock(**own, stretch=np.zeros(n, np.int64), rate_origin=origin, gaps=gaps)
 
 
+def follows(rows: AttitudeBlock, largest_gap_s: float) -> npt.NDArray[np.bool_]:
+    """Marks (n - 1,) of the rows that follow the one before within the gap, and none is missing."""
+    near = np.abs(np.diff(rows.time_ns)) <= round(largest_gap_s * 1e9)
+    return np.asarray(near & (np.diff(rows.gaps) == 0))
+
+
+def known_rates(rows: AttitudeBlock) -> Vector:
+    """The rates (n, 3), deg/s, that batches gave or a filter estimated; NaN elsewhere."""
+    is_known = _among(rows.rate_origin, (OWN, ESTIMATED))
+    return np.where(is_known[:, None], rows.rate_deg_per_s, np.nan)
+
+
+def turns_far(rows: AttitudeBlock) -> npt.NDArray[np.bool_]:
+    """Marks (n - 1,) of the steps of more than a quarter turn, by the attitudes or by the rates."""
+    step_s = np.abs(np.diff(rows.time_ns)) * 1e-9
+    turn = np.linalg.norm(rotation_vectors(rows.quaternion[:-1], rows.quaternion[1:]), axis=1)
+    rate = np.nan_to_num(np.linalg.norm(np.radians(known_rates(rows)), axis=1))
+    at_rates = np.maximum(rate[:-1], rate[1:]) * step_s
+    return np.asarray((turn > QUARTER_TURN_RAD) | (at_rates > QUARTER_TURN_RAD))
+
+
 def _with_stretches(rows: AttitudeBlock, largest_gap_s: float, first: int) -> AttitudeBlock:
     """The rows with numbers of stretches, the first row's being `first`, and continuous signs."""
     if not len(rows):
         return rows
-    begins = np.abs(np.diff(rows.time_ns)) > round(largest_gap_s * 1e9)
-    begins |= np.diff(rows.gaps) != 0
+    begins = ~follows(rows, largest_gap_s) | turns_far(rows)
     stretch = first + np.concatenate([[0], np.cumsum(begins)])
     along = np.sum(rows.quaternion[1:] * rows.quaternion[:-1], axis=1)
     turned = np.where((along < 0) & ~begins, -1.0, 1.0)

@@ -17,6 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from service import vectors
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
+from service.interpolation import LARGEST_ERROR_RAD, QUARTER_TURN_RAD
 from service.observations.batch import ObservationBatch
 from service.observations.decompress import Line
 from service.observations.schema import RunName, Submission, submission_from_json
@@ -165,7 +166,8 @@ class FromFile(ABC):
 class FilePrior(FromFile):
     """The attitude of an AEM or C-kernel, as `a_priori`.
 
-    A batch outside the segments of the file keeps its own.
+    A batch keeps its own outside the segments of the file, and where the body may have turned any
+    way between two of its attitudes.
     """
 
     option, key, title = "--a-priori", "a_priori_from_file", "a priori of file"
@@ -176,7 +178,9 @@ class FilePrior(FromFile):
 
     def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
         """The a priori attitude."""
-        (quaternion,) = self._known.at(np.array([batch.time.tai_ns]))
+        rates = batch.body_rates_deg_per_s
+        own = np.radians(rates)[None] if rates.any() else None
+        (quaternion,) = self._known.at(np.array([batch.time.tai_ns]), own)
         if np.isnan(quaternion[0]):
             return {}
         if quaternion[3] < 0:
@@ -234,7 +238,8 @@ class AttitudeCarrier:
     """Remembers the last good attitude of every spacecraft and writes it into its next batch.
 
     Between the two batches the body turns with the mean of their rates where both
-    give rates, else with the given ones.  A suspect or missing attitude is not
+    give rates, else with the given ones; where these differ and it turns far, nothing is carried.
+    A suspect or missing attitude is not
     carried: the last good one is.
     """
 
@@ -254,6 +259,8 @@ class AttitudeCarrier:
             return item
         rates = [each for each in (known.rates_deg_per_s, batch.body_rates_deg_per_s) if each.any()]
         rates_deg_per_s = np.mean(rates, axis=0) if rates else np.zeros(3)
+        if _is_unsteady(rates, passed_s):
+            return item
         body = json.loads(item.submission.text)
         quaternion = vectors.quaternion_from_matrix(
             turned(known.attitude, rates_deg_per_s, passed_s)
@@ -274,6 +281,16 @@ class AttitudeCarrier:
             batch.time,
             batch.body_rates_deg_per_s,
         )
+
+
+def _is_unsteady(rates_deg_per_s: Sequence[vectors.Vector], passed_s: float) -> bool:
+    """True if a body that turns far has rates at both ends that lead to different attitudes."""
+    if len(rates_deg_per_s) < 2:
+        return False
+    one, other = np.radians(rates_deg_per_s) * abs(passed_s)
+    far = max(float(np.linalg.norm(one)), float(np.linalg.norm(other)))
+    apart = float(np.linalg.norm(other - one))
+    return far > QUARTER_TURN_RAD and apart > LARGEST_ERROR_RAD
 
 
 def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:

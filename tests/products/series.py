@@ -49,10 +49,22 @@ def rows(quaternions, times=START, *, step_s=1.0, status="good", rates=None):
 
 
 def random_quaternions(rng, n):
-    """Attitudes all over, a tenth of them with a scalar near zero; qc >= 0, as recorded."""
-    q = rng.normal(size=(n, 4))
-    q[::10, 3] *= 1e-9
-    q /= np.linalg.norm(q, axis=1)[:, None]
+    """Attitudes all over, at most 60 deg apart from one to the next; qc >= 0, as recorded.
+
+    The first and some others have a scalar near zero.
+    """
+    from service.vectors import turned_quaternion
+
+    q = np.empty((n, 4))
+    last = rng.normal(size=4) * [1.0, 1.0, 1.0, 1e-9]
+    for k in range(n):
+        turn = rng.normal(size=3)
+        turn *= rng.uniform(0.0, 0.5) / np.linalg.norm(turn)
+        last = turned_quaternion(last, turn) if k else last
+        if abs(last[3]) < 0.2 * np.linalg.norm(last):
+            last[3] *= 1e-9
+        last /= np.linalg.norm(last)
+        q[k] = last
     return np.where(q[:, 3:] < 0, -q, q)
 
 

@@ -1,4 +1,6 @@
-"""Reads AEM versions 1 and 2 (CCSDS 504.0-B), KVN and XML: quaternions of a spacecraft's body.
+"""Reads AEM versions 1 and 2 (CCSDS 504.0-B), KVN and XML: attitudes of a spacecraft's body.
+
+Quaternions, Euler angles and spin, with their rates: see `attitude_types`.
 
 Version 1 says by ATTITUDE_DIR and QUATERNION_TYPE which way a quaternion transforms and where
 its scalar stands; in version 2 it transforms from REF_FRAME_A to REF_FRAME_B and has the scalar
@@ -15,17 +17,41 @@ import numpy as np
 
 from service.observations.schema import NORM_TOLERANCE
 from service.products.reading import tokens as ccsds
-from service.products.reading.known import KnownAttitudes, Segment, known_attitudes
+from service.products.reading.attitude_types import (
+    SEQUENCES,
+    AttitudeType,
+    Frames,
+    body_attitudes,
+)
+from service.products.reading.known import KnownAttitudes, Segment, known_attitudes, told_rates
 
 _BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
 _V1_ONLY = {"QUATERNION_TYPE": ("FIRST", "LAST"), "ATTITUDE_DIR": ("A2B", "B2A")}
-_NUMBERS = {
-    1: {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/RATE": 7},
-    2: {"QUATERNION": 4, "QUATERNION/DERIVATIVE": 8, "QUATERNION/ANGVEL": 7},
+_TYPES = {
+    "QUATERNION": AttitudeType("quaternion"),
+    "QUATERNION/DERIVATIVE": AttitudeType("quaternion", "q_dot"),
+    "QUATERNION/RATE": AttitudeType("quaternion", "euler"),
+    "QUATERNION/ANGVEL": AttitudeType("quaternion", "angvel"),
+    "EULER_ANGLE": AttitudeType("euler"),
+    "EULER_ANGLE/RATE": AttitudeType("euler", "euler"),
+    "EULER_ANGLE/DERIVATIVE": AttitudeType("euler", "euler"),
+    "EULER_ANGLE/ANGVEL": AttitudeType("euler", "angvel"),
+    "SPIN": AttitudeType("spin", "spin"),
+    "SPIN/NUTATION": AttitudeType("spin", "nutation"),
+    "SPIN/NUTATION_MOM": AttitudeType("spin", "momentum"),
 }
-"""The types that are read, by version, with the numbers of a state: the quaternion comes first."""
-_NAMES = ("EPOCH", "Q1", "Q2", "Q3", "QC")
-"""The names of the elements of an XML state."""
+"""The types of attitudes, which files of either version mix: /RATE is of version 1, /DERIVATIVE of
+Euler angles, /ANGVEL and /NUTATION_MOM are of version 2."""
+_UNITS = {
+    "EPOCH": "",
+    "RATE": "deg/s",
+    "VEL": "deg/s",
+    "ANGVEL": "deg/s",
+    "DOT": "deg/s",
+    "PER": "s",
+}
+"""The unit of an XML element by a part of its name; all others are in degrees."""
+_RATE_FRAMES = ("RATE_FRAME", "ANGVEL_FRAME")
 _HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")
 _REQUIRED = (
     "OBJECT_NAME",
@@ -44,8 +70,7 @@ _METADATA = (
     "USEABLE_START_TIME",
     "USEABLE_STOP_TIME",
     "EULER_ROT_SEQ",
-    "RATE_FRAME",
-    "ANGVEL_FRAME",
+    *_RATE_FRAMES,
     "INTERPOLATION_METHOD",
     "INTERPOLATION_DEGREE",
 )
@@ -57,9 +82,9 @@ class _Form:
 
     line: int
     time_system: str
-    numbers: int
+    type: AttitudeType
+    frames: Frames
     scalar_first: bool
-    is_inverse: bool
     useable_ns: tuple[int | None, int | None]
 
 
@@ -124,25 +149,62 @@ class _Reader(ccsds.MessageReader):
 
     def _form(self, metadata: ccsds.Metadata) -> _Form:
         metadata.require(_REQUIRED)
-        numbers = _NUMBERS[self._version]
-        type = metadata.one_of("ATTITUDE_TYPE", tuple(numbers))
+        type = _TYPES[metadata.one_of("ATTITUDE_TYPE", tuple(_TYPES))]
         if self._version == 1:
-            metadata.require(tuple(_V1_ONLY))
+            metadata.require(("ATTITUDE_DIR",))
+            if type.attitude == "quaternion":
+                metadata.require(("QUATERNION_TYPE",))
         time_system = metadata.time_system()
         metadata.span(time_system)
         self._check_object(metadata)
+        sequence = self._sequence(metadata, type)
+        if type.rates == "euler" and not sequence:
+            # Without a sequence the rates of version 1 can be but an angular velocity.
+            type = AttitudeType(type.attitude, "angvel")
+        from_body = self._from_body(metadata)
+        reverse = self._v1_keyword(metadata, "ATTITUDE_DIR") == "B2A"
         return _Form(
             line=metadata.line,
             time_system=time_system,
-            numbers=numbers[type],
-            scalar_first=self._v1_keyword(metadata, "QUATERNION_TYPE") == "FIRST",
-            is_inverse=self._from_body(metadata)
-            != (self._v1_keyword(metadata, "ATTITUDE_DIR") == "B2A"),
+            type=type,
+            frames=Frames(
+                sequence, from_body, from_body != reverse, self._rate_in_body(metadata, from_body)
+            ),
+            scalar_first=type.attitude == "quaternion"
+            and self._v1_keyword(metadata, "QUATERNION_TYPE") == "FIRST",
             useable_ns=metadata.useable(time_system),
         )
 
+    def _sequence(self, metadata: ccsds.Metadata, type: AttitudeType) -> str:
+        """The axes of Euler angles, such as ZXZ; empty where the type has none."""
+        if type.attitude == "euler":
+            metadata.require(("EULER_ROT_SEQ",))
+        if "EULER_ROT_SEQ" not in metadata.values or "euler" not in (type.attitude, type.rates):
+            return ""
+        value = metadata.values["EULER_ROT_SEQ"].upper()
+        sequence = value.translate(str.maketrans("123", "XYZ"))
+        if sequence not in SEQUENCES:
+            message = "must name three axes as ZXZ or 313, no two in a row the same"
+            raise metadata.fault("EULER_ROT_SEQ", message)
+        return sequence
+
+    def _rate_in_body(self, metadata: ccsds.Metadata, from_body: bool) -> bool:
+        """True if components of an angular velocity are about the axes of the body."""
+        name = next((each for each in _RATE_FRAMES if each in metadata.values), None)
+        if name is None:
+            return True
+        frames = [metadata.values[key].upper() for key in ("REF_FRAME_A", "REF_FRAME_B")]
+        value = metadata.values[name].upper()
+        if value in ("REF_FRAME_A", frames[0]):
+            return from_body
+        if value in ("REF_FRAME_B", frames[1]):
+            return not from_body
+        raise metadata.fault(name, f"must be one of {', '.join(frames)}")
+
     def _v1_keyword(self, metadata: ccsds.Metadata, name: str) -> str:
-        return metadata.one_of(name, _V1_ONLY[name]) if self._version == 1 else ""
+        if self._version > 1 or name not in metadata.values:
+            return ""
+        return metadata.one_of(name, _V1_ONLY[name])
 
     def _from_body(self, metadata: ccsds.Metadata) -> bool:
         """True if REF_FRAME_A is the body; the other frame must be inertial."""
@@ -158,29 +220,65 @@ class _Reader(ccsds.MessageReader):
         return is_body["REF_FRAME_A"]
 
     def _state(self, token: ccsds.Token, form: _Form) -> tuple[int, tuple[float, ...]]:
-        words = token.words if token.names is None else self._source.named(token, _NAMES)
-        if token.names is None and len(words) != 1 + form.numbers:
-            message = f"must have an epoch and {form.numbers} numbers"
+        words = token.words if token.names is None else self._named(token, form)
+        if token.names is None and len(words) != 1 + form.type.size:
+            message = f"must have an epoch and {form.type.size} numbers"
             raise self._source.bad(token.line, "state", message, " ".join(words))
         time_ns = self._source.epoch_ns(token, words[0], form.time_system)
         numbers = [self._source.number(token, word) for word in words[1:]]
-        quaternion = numbers[:4]
         if form.scalar_first and token.names is None:
-            quaternion = [*numbers[1:4], numbers[0]]
-        norm = math.hypot(*quaternion)
-        if not abs(norm - 1.0) <= NORM_TOLERANCE:
-            message = f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
-            raise self._source.bad(token.line, "quaternion", message, quaternion)
-        return time_ns, tuple(quaternion)
+            numbers = _scalar_last(numbers)
+        if form.type.attitude == "quaternion":
+            norm = math.hypot(*numbers[:4])
+            if not abs(norm - 1.0) <= NORM_TOLERANCE:
+                message = f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
+                raise self._source.bad(token.line, "quaternion", message, numbers[:4])
+        if form.type.rates == "nutation" and numbers[5] == 0.0:
+            raise self._source.bad(token.line, "NUTATION_PER", "must not be 0", numbers[5])
+        return time_ns, tuple(numbers)
+
+    def _named(self, token: ccsds.Token, form: _Form) -> tuple[str, ...]:
+        """The words of an XML state, in the order of those of a text state."""
+        assert token.names is not None
+        wanted = [("EPOCH",), *form.type.names(form.frames.sequence)]
+        for name in set(token.names):
+            if token.names.count(name) > max(1, sum(name in each for each in wanted)):
+                raise self._source.bad(token.line, name, "must be there once in a state")
+        left = list(zip(token.names, token.words, token.units, strict=True))
+        words = []
+        for names in wanted:
+            place = next((k for k, each in enumerate(left) if each[0] in names), None)
+            if place is None:
+                raise self._source.bad(token.line, names[0], "must be there once in a state")
+            name, word, unit = left.pop(place)
+            expected = _unit_of(name)
+            if unit and unit.lower() != expected:
+                raise self._source.bad(
+                    token.line, name, f"must be in {expected or 'no unit'}", unit
+                )
+            words.append(word)
+        return tuple(words)
 
     def _made(self, form: _Form, times: list[int], numbers: list[tuple[float, ...]]) -> Segment:
         time_ns = np.array(times, dtype=np.int64)
-        quaternion = np.array(numbers)
-        quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
-        if form.is_inverse:
-            quaternion[:, :3] *= -1.0
+        quaternion, rate = body_attitudes(form.type, np.array(numbers), form.frames)
         span = ccsds.useable_span(times, form.useable_ns)
-        return Segment(f"line {form.line}", time_ns, *span, quaternion)
+        rate = told_rates(quaternion, rate)
+        return Segment(f"line {form.line}", time_ns, *span, quaternion, rate)
+
+
+def _unit_of(name: str) -> str:
+    """The unit of an XML element."""
+    if name.startswith("Q"):
+        return "1/s" if name.endswith("_DOT") else ""
+    return next((unit for end, unit in _UNITS.items() if end in name.split("_")), "deg")
+
+
+def _scalar_last(numbers: list[float]) -> list[float]:
+    """The quaternion, and its derivative where there is one, with the scalar last."""
+    parts = [numbers[first : first + 4] for first in range(0, len(numbers) - 3, 4)]
+    turned = [each for part in parts for each in (*part[1:], part[0])]
+    return turned + numbers[len(turned) :]
 
 
 def _epoch(token: ccsds.Token) -> str:

@@ -1,7 +1,9 @@
-"""Reads C-kernels of type 3 through CSPICE, in a child process: CSPICE is global.
+"""Reads C-kernels of types 1 and 3 through CSPICE, in a child process: CSPICE is global.
 
 SPICE's quaternion is scalar-first and the conjugate of ours.  Each interpolation interval is a
-segment.  Leap seconds come from ERFA's table unless a kernel of them is given.
+segment, of type 1 each segment, of which only the records are known.  Where intervals overlap,
+that of the later segment of the file has priority, as SPICE has it.  Leap seconds come from
+ERFA's table unless a kernel of them is given.
 """
 
 import json
@@ -19,6 +21,7 @@ from service.extras import require_extra
 from service.products.ck import leap_second_kernel
 from service.products.reading import known
 from service.products.spool import PIECE_BYTES, folder
+from service.vectors import attitude_matrices
 
 CHILD_S = 600.0
 """The longest that the child may take."""
@@ -97,20 +100,32 @@ def _read(name: str, place: Path, kernel: str, others: list[str]) -> known.Known
     answer = json.loads(done.stdout.splitlines()[-1])
     if "error" in answer:
         raise BadFile(Fault(name, answer["error"]))
-    records = np.fromfile(place / "records").reshape(-1, 5)
-    spans = np.fromfile(place / "segments", dtype=np.int64).reshape(-1, 2)
+    records = np.fromfile(place / "records").reshape(-1, 8)
+    spans = np.fromfile(place / "segments", dtype=np.int64).reshape(-1, 3)
     time_ns = np.ascontiguousarray(records[:, 0]).view(np.int64)
-    norm = np.linalg.norm(records[:, 1:], axis=1)
+    norm = np.linalg.norm(records[:, 1:5], axis=1)
     if not np.all(np.abs(norm - 1.0) < 1e-3):
         row = int(np.flatnonzero(~(np.abs(norm - 1.0) < 1e-3))[0])
         message = f"must have norm 1 within 0.001; its norm is {norm[row]:.6g}"
         raise BadFile(Fault(f"{name}, record {row + 1}: quaternion", message))
-    quaternion = np.column_stack([-records[:, 2:], records[:, 1]]) / norm[:, None]
+    quaternion = np.column_stack([-records[:, 2:5], records[:, 1]]) / norm[:, None]
+    rate = np.einsum("nij,nj->ni", attitude_matrices(quaternion), records[:, 5:])
     segments = []
-    for first, count in spans.tolist():
-        at, times = f"record {first + 1}", time_ns[first : first + count]
+    for first, count, discrete in spans.tolist():
+        at, rows = f"record {first + 1}", slice(first, first + count)
+        times = time_ns[rows]
         if np.any(np.diff(times) <= 0):
             raise BadFile(Fault(f"{name}, {at}", "times must increase within an interval"))
-        within = quaternion[first : first + count]
-        segments.append(known.Segment(at, times, int(times[0]), int(times[-1]), within))
-    return known.known_attitudes(name, answer["object"], segments)
+        rates = None if np.isnan(rate[first]).any() else rate[rows]
+        segments.append(
+            known.Segment(
+                at,
+                times,
+                int(times[0]) - (known.DISCRETE_NS if discrete else 0),
+                int(times[-1]) + (known.DISCRETE_NS if discrete else 0),
+                quaternion[rows],
+                known.told_rates(quaternion[rows], rates),
+                bool(discrete),
+            )
+        )
+    return known.known_attitudes(name, answer["object"], known.by_priority(segments))

@@ -1,10 +1,12 @@
-"""Reads C-kernels of type 3; run as a program of its own, because CSPICE is global.
+"""Reads C-kernels of types 1 and 3; run as a program of its own, because CSPICE is global.
 
     python ck_reader_child.py OUT MOST CK KERNEL...
 
-Writes to the folder OUT `records`, rows of nanoseconds of TAI since J2000 (int64) and the four
-components of SPICE's quaternion (float64), and `segments`: rows of the first record and the
-number of records of each interval.  Prints a line of JSON: `error`, or the `object`.
+Writes to the folder OUT `records`, rows of nanoseconds of TAI since J2000 (int64), the four
+components of SPICE's quaternion from J2000 and the rates about inertial axes in rad/s, NaN where
+there are none (float64); and `segments`: rows of the first record, the number of records of each
+interval, and 1 where nothing is known between its records.  Intervals are in the order of the
+file: a later one has priority.  Prints a line of JSON: `error`, or the `object`.
 """
 
 import json
@@ -16,7 +18,11 @@ import numpy as np
 import spiceypy as spice
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
-TYPE = 3
+DISCRETE, CONTINUOUS = 1, 3
+"""The types that are read."""
+J2000 = 1
+INERTIAL = range(1, 22)
+"""SPICE's inertial frames, each at a fixed rotation from J2000."""
 
 
 class Refused(Exception):
@@ -32,21 +38,36 @@ def segments(handle: int) -> list[list[int]]:
     return found
 
 
-def records_of(handle: int, begin: int, end: int, rates: int) -> "tuple[Floats, Floats]":
-    """Records (n, 5) of a segment, clock first, and the clock at the start of its intervals."""
-    # The layout of type 3 ("CK Required Reading"): packets, times, directory of times,
-    # starts of intervals, directory of starts, number of intervals, number of packets.
-    intervals, count = (int(each) for each in spice.dafgda(handle, end - 1, end))
+def records_of(handle: int, kind: int, begin: int, end: int, rates: int) -> "tuple[Floats, Floats]":
+    """Records (n, 8) of a segment, clock first, and the clock at the start of its intervals."""
+    # The layouts of types 1 and 3 ("CK Required Reading"): packets, times, directory of times,
+    # of type 3 starts of intervals, directory of starts, number of intervals; number of packets.
     size = 7 if rates else 4
     room = end - begin + 1
+    (count,) = (int(each) for each in spice.dafgda(handle, end, end))
+    intervals = int(spice.dafgda(handle, end - 1, end - 1)[0]) if kind == CONTINUOUS else 1
     if not (0 < count <= room // (size + 1) and 0 < intervals <= count):
         raise Refused("a segment of it is not as its type has it")
     packets = np.array(spice.dafgda(handle, begin, begin + count * size - 1)).reshape(-1, size)
     times_at = begin + count * size
     times = np.array(spice.dafgda(handle, times_at, times_at + count - 1))
-    starts_at = times_at + count + (count - 1) // 100
-    starts = np.array(spice.dafgda(handle, starts_at, starts_at + intervals - 1))
-    return np.column_stack([times, packets[:, :4]]), starts
+    starts = times[:1]
+    if kind == CONTINUOUS:
+        starts_at = times_at + count + (count - 1) // 100
+        starts = np.array(spice.dafgda(handle, starts_at, starts_at + intervals - 1))
+    rate = packets[:, 4:] if rates else np.full((count, 3), np.nan)
+    return np.column_stack([times, packets[:, :4], rate]), starts
+
+
+def from_j2000(frame: int, records: Floats) -> Floats:
+    """The records with quaternions and rates of another inertial frame from J2000."""
+    if frame == J2000:
+        return records
+    matrix = np.array(spice.pxform("J2000", spice.frmnam(frame), 0.0))
+    # SPICE's product of quaternions is that of their matrices: C-matrix times frame.
+    turn = spice.m2q(matrix)
+    q = np.array([spice.qxq(each, turn) for each in records[:, 1:5]])
+    return np.column_stack([records[:, 0], q, records[:, 5:] @ matrix])
 
 
 def main() -> None:
@@ -70,20 +91,22 @@ def main() -> None:
             f"needs the clock of spacecraft {clock}: put its SCLK kernel (.tsc) in the same folder"
         ) from None
     count = 0
-    spans: list[tuple[int, int]] = []
+    spans: list[tuple[int, int, int]] = []
     with Path(out, "records").open("wb") as file:
         for _, frame, kind, rates, begin, end in found:
-            if kind != TYPE:
-                raise Refused(f"has a segment of type {kind}; type {TYPE} is read")
-            if frame != 1:
-                raise Refused(f"refers to frame {spice.frmnam(frame) or frame}; J2000 is read")
-            rows, starts = records_of(handle, begin, end, rates)
+            if kind not in (DISCRETE, CONTINUOUS):
+                raise Refused(f"has a segment of type {kind}; types 1 and 3 are read")
+            if frame not in INERTIAL:
+                name = spice.frmnam(frame) or frame
+                raise Refused(f"refers to frame {name}; inertial frames of SPICE are read")
+            rows, starts = records_of(handle, kind, begin, end, rates)
+            rows = from_j2000(frame, rows)
             count_here = len(rows)
             if count + count_here > int(most):
                 raise Refused(f"has more than {int(most):,} records")
             place = np.searchsorted(rows[:, 0], starts)
             spans += [
-                (count + first, last - first)
+                (count + first, last - first, int(kind == DISCRETE))
                 for first, last in zip(place, [*place[1:], count_here], strict=True)
             ]
             tai_s = [spice.unitim(spice.sct2e(clock, t), "ET", "TAI") for t in rows[:, 0]]

@@ -1,23 +1,29 @@
 """Attitudes or orbital states that a file gives in spans of time, and the one at a moment."""
 
+from bisect import bisect_left
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, Protocol, TypeVar
 
 import numpy as np
 
 from service.errors import BadFile, Fault
+from service.interpolation import QUARTER_TURN_RAD, steps_between
 from service.products.attitudes import SAME_MOMENT_NS, Integers
 from service.times import Utc
-from service.vectors import Vector, rotation_vectors, turned_quaternion
+from service.vectors import Vector, rotation_vectors
 
 MOST_RECORDS = 5_000_000
-"""Attitudes that are held in memory, 40 bytes each."""
-
+"""Attitudes that are held in memory, 40 bytes each, or 64 with rates."""
 
 CLOCK_NS = 200
 """A time that went through a kernel's clock and ET comes back this near."""
+DISCRETE_NS = 1_000_000
+"""A moment this near to a record is that of the record, where nothing is known between."""
+
+STILL_RAD = 1e-5
+"""Rates of zeros are none where the body turns by more from one record to the next."""
 
 
 @dataclass(frozen=True)
@@ -35,14 +41,22 @@ class Span:
 
 @dataclass(frozen=True)
 class Segment(Span):
-    """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated."""
+    """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated.
+
+    `rate_rad_s` (n, 3) are the rates of the body relative to inertial, in body axes; None where
+    the file gives none.  Of a `discrete` segment nothing is known between two records.
+    """
 
     quaternion: Vector
+    rate_rad_s: Vector | None = None
+    discrete: bool = False
 
-    def at(self, time_ns: Integers) -> Vector:
-        """The attitudes (n, 4) at moments (n,); NaN outside the segment.
+    def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
+        """The attitudes (n, 4) at moments (n,); NaN outside the segment and where none is known.
 
-        Between two records the body turns at a constant rate the shorter way.
+        See `interpolation` for what is known between two records.  Rates (n, 3) about
+        the body axes, of another source, count for moments between records that have none, if the
+        body makes more than a quarter turn at them.
         """
         # A kernel's clock may put a record some nanoseconds off its moment.
         moment = time_ns.clip(self.first_ns, self.last_ns)
@@ -51,11 +65,24 @@ class Segment(Span):
         after = np.searchsorted(self.time_ns, moment).clip(min(1, last), last)
         before = (after - 1).clip(0)
         step_ns = np.maximum(self.time_ns[after] - self.time_ns[before], 1)
-        share = (moment - self.time_ns[before]) / step_ns
-        q = between(self.quaternion[before], self.quaternion[after], share)
+        rates: tuple[Vector | None, Vector | None] = (None, None)
+        if self.rate_rad_s is not None:
+            rates = (self.rate_rad_s[before], self.rate_rad_s[after])
+        elif rate_rad_s is not None:
+            turn = np.linalg.norm(rate_rad_s, axis=1) * step_ns * 1e-9
+            far = np.where((turn > QUARTER_TURN_RAD)[:, None], rate_rad_s, np.nan)
+            rates = (far, far)
+        steps = steps_between(
+            self.quaternion[before], self.quaternion[after], step_ns * 1e-9, *rates
+        )
+        q = steps.at((moment - self.time_ns[before]) / step_ns)
+        q[~steps.is_known] = np.nan
+        if self.discrete:
+            q[:] = np.nan
         # Where a record is, it is given as it stands.
         for place in (before, after):
-            is_there = np.abs(self.time_ns[place] - moment) <= CLOCK_NS
+            apart_ns = np.abs(self.time_ns[place] - moment)
+            is_there = apart_ns <= (DISCRETE_NS if self.discrete else CLOCK_NS)
             q[is_there] = self.quaternion[place[is_there]]
         q[~inside] = np.nan
         return q
@@ -71,20 +98,24 @@ class KnownAttitudes:
     def __len__(self) -> int:
         return sum(len(each.time_ns) for each in self.segments)
 
-    def at(self, time_ns: Integers) -> Vector:
-        """The attitudes (n, 4) at moments (n,); NaN outside every segment."""
+    def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
+        """The attitudes (n, 4) at moments (n,); NaN where none is known; see `Segment.at`."""
         starts = np.array([each.first_ns for each in self.segments], dtype=np.int64)
         place = np.searchsorted(starts, time_ns + SAME_MOMENT_NS, side="right") - 1
         found = np.full((len(time_ns), 4), np.nan)
         for number in np.unique(place[place >= 0]).tolist():
             chosen = place == number
-            found[chosen] = self.segments[number].at(time_ns[chosen])
+            rates = None if rate_rad_s is None else rate_rad_s[chosen]
+            found[chosen] = self.segments[number].at(time_ns[chosen], rates)
         return found
 
 
-def between(first: Vector, second: Vector, share: Vector) -> Vector:
-    """The attitudes (n, 4) a share (n,) of the way from some (n, 4) to others, the shorter way."""
-    return turned_quaternion(first, rotation_vectors(first, second) * share[:, None])
+def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
+    """The rates (n, 3) of attitudes (n, 4); None where all are zero although the body turns."""
+    if rate_rad_s is None or rate_rad_s.any() or len(quaternion) < 2:
+        return rate_rad_s
+    turned = np.linalg.norm(rotation_vectors(quaternion[:-1], quaternion[1:]), axis=1)
+    return None if turned.max() > STILL_RAD else rate_rad_s
 
 
 def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) -> KnownAttitudes:
@@ -111,6 +142,35 @@ def in_order(file: str, segments: Sequence[S]) -> list[S]:
             message = f"overlaps the segment at {one.place}: a time belongs to one segment"
             raise BadFile(Fault(f"{file}, {other.place}", message))
     return ordered
+
+
+def by_priority(segments: Sequence[Segment]) -> list[Segment]:
+    """Segments of which none overlap: a time belongs to the last one that has it.
+
+    Between the records of a discrete segment nothing is known, and those before it hold.
+    """
+    firsts: list[int] = []
+    lasts: list[int] = []
+    found = []
+    for segment in reversed(segments):
+        spans = [(segment.first_ns, segment.last_ns)]
+        if segment.discrete:
+            spans = [(int(t) - DISCRETE_NS, int(t) + DISCRETE_NS) for t in segment.time_ns]
+        for first_ns, last_ns in spans:
+            place = end = bisect_left(lasts, first_ns)
+            begin = first_ns
+            while end < len(firsts) and firsts[end] <= last_ns:
+                if begin < firsts[end]:
+                    found.append(replace(segment, first_ns=begin, last_ns=firsts[end] - 1))
+                # A moment just after an interval is that of its end, see `KnownAttitudes.at`.
+                begin = lasts[end] + SAME_MOMENT_NS + 1
+                end += 1
+            if begin <= last_ns:
+                found.append(replace(segment, first_ns=begin, last_ns=last_ns))
+            low = min([first_ns, *firsts[place:end]])
+            high = max([last_ns, *lasts[place:end]])
+            firsts[place:end], lasts[place:end] = [low], [high]
+    return found
 
 
 Interpolation = Literal["HERMITE", "LAGRANGE"]

@@ -20,6 +20,7 @@ MAX_LINE_BYTES = 4096
 _PIECE_BYTES = 1 << 16
 _MOST_DEPTH = 12
 _PAIR = re.compile(r"([A-Za-z0-9_]+)\s*=\s*(.*)")
+_D_TO_E = str.maketrans("dD", "ee")
 _UNIT = re.compile(r"\s*\[[^\]]*\]$")
 
 
@@ -27,7 +28,8 @@ _UNIT = re.compile(r"\s*\[[^\]]*\]$")
 class Token:
     """A keyword, a mark or a state, with its line.
 
-    `words` of a state are its epoch and numbers; in XML with the `names` of its elements.
+    `words` of a state are its epoch and numbers; in XML with the `names` of its elements, and the
+    `units` that they name.
     """
 
     line: int
@@ -36,6 +38,7 @@ class Token:
     value: str = ""
     words: tuple[str, ...] = ()
     names: tuple[str, ...] | None = None
+    units: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -98,7 +101,8 @@ class Source:
     def number(self, token: Token, word: str) -> float:
         """A number of a state; raises `BadFile` for any other word."""
         try:
-            number = float(word)
+            # Fortran writes the exponents of double precision with D.
+            number = float(word.translate(_D_TO_E))
         except ValueError:
             number = math.nan
         if not math.isfinite(number) or "_" in word:
@@ -183,7 +187,8 @@ class _XmlReader:
         self._size = 0
         self._is_leaf = False
         self._line = 0
-        self._state: list[tuple[str, str]] | None = None
+        self._state: list[tuple[str, str, str]] | None = None
+        self._attributes: dict[str, str] = {}
 
     def feed(self, piece: bytes) -> None:
         """Read on; a piece without bytes is the end."""
@@ -222,6 +227,7 @@ class _XmlReader:
                 self._line_number, tag, f"lies in more than {_MOST_DEPTH} others"
             )
         self._text, self._size, self._is_leaf = [], 0, True
+        self._attributes = attributes
 
     def _characters(self, text: str) -> None:
         self._size += len(text)
@@ -236,9 +242,9 @@ class _XmlReader:
         if tag in self._form.parts:
             self._tokens.append(Token(self._line_number, "mark", self._form.parts[tag][1]))
         elif tag == self._form.state:
-            names, words = zip(*self._state or [("", "")], strict=True)
+            names, words, units = zip(*self._state or [("", "", "")], strict=True)
             self._tokens.append(
-                Token(self._line, "state", "state", words=tuple(words), names=tuple(names))
+                Token(self._line, "state", "state", words=words, names=names, units=units)
             )
             self._state = None
         elif self._is_leaf and tag != "COMMENT":
@@ -246,7 +252,10 @@ class _XmlReader:
             if self._state is None:
                 self._tokens.append(Token(self._line_number, "key", tag, value))
             elif len(self._state) < 32:
-                self._state.append((tag, value))
+                # Version 1 names Euler angles in an attribute.
+                own = self._attributes
+                name = own.get("angle", own.get("rate", tag))
+                self._state.append((name, value, own.get("units", "")))
         self._is_leaf = False
         self._text, self._size = [], 0
 

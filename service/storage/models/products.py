@@ -77,11 +77,12 @@ class AttitudeAtMoment(Record, frozen=True, kw_only=True):
     method: Literal["nearest", "interpolated"]
     quaternion: ContinuousQuaternion
     covariance_arcsec2: Covariance
-    """Of the attitudes that were used. Between two batches their errors are independent; between
-    filtered or smoothed samples it is the weighted mean."""
+    """Of the attitudes that were used, and of the motion. Between two batches their errors are
+    independent; between filtered or smoothed samples it is the weighted mean."""
     motion_arcsec: float | None
     """The error that the motion adds. Nearest: the angle that the body turns until the moment.
-    Interpolated: an eighth of the step times the change of the rate. Null: no rate is known."""
+    Interpolated: an eighth of the step times the change of the rate, over more than a quarter turn
+    a bound from the rates. Null: no rate is known."""
     offset_s: Annotated[float, doc("From the moment to the nearest attitude that was used.")]
     ids: Annotated[list[Id], doc("The results that were used.")]
 
