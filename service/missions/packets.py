@@ -7,7 +7,7 @@ parameter lies in a packet, how it is encoded and calibrated, is said by the XTC
 import math
 import re
 from datetime import date, datetime
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -40,6 +40,9 @@ Upper = (
     ]
 )
 """The upper triangle of a symmetric matrix by rows: 11, 12, 13, 22, 23, 33."""
+ValidLabels = Annotated[tuple[str, ...], Field(min_length=1, max_length=100)] | None
+_no_labels: Any = Field(default=None, exclude_if=lambda labels: labels is None)
+"""Missing, they are no part of the mission's digest."""
 SigmaArcsec = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -114,6 +117,8 @@ class PacketTracker(Strict):
     """So many slots, from the first, hold a star."""
     valid: SlotNames | None = None
     """A slot holds a star where this is not zero."""
+    valid_labels: ValidLabels = _no_labels
+    """The labels of enumerated parameters, or texts, for which a slot holds a star."""
 
     @model_validator(mode="after")
     def _names_fit(self) -> Self:
@@ -177,6 +182,8 @@ class PacketMeasurement(Strict):
     """In place of parameters: the sigmas of every packet."""
     valid: ParameterName | None = None
     """The packet holds an attitude where this is not zero."""
+    valid_labels: ValidLabels = _no_labels
+    """The labels of an enumerated parameter, or texts, for which it holds one."""
     time: PacketTime | None = None
     """Of an attitude with a time of its own; by default the time of its packet."""
 

@@ -252,7 +252,9 @@ class BatchMaker:
                 raise PacketFault(columns.count, message, used)
         slots, stars = [], []
         for slot in range(used):
-            if columns.valid is not None and not clock.number(values, columns.valid[slot]):
+            if columns.valid is not None and not clock.flag(
+                values, columns.valid[slot], columns.valid_labels
+            ):
                 continue
             direction = [clock.number(values, each[slot]) for each in columns.directions]
             if not all(map(math.isfinite, direction)):
@@ -366,7 +368,7 @@ class MeasurementMaker:
         self, columns: MeasurementColumns, packet: SpacePacket, values: Mapping[str, Any]
     ) -> dict[str, Any] | None:
         table = columns.table
-        if table.valid is not None and not clock.number(values, table.valid):
+        if table.valid is not None and not clock.flag(values, table.valid, table.valid_labels):
             return None
         quaternion = quaternion_in(values, columns.quaternion, table)
         if quaternion is None:

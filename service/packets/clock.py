@@ -141,6 +141,18 @@ def number(values: Mapping[str, Any], name: str) -> float:
         raise PacketFault(name, "is beyond every number of a batch") from None
 
 
+def flag(values: Mapping[str, Any], name: str, labels: Sequence[str] | None = None) -> bool:
+    """True where a flag is not zero; of an enumerated one, its number.
+
+    With `labels`, where its label or text is among them.
+    """
+    if labels is not None:
+        return text(values, name) in labels
+    value = _present(values, name)
+    raw = getattr(value, "raw_value", value) if isinstance(value, str) else value
+    return bool(number({name: raw}, name))
+
+
 def finite(values: Mapping[str, Any], name: str) -> float:
     """A value that is a number; raises `PacketFault` for NaN and infinity too."""
     value = number(values, name)

@@ -11,8 +11,9 @@ import io
 import math
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from service.errors import BadFile, Fault, shown_value
 from service.extras import require_extra
@@ -23,6 +24,7 @@ MAX_CONTAINERS = 4_000
 MAX_PARAMETERS = 100_000
 MAX_EXPONENT = 64
 MAX_BITS = 8 * (65536 + 6)
+MAX_LABELLED = 65_536
 MAX_DEPTH = 16
 """Arrays of aggregates of arrays, so deep."""
 
@@ -181,10 +183,30 @@ class _Expansion:
         for each in kind.iter():
             if each.get("bitOrder") == "leastSignificantBitFirst":
                 raise XtceFault(each, "bitOrder leastSignificantBitFirst is not supported")
+        if self._local(kind) == "EnumeratedParameterType":
+            for each in list(kind.iter(_named("Enumeration"))):
+                self._list_range(each)
         if self._local(kind) == "BooleanParameterType":
             for word in ("StringDataEncoding", "BinaryDataEncoding"):
                 if kind.find(f".//{_named(word)}") is not None:
                     raise XtceFault(kind, f"a boolean with a {word} is not supported")
+
+    def _list_range(self, entry: Any) -> None:
+        """Write a label of numbers up to `maxValue` as one entry for each."""
+        last = entry.get("maxValue")
+        if last is None:
+            return
+        del entry.attrib["maxValue"]
+        try:
+            numbers = range(int(entry.get("value", "")), int(last) + 1)
+        except ValueError:
+            raise XtceFault(entry, "value and maxValue must be whole numbers", last) from None
+        if not 0 < len(numbers) <= MAX_LABELLED:
+            message = f"maxValue must be from value to {MAX_LABELLED} numbers on"
+            raise XtceFault(entry, message, last)
+        for number in reversed(numbers[1:]):
+            copy = self._etree.Element(entry.tag, value=str(number), label=entry.get("label", ""))
+            entry.addnext(copy)
 
     def _is_compound(self, type_name: str | None) -> bool:
         kind = self._types.get(type_name or "")
@@ -333,6 +355,17 @@ class PacketFault(Exception):
         self.value = None if value is None else shown_value(value)
 
 
+@dataclass(frozen=True)
+class ParameterKind:
+    """The values that a parameter has; of an enumerated one the labels with their numbers.
+
+    The number is None where the labels stand for texts.
+    """
+
+    kind: Literal["number", "boolean", "enumerated", "text", "binary"]
+    labels: Mapping[str, float | None] = field(default_factory=dict)
+
+
 class PacketDefinition:
     """Reads packets as an XTCE file describes them; `name` is that of the file in messages."""
 
@@ -349,9 +382,13 @@ class PacketDefinition:
             raise BadFile(Fault(name, message))
         self._root = self._containers[root_container]
         _require_bounded(self._containers, name)
-        self.parameters = frozenset(
-            entry for each in self._containers.values() for entry in _parameter_names(each)
-        )
+        self.parameters: dict[str, ParameterKind] = {
+            entry.name: _kind_of(entry.parameter_type)
+            for each in self._containers.values()
+            for entry in each.entry_list
+            if not hasattr(entry, "entry_list")
+        }
+        """The kinds of the parameters that containers hold, by name."""
 
     def read(self, packet: bytes) -> Mapping[str, Any]:
         """The calibrated values of a packet's parameters by name.
@@ -433,8 +470,21 @@ def _entries(container: Any, sizes: dict[str, int]) -> int:
     return min(sizes[container.name], MAX_ENTRIES + 1)
 
 
-def _parameter_names(container: Any) -> list[str]:
-    return [entry.name for entry in container.entry_list if not hasattr(entry, "entry_list")]
+def _kind_of(parameter_type: Any) -> ParameterKind:
+    name = type(parameter_type).__name__.removesuffix("ParameterType")
+    encoding = type(parameter_type.encoding).__name__
+    if name == "Enumerated":
+        # A value of a text encoding is bytes.
+        labels = {
+            label: raw if isinstance(raw, int | float) else None
+            for raw, label in parameter_type.enumeration.items()
+        }
+        return ParameterKind("enumerated", labels)
+    if name == "Boolean":
+        return ParameterKind("boolean")
+    if encoding == "StringDataEncoding":
+        return ParameterKind("text")
+    return ParameterKind("binary" if encoding == "BinaryDataEncoding" else "number")
 
 
 def _fits(container: Any, values: Any) -> bool:

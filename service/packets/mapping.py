@@ -16,7 +16,7 @@ from service.missions.packets import (
     element_names,
 )
 from service.packets.clock import names_of
-from service.packets.definition import PacketDefinition
+from service.packets.definition import PacketDefinition, ParameterKind
 
 DEG_OF_UNIT = {"deg": 1.0, "arcmin": 1.0 / 60.0, "arcsec": 1.0 / 3600.0, "rad": 180.0 / math.pi}
 
@@ -35,6 +35,7 @@ class TrackerColumns:
     time_offset_s: tuple[str, ...] | None
     sigma_arcsec: tuple[str, ...] | None
     valid: tuple[str, ...] | None
+    valid_labels: tuple[str, ...] | None
     count: str | None
 
     @property
@@ -90,15 +91,77 @@ def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
         velocity=element_names(table.velocity.components, 3) if table.velocity else (),
         position=element_names(table.position.components, 3) if table.position else (),
     )
-    faults = [
-        Fault(f"packets.{key}", _missing(name, definition), shown_value(name))
-        for key, names in _keys(found)
-        for name in names
-        if name not in definition.parameters
-    ]
+    faults = []
+    for key, names in _keys(found):
+        labels = _labels_of(key, found)
+        for name in names:
+            kind = definition.parameters.get(name)
+            message = _missing(name, definition) if kind is None else _misfit(key, kind, labels)
+            if message:
+                faults.append(Fault(f"packets.{key}", message, shown_value(name)))
     if faults:
         raise BadInput(faults[:20])
     return found
+
+
+def _labels_of(key: str, found: PacketMap) -> tuple[str, ...] | None:
+    table, index, word = (*key.split("."), "", "")[:3]
+    if word != "valid":
+        return None
+    if table == "trackers":
+        return found.trackers[int(index)].valid_labels
+    return found.measurements[int(index)].table.valid_labels
+
+
+_NO = frozenset(
+    (
+        *("invalid", "not_valid", "notvalid", "false", "no", "none", "nok", "not_ok", "bad", "off"),
+        *("fail", "failed", "error", "fault", "lost", "inactive", "disabled", "unused", "empty"),
+        "absent",
+    )
+)
+_YES = frozenset(
+    (
+        *("valid", "true", "yes", "ok", "good", "on", "active", "enabled", "used", "present"),
+        *("nominal", "locked", "tracking", "tracked"),
+    )
+)
+"""Words of labels that tell by themselves whether something is there."""
+
+
+def _misfit(key: str, kind: ParameterKind, labels: tuple[str, ...] | None) -> str | None:
+    """Why parameters of a kind cannot stand at a key of the table; None where they can."""
+    if key == "batch":
+        return "is a boolean; a number or a text is needed" if kind.kind == "boolean" else None
+    if not key.endswith(".valid"):
+        return None if kind.kind == "number" else f"{_said(kind)}; a number is needed"
+    if labels is None:
+        if kind.kind == "enumerated":
+            return _unclear_labels(kind.labels)
+        return None if kind.kind in ("number", "boolean") else f"{_said(kind)}; give valid_labels"
+    if kind.kind == "enumerated":
+        unknown = [label for label in labels if label not in kind.labels]
+        known = ", ".join(list(kind.labels)[:20])
+        return f"has no label {unknown[0]!r} of valid_labels; it has {known}" if unknown else None
+    return None if kind.kind == "text" else f"{_said(kind)} and has no labels; drop valid_labels"
+
+
+def _said(kind: ParameterKind) -> str:
+    return f"is {'an' if kind.kind == 'enumerated' else 'a'} {kind.kind} parameter"
+
+
+def _unclear_labels(labels: Mapping[str, float | None]) -> str | None:
+    """Why the numbers of labels do not tell which of them mean that something is there."""
+    words = {label: label.strip().lower().replace(" ", "_").replace("-", "_") for label in labels}
+    set_labels = [label for label, raw in labels.items() if raw != 0]
+    wrong = [label for label in set_labels if labels[label] is None or words[label] in _NO]
+    wrong += [label for label, raw in labels.items() if raw == 0 and words[label] in _YES]
+    if len(set_labels) > 1:
+        wrong += [label for label in set_labels if words[label] not in _YES]
+    if not wrong:
+        return None
+    shown = ", ".join(f"{label} = {raw}" for label, raw in list(labels.items())[:20])
+    return f"is enumerated, {shown}: give valid_labels, the labels that mean that it holds one"
 
 
 def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission:
@@ -151,6 +214,7 @@ def _columns(table: PacketTracker) -> TrackerColumns:
         time_offset_s=column(table.time_offset_s),
         sigma_arcsec=column(table.sigma_arcsec),
         valid=column(table.valid),
+        valid_labels=table.valid_labels,
         count=table.count,
     )
 

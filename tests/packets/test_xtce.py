@@ -66,7 +66,7 @@ def test_an_include_is_refused_by_its_line():
 def test_every_style_of_namespaces_gives_the_same_parameters(style):
     found = PacketDefinition(xtce(style), "test.xml", "CCSDSPacket").parameters
     assert found == PacketDefinition(xtce(), "test.xml", "CCSDSPacket").parameters
-    assert {"ST1_A[0]", "ST1_A[7]", "ST_DAY", "PKT_APID"} <= found
+    assert {"ST1_A[0]", "ST1_A[7]", "ST_DAY", "PKT_APID"} <= found.keys()
 
 
 def in_attitude(text, name):

@@ -1,0 +1,143 @@
+"""Enumerated, boolean and text parameters: taken where they fit, else refused before any packet."""
+
+from pathlib import Path
+
+import pytest
+
+from service.errors import BadInput
+from service.observations.schema import submission_from_json
+from service.packets.definition import PacketDefinition
+from service.packets.reader import PacketReader
+from tests.packets.packing import TABLE, VECTORS, mission_with, xtce
+
+FOLDER = Path(__file__).parent / "enumerated"
+XTCE = (FOLDER / "enum.xml").read_text()
+TABLE_OF_FLAG = """
+[packets]
+[packets.time]
+kind = "cds"
+day = "DAY"
+millisecond = "MS"
+[[packets.measurements]]
+quaternion = ["Q1", "Q2", "Q3", "Q4"]
+sigma_arcsec = [5, 5, 30]
+valid = "VALID"
+"""
+LABELS = XTCE[XTCE.index("<EnumerationList>") : XTCE.index("</EnumerationList>")]
+
+
+def labelled(**numbers):
+    entries = "".join(
+        f'<Enumeration value="{value}" label="{label}"/>' for label, value in numbers.items()
+    )
+    return XTCE.replace(LABELS, f"<EnumerationList>{entries}")
+
+
+def read(table=TABLE_OF_FLAG, described=XTCE):
+    definition = PacketDefinition(described.encode(), "enum.xml", "CCSDSPacket")
+    reader = PacketReader(mission_with(table), definition)
+    with (FOLDER / "a.dat").open("rb") as file:
+        lines = list(reader.lines(file, "a.dat"))
+    assert [line.fault for line in lines if line.fault is not None] == []
+    return [submission_from_json(line.body).batch for line in lines], reader.totals()
+
+
+def test_an_enumerated_flag_counts_by_its_number():
+    """The input of a public report: six packets, of which three are VALID."""
+    batches, totals = read()
+    assert len(batches) == 3
+    assert totals.without_stars == 3
+    assert totals.refused == 0
+
+
+def test_valid_labels_say_which_labels_hold_an_attitude():
+    wanted = [each.time for each in read()[0]]
+    table = TABLE_OF_FLAG + 'valid_labels = ["TRACKING"]\n'
+    assert [each.time for each in read(table, labelled(ACQUIRING=0, TRACKING=1))[0]] == wanted
+    others = [each.time for each in read(table, labelled(TRACKING=0, ACQUIRING=1))[0]]
+    assert len(others) == 3
+    assert not set(others) & set(wanted)
+
+
+def test_a_range_of_numbers_has_one_label():
+    described = XTCE.replace('value="1" label="VALID"', 'value="1" maxValue="200" label="VALID"')
+    assert len(read(described=described)[0]) == 3
+
+
+BOOLEAN = XTCE.replace("Enumerated", "Boolean").replace(LABELS + "</EnumerationList>", "")
+
+
+def test_a_boolean_flag_counts_where_it_is_true():
+    assert [each.time for each in read(described=BOOLEAN)[0]] == [each.time for each in read()[0]]
+
+
+def test_without_labels_a_flag_by_number_is_as_before():
+    number = XTCE.replace(
+        'name="VALID" parameterTypeRef="VT"', 'name="VALID" parameterTypeRef="U8"'
+    )
+    kind = '<IntegerParameterType name="U8" signed="false"><IntegerDataEncoding sizeInBits="8"/>'
+    number = number.replace("<EnumeratedP", f"{kind}</IntegerParameterType><EnumeratedP", 1)
+    assert len(read(described=number)[0]) == 3
+
+
+@pytest.mark.parametrize(
+    ("described", "more", "words"),
+    [
+        (labelled(VALID=0, INVALID=1), "", "VALID = 0, INVALID = 1: give valid_labels"),
+        (labelled(OFF=0, ACQUIRING=1, TRACKING=2), "", "give valid_labels"),
+        (XTCE, 'valid_labels = ["GOOD"]', "has no label 'GOOD' of valid_labels; it has INVALID"),
+        (BOOLEAN, 'valid_labels = ["VALID"]', "is a boolean parameter and has no labels"),
+    ],
+)
+def test_labels_that_do_not_tell_are_refused_before_any_packet(described, more, words):
+    with pytest.raises(BadInput) as refusal:
+        read(TABLE_OF_FLAG + more, described)
+    assert "packets.measurements.0.valid" in str(refusal.value)
+    assert words in str(refusal.value)
+
+
+PARAMETERS = {
+    "time": ("ST_DAY", "ST_MS", "ST_US"),
+    "trackers.0.count": ("ST1_STARS",),
+    "trackers.0.vector.0": ("ST1_A",),
+    "trackers.0.magnitude": ("ST1_MAG",),
+    "trackers.0.time_offset_s": ("ST1_DT",),
+    "prior.quaternion": ("Q1",),
+    "rates.components": ("RATE_X",),
+    "velocity.components": ("VEL_Y",),
+    "position.components": ("POS_Z",),
+}
+KINDS = {
+    "ENUM_T": "is an enumerated parameter; a number is needed",
+    "BOOL_T": "is a boolean parameter; a number is needed",
+    "TEXT_T": "is a text parameter; a number is needed",
+}
+TYPES = (
+    '<xtce:EnumeratedParameterType name="ENUM_T"><xtce:IntegerDataEncoding sizeInBits="64"/>'
+    '<xtce:EnumerationList><xtce:Enumeration value="1" label="ON"/></xtce:EnumerationList>'
+    '</xtce:EnumeratedParameterType><xtce:BooleanParameterType name="BOOL_T">'
+    '<xtce:IntegerDataEncoding sizeInBits="64"/></xtce:BooleanParameterType>'
+)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("key", PARAMETERS)
+def test_a_number_is_needed_in_every_other_place(key, kind):
+    described = xtce("prefixed", TYPES).decode()
+    for name in PARAMETERS[key]:
+        for own in (
+            f'"{name}" parameterTypeRef="{name}_T"',
+            f'"{name}" parameterTypeRef="DOUBLE_T"',
+        ):
+            described = described.replace(own, f'"{name}" parameterTypeRef="{kind}"')
+        described = described.replace(
+            f'name="{name}_T" arrayTypeRef="DOUBLE_T"', f'name="{name}_T" arrayTypeRef="{kind}"'
+        )
+        if name in ("ST1_A", "ST1_MAG", "ST1_DT"):
+            described = described.replace(
+                f'"{name}" parameterTypeRef="{kind}"', f'"{name}" parameterTypeRef="{name}_T"'
+            )
+    definition = PacketDefinition(described.encode(), "pass.xml", "CCSDSPacket")
+    with pytest.raises(BadInput) as refusal:
+        PacketReader(mission_with(TABLE.format(directions=VECTORS)), definition)
+    assert f"packets.{key}: {KINDS[kind]}" in str(refusal.value)
