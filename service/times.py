@@ -232,7 +232,8 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
     year, hour, minute, second = int(years), int(hours), int(minutes), int(seconds)
     if not first_year <= year <= last_year:
         raise ValueError(f"the year must be from {first_year} to {last_year}")
-    if hour > 23 or minute > 59 or second > 60:
+    is_end_of_day = hour == 24 and not (minute or second or float(fraction or 0.0))
+    if (hour > 23 and not is_end_of_day) or minute > 59 or second > 60:
         raise ValueError("there is no such time of day")
     try:
         if days_of_year:
@@ -243,6 +244,11 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
         raise ValueError("there is no such day") from None
     if day.year != year:
         raise ValueError("there is no such day of the year")
+    if is_end_of_day:
+        # The end of a day is the beginning of the next one (ISO 8601).
+        if day == date(last_year, 12, 31):
+            raise ValueError(f"the year must be from {first_year} to {last_year}")
+        day, hour = day + timedelta(days=1), 0
     if zone[0]:
         day, hour, minute = _in_utc(day, hour, minute, *zone)
     if second == 60 and not ((hour, minute) == (23, 59) and _length_s(day) > DAY_S):

@@ -99,7 +99,7 @@ def test_a_leap_second_belongs_to_the_hour_that_it_ends():
         ("1996-02-30T00:00:00Z", "no such day"),
         ("1997-366T00:00:00Z", "no such day of the year"),
         ("1996-000T00:00:00Z", "no such day of the year"),
-        ("1996-01-10T24:00:00Z", "no such time of day"),
+        ("1996-01-10T24:00:01Z", "no such time of day"),
         ("1996-01-10T12:60:00Z", "no such time of day"),
         ("1996-01-10T12:00:61Z", "no such time of day"),
         ("2016-12-30T23:59:60Z", "no leap second"),

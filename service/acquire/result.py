@@ -240,10 +240,10 @@ FLIP_DEG = 5.0
 
 def warnings_of_batch(batch: ObservationBatch, mission: Mission) -> list[str]:
     """Warnings about the batch itself, whatever was found."""
-    warnings, options = [], batch.options
+    warnings, options = list(batch.remarks), batch.options
     if options.tests or options.tolerances:
         off = [name for name in impossible_tests(batch, mission) if options.tests.get(name)]
-        warnings = [
+        warnings += [
             f"test_off: {name} was asked for and cannot be made of this a priori knowledge"
             for name in off
         ]

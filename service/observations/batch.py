@@ -151,3 +151,5 @@ class ObservationBatch(Struct, frozen=True, eq=False):
     position_km: Vector | None = None
     tracking: Tracking | None = None
     measurement: MeasuredAttitude | None = None
+    remarks: tuple[str, ...] = ()
+    """What was taken otherwise than it was sent: a code, a colon, and a sentence each."""

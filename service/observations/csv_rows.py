@@ -58,7 +58,8 @@ MEASURED = ("measured_quaternion", "measured_sigma_arcsec", "measured_covariance
 VERBATIM = (*TEXTS, "tracker")
 """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
 
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
+_D_TO_E = str.maketrans("dD", "ee")
 
 
 class BadCell(Exception):
@@ -119,7 +120,8 @@ def number_cell(row: CsvRow, column: str) -> float:
 def _number(column: str, cell: str) -> float:
     if not _NUMBER.fullmatch(cell):
         raise BadCell(column, "must be a number", cell)
-    number = float(cell)
+    # Fortran writes the exponents of double precision with D.
+    number = float(cell.translate(_D_TO_E))
     if not math.isfinite(number):
         raise BadCell(column, "must be a finite number", cell)
     return number
@@ -382,8 +384,11 @@ class BatchRows(JoinedRows):
                 message = f"differs from line {self.number}, the first of the batch"
                 raise BadCell(column, message, row[column])
         if "measurement" in self.fields:
-            if self.rows > 1:
+            if self.rows > 1 and row != self.first:
                 raise BadCell("batch", "has a second measured attitude", self.key[-1])
+            if self.rows > 1:
+                words = f"{self.rows - 1} rows repeat the measured attitude"
+                self.fields["remarks"] = [f"repeated_rows: {words}, and were counted once"]
             if cell := next((row[each] for each in STAR_COLUMNS[1:] if row.get(each)), None):
                 raise BadCell("batch", "has stars beside a measured attitude", cell)
             return

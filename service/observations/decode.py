@@ -133,6 +133,7 @@ class SentBatch(_SentPart):
     position_km: Triple | None = None
     aberration: Aberration = "to_correct"
     options: SentOptions = msgspec.field(default_factory=SentOptions)
+    remarks: tuple[str, ...] = ()
 
 
 _BATCH = msgspec.json.Decoder(SentBatch)
@@ -163,6 +164,7 @@ def batch_from_canonical(text: str) -> ObservationBatch:
         position_km=_optional_array(sent.position_km),
         tracking=None if prior is None or prior.from_ is None else _tracking_of(prior),
         measurement=None if sent.measurement is None else _measured(sent.measurement),
+        remarks=sent.remarks,
     )
 
 

@@ -37,6 +37,7 @@ from service.observations.batch import (
     Options,
 )
 from service.observations.decode import batch_from_canonical, prior_from_canonical
+from service.observations.fill_values import MOST_REMARKS, without_fill_values
 from service.observations.frame_record import FrameRecord
 from service.times import parse_utc
 
@@ -443,6 +444,7 @@ def no_options_beside_measurement(options: Any, info: ValidationInfo) -> Any:
     return options
 
 
+Remark = Annotated[str, Field(max_length=300, pattern=r"^[a-z_0-9]+: [^\x00-\x1f\x7f]+$")]
 Sigma = Annotated[Number, Field(ge=LEAST_SIGMA_ARCSEC, le=LARGEST_SIGMA_ARCSEC)]
 
 
@@ -490,6 +492,8 @@ class BatchIn(Wire):
         AfterValidator(_stars_of_different_trackers),
     ] = []
     options: Annotated[OptionsIn, AfterValidator(no_options_beside_measurement)] = OptionsIn()
+    remarks: Annotated[tuple[Remark, ...], Field(max_length=MOST_REMARKS)] = ()
+    """What was taken otherwise than it was sent.  The service adds this."""
 
 
 def prior_of(prior: APrioriIn) -> APriori:
@@ -541,23 +545,26 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 def checked_from_model(model: BatchIn) -> Checked:
     """The checked value for which a model stands."""
+    model = without_fill_values(model)
     text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
     sent = text
     if isinstance(prior, FromLastIn) and (prior.prediction or prior.by_default):
         as_sent = None if prior.by_default else FromLastIn.model_validate({"from": "last"})
         sent_model = model.model_copy(update={"a_priori": as_sent})
-        sent = sent_model.model_dump_json(exclude_defaults=True)
+        sent = sent_model.model_dump_json(exclude_defaults=True, exclude={"remarks"})
+    elif model.remarks:
+        sent = model.model_dump_json(exclude_defaults=True, exclude={"remarks"})
     return Checked(text, hashlib.sha256(sent.encode()).hexdigest())
 
 
 def fingerprint_of(input: str) -> str:
     """The fingerprint of a recorded batch that was not made of a frame."""
-    if _PREDICTED in input:
+    if _PREDICTED in input or _REMARKS in input:
         return checked_from_json(input).fingerprint
     return hashlib.sha256(input.encode()).hexdigest()
 
 
-_PREDICTED = '"from":"last"'
+_PREDICTED, _REMARKS = '"from":"last"', '"remarks":['
 
 
 def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:

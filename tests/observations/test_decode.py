@@ -86,7 +86,14 @@ def stars(draw):
     return draw(directions()) | draw(st.fixed_dictionaries({}, optional=numbers))
 
 
-@given(st.lists(stars(), min_size=1, max_size=8))
+def unlike(star):
+    """A star as a value: exact repeats count once, and several magnitudes of zero are none."""
+    if star.get("magnitude") == 0.0:
+        return "zero"
+    return json.dumps({name: np.add(value, 0.0).tolist() for name, value in star.items()})
+
+
+@given(st.lists(stars(), min_size=1, max_size=8, unique_by=unlike))
 def test_every_number_of_a_star_arrives_as_it_was_sent(sent):
     body = BATCH | {"observations": [BATCH["observations"][0] | {"stars": sent}]}
     (seen,) = wire.submission_from_json(json.dumps(body)).batch.observations

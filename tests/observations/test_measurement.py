@@ -140,7 +140,7 @@ def test_a_file_of_quaternions_alone_needs_no_columns_of_stars():
 def test_a_row_with_a_bad_cell_is_refused_by_its_column():
     (line,) = lines_of(f"{HEADER},{SIGMAS}", ROW.replace(",0,0,0,1,", ",0,,0,1,"))
     assert (line.body, line.fault.field) == (None, "line 2, column measured_q2")
-    (line,) = lines_of(f"{HEADER},{SIGMAS}", ROW, ROW)
-    assert (line.body, line.fault.field) == (None, "line 3, column batch")
+    (line,) = lines_of(f"{HEADER},{SIGMAS},frame", f"{ROW},EME2000", f"{ROW},ICRF")
+    assert (line.body, line.fault.field) == (None, "line 3, column frame")
     (line,) = lines_of(f"{HEADER},{SIGMAS},x,y,z", f"{ROW},0,0,1")
     assert "beside a measured attitude" in line.fault.message

@@ -2,6 +2,7 @@
 
 import io
 import json
+import math
 import tracemalloc
 from pathlib import Path
 
@@ -299,7 +300,9 @@ bodies = st.fixed_dictionaries(
         "run": st.sampled_from(["live", "night-1"]),
         "body_rates_deg_per_s": triples,
         "velocity_km_per_s": triples,
-        "position_km": st.lists(numbers, min_size=3, max_size=3),
+        "position_km": st.lists(numbers, min_size=3, max_size=3).map(
+            lambda km: [7e3, *km[1:]] if math.hypot(*km) < 7e3 else km
+        ),
         "sun_vector": units,
         "aberration": st.sampled_from(["to_correct", "applied_upstream", "ignore"]),
         "options": st.just({"solver": "triad", "tolerances": {"magnitude_mag": 0.25}}),

@@ -1,0 +1,93 @@
+"""Values that stand for none in what senders write, and stars that are there twice.
+
+They are taken as not given, or counted once, and a remark of the batch says so.  Values that may
+be in another unit are refused.
+"""
+
+import math
+from typing import TYPE_CHECKING, Any
+
+from service.errors import BadBatch, Fault, shown_value
+
+if TYPE_CHECKING:
+    from service.observations.schema import BatchIn, StarIn, TrackerIn
+
+MOST_REMARKS = 40
+EARTH_RADIUS_KM = 6_350.0
+"""A little less than the polar radius."""
+EARTH_GM_KM3_PER_S2 = 398_600.4418
+_VECTORS = ("velocity_km_per_s", "position_km")
+
+
+def without_fill_values(batch: "BatchIn") -> "BatchIn":
+    """The batch without values that stand for none, and its stars once each; with remarks on both.
+
+    Raises `BadBatch` for a position inside the Earth, and for one that with its velocity would be
+    an orbit about the Earth if it were in metres.
+    """
+    changes: dict[str, Any] = {}
+    remarks = []
+    for name in _VECTORS:
+        vector = getattr(batch, name)
+        if vector is not None and not any(vector):
+            changes[name] = None
+            remarks.append(f"{name}_not_given: {name} is zero, and was taken as not given")
+    _require_outside_earth(batch.position_km, batch.velocity_km_per_s)
+    observations = [_of_tracker(each, remarks) for each in batch.observations]
+    if remarks:
+        changes["observations"] = observations
+        changes["remarks"] = (*batch.remarks, *remarks)[:MOST_REMARKS]
+    return batch.model_copy(update=changes) if changes else batch
+
+
+def _of_tracker(tracker: "TrackerIn", remarks: list[str]) -> "TrackerIn":
+    stars = tracker.stars
+    if len(stars) < 2:
+        return tracker
+    once = {_key(star): star for star in stars}
+    if len(once) < len(stars):
+        words = f"{len(stars) - len(once)} of {len(stars)} stars of {tracker.tracker}"
+        remarks.append(f"repeated_stars: {words} are exact repeats, and were counted once")
+        stars = list(once.values())
+    zeros = sum(star.magnitude == 0.0 for star in stars)
+    if zeros > 1:
+        words = f"{zeros} stars of {tracker.tracker} have the magnitude 0"
+        remarks.append(f"magnitudes_not_given: {words}, which was taken as not given")
+        stars = [
+            star.model_copy(update={"magnitude": None}) if star.magnitude == 0.0 else star
+            for star in stars
+        ]
+    return tracker if stars is tracker.stars else tracker.model_copy(update={"stars": stars})
+
+
+def _key(star: "StarIn") -> tuple[Any, ...]:
+    key = star.vector, star.h_deg, star.v_deg, star.magnitude, star.time_offset_s, star.sigma_arcsec
+    lists = star.h_counts, star.v_counts, star.h_times, star.v_times
+    if lists == (None, None, None, None):
+        return key
+    return (*key, *(None if each is None else tuple(each) for each in lists))
+
+
+def _require_outside_earth(
+    position_km: tuple[float, ...] | None, velocity_km_per_s: tuple[float, ...] | None
+) -> None:
+    if position_km is None or not any(position_km):
+        return
+    distance_km = math.hypot(*position_km)
+    message = None
+    if distance_km < EARTH_RADIUS_KM:
+        message = f"is {distance_km:.6g} km from the centre of the Earth, inside it"
+    elif velocity_km_per_s is not None:
+        speed = math.hypot(*velocity_km_per_s)
+        in_metres_km = distance_km / 1e3
+        circular = math.sqrt(EARTH_GM_KM3_PER_S2 / in_metres_km)
+        along = sum(p * v for p, v in zip(position_km, velocity_km_per_s, strict=True))
+        # Far spacecraft hardly ever move at such a speed, and across their direction.
+        is_orbit = 0.8 * circular < speed < 1.25 * circular
+        if in_metres_km > EARTH_RADIUS_KM and is_orbit and abs(along) < 0.3 * distance_km * speed:
+            message = (
+                f"is {distance_km:.6g} km from the Earth at {speed:.3g} km/s: that is an orbit "
+                "about the Earth if it is in metres; give kilometres"
+            )
+    if message is not None:
+        raise BadBatch(Fault("position_km", message, shown_value(position_km)))
