@@ -3,13 +3,19 @@
 Nothing outside the folder of a feature imports it.  Its package holds a `Feature` under the name
 `FEATURE`, which says which modules the feature brings; the rest of the service asks for these:
 
+- `tables`: importing it declares its tables of the database; they stay where the feature is off.
+- `part`: `open_part(app)` makes what the feature adds to an open `App`, which has it by its class
+  (`App.part`) and closes it by its `close()`.
 - `command`: `add(commands)` declares its commands, as a module of `service.cli.commands` does.
 - `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
 - `routes`: `ROUTERS` are its routes of the API, `POLICIES` their policies by name.
 - `pages`: importing it registers its pages of the console; its templates and scripts lie in the
   folders `templates` and `static` of the package.
-- `panels`: `PANELS`, the parts that it adds to other pages: a function by the name of a page.
+- `panels`: `PANELS`, what it adds to pages of others: functions of the `PageContext`, by name of
+  the page; each page says what it takes.
+- `metrics`: `reads(app)`, functions by name that are called together at each scrape, with a
+  deadline; `collect(app, found)` makes metrics of what they returned in time.
 
 Another package brings a feature by an entry point of the group `acquire.features` that names its
 `Feature`.  `ACQUIRE_FEATURES_OFF` names features that are not to be imported at all.
@@ -20,15 +26,25 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.resources import files
 from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("follow",)
+SHIPPED = ("follow", "webhooks")
 """The features that come with the service, in the order of their routes and commands."""
 
-KINDS = ("command", "serving", "routes", "pages", "panels")
-"""The modules that a feature may bring."""
+KINDS = (
+    "tables",
+    "part",
+    "command",
+    "serving",
+    "routes",
+    "pages",
+    "panels",
+    "metrics",
+)
+"""The names of the modules that a feature may bring."""
 
 SETTING = "ACQUIRE_FEATURES_OFF"
 
@@ -78,4 +94,13 @@ def feature_modules(kind: str, off: str) -> list[ModuleType]:
         import_module(f"{feature.package}.{kind}")
         for feature in features_on(off)
         if kind in feature.brings
+    ]
+
+
+def feature_folders(name: str) -> list[str]:
+    """The packages of all features that have a folder of this name, such as `templates`."""
+    return [
+        feature.package
+        for feature in known_features().values()
+        if files(feature.package).joinpath(name).is_dir()
     ]

@@ -1,5 +1,7 @@
 """The app: every part of the service, put together in one place."""
 
+from typing import Protocol, TypeVar
+
 from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
 from service.app.advice import AdviceService
@@ -16,8 +18,8 @@ from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Gyro, Spacecraft
 from service.app.tracks import Tracks
-from service.app.webhooks import Webhooks
 from service.app.zones import Zones
+from service.feature import feature_modules
 from service.ingest.spool import Spool
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, load_missions
@@ -35,6 +37,15 @@ from service.storage.store import Store
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade, TrackerSplitter
 from service.times import utc_now
+
+T = TypeVar("T")
+
+
+class Part(Protocol):
+    """What a feature adds to an open app."""
+
+    def close(self) -> None:
+        """Stop what it has begun."""
 
 
 class App:
@@ -88,7 +99,6 @@ class App:
         self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
         self.events = Events(context)
         self.expiries = ExpiryDates(context.reading_record)
-        self.webhooks = Webhooks(context, self.access)
         self.upgrade = BackgroundUpgrade(
             TrackerSplitter(context.store, context.sky, context.missions)
         )
@@ -102,10 +112,22 @@ class App:
             self.single_projector,
         )
 
+        self._parts: dict[type, Part] = {}
+        for module in feature_modules("part", context.settings.features_off):
+            part: Part = module.open_part(self)
+            self._parts[type(part)] = part
+
+    def part(self, kind: type[T]) -> T:
+        """What a feature added to this app, by its class."""
+        part = self._parts[kind]
+        assert isinstance(part, kind)
+        return part
+
     def close(self) -> None:
         """Stop the replays, write and project what is queued, and close the database."""
         self.single_projector.stop()
-        self.webhooks.sender.stop()
+        for part in self._parts.values():
+            part.close()
         self.replays.stop()
         self.calibrations.close()
         self.live_filter.stop()

@@ -48,7 +48,7 @@ ROOT = Path(__file__).parents[2]
 AREAS = {
     "alarms": ("service/alarms",),
     "access": ("service/access.py",),
-    "webhooks": ("service/webhooks",),
+    "webhooks": ("service/features/webhooks",),
     "recording": ("service/storage/recording",),
     "ingest": ("service/ingest",),
     "packets": ("service/packets",),

@@ -20,9 +20,9 @@ from tests.calibration.wrong_file import (
     with_true_file,
     write_mission_files,
 )
+from tests.features.webhooks.conftest import LOOPBACK, receiver
 from tests.web.conformance import check
 from tests.web.serving import Server, ended, in_process_settings
-from tests.webhooks.conftest import LOOPBACK, receiver
 
 __all__ = ["receiver"]
 

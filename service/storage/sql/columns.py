@@ -20,6 +20,8 @@ metadata = MetaData(
         "pk": "pk_%(table_name)s",
     }
 )
+HAS_FIRST_ROW = "has_first_row"
+"""The key in the `info` of a table that has a row in a new database."""
 
 Id = String(26)
 Name = String(128)

@@ -17,6 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service import __version__
 from service.errors import BadConfiguration
+from service.feature import feature_modules
 from service.resources import shipped
 from service.storage.sql import engines
 from service.storage.sql.columns import metadata, unpack
@@ -107,6 +108,8 @@ def all_tables() -> list[Table]:
     # A table is known to the metadata when its module is loaded.
     from service.storage.sql import alarm_tables, grade_tables, tables  # noqa: F401
 
+    # A feature that is off keeps its tables.
+    feature_modules("tables", off="")
     return metadata.sorted_tables
 
 

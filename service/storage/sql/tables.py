@@ -16,7 +16,6 @@
     calibrations ── calibration_adoptions          of trackers, and what holds of them
     replays
     access_tokens ── access_sessions, audit        who may ask, who changed what
-    webhooks ── webhook_deliveries                 receivers of events, and what waits for them
 
 A batch is what was sent; a result is what was made of it.  The first result of
 a batch has the batch's own id; recorded what-ifs add others, and exactly one
@@ -36,6 +35,7 @@ from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
 from service.storage.sql.columns import (
     CURRENT,
+    HAS_FIRST_ROW,
     Digest,
     Id,
     Moment,
@@ -80,72 +80,6 @@ audit = sa.Table(
     sa.Column("about", sa.Text, nullable=False),
     sa.Column("body", sa.Text),
     sa.Column("status", sa.SmallInteger),
-)
-
-
-webhooks = sa.Table(
-    "webhooks",
-    metadata,
-    sa.Column("id", Id, primary_key=True),
-    sa.Column("name", sa.String(64), nullable=False),
-    sa.Column("url", sa.Text, nullable=False),
-    # The filters; lists as JSON.  Null: no filter.
-    sa.Column("kinds", sa.Text),
-    sa.Column("spacecraft", sa.Text),
-    sa.Column("severity", sa.String(16)),
-    sa.Column("run", RunName),
-    sa.Column("enabled", sa.Boolean, nullable=False),
-    # The token that made or last changed it; null: access was open.
-    sa.Column("token_id", Id, sa.ForeignKey(access_tokens.c.id)),
-    sa.Column("who", sa.String(64), nullable=False),
-    sa.Column("created", Moment, nullable=False),
-    # Not a digest: a signature needs the secret itself.
-    sa.Column("secret", sa.Text, nullable=False),
-    sa.Column("previous_secret", sa.Text),
-    sa.Column("previous_until", Moment),
-    # The number of the last event that was queued or passed over.
-    sa.Column("position", sa.BigInteger, nullable=False),
-    sa.Column("missed", sa.BigInteger, nullable=False, server_default=sa.text("0")),
-    sa.Column("gone_at", Moment),
-    sa.Column("held_until", Moment),
-    sa.Column("failing_since", Moment),
-    sa.Column("last_attempt", Moment),
-    sa.Column("last_delivered", Moment),
-    sa.Column("last_status", sa.SmallInteger),
-    sa.Column("last_fault", sa.Text),
-)
-
-webhook_deliveries = sa.Table(
-    "webhook_deliveries",
-    metadata,
-    sa.Column("webhook_id", Id, sa.ForeignKey(webhooks.c.id), primary_key=True),
-    sa.Column("event_id", sa.BigInteger, primary_key=True, autoincrement=False),
-    sa.Column("message_id", sa.String(48), nullable=False),
-    sa.Column("kind", sa.String(16), nullable=False),
-    # Empty: the event is about no spacecraft or about every one.
-    sa.Column("spacecraft", Name, nullable=False),
-    sa.Column("body", sa.Text, nullable=False),
-    # Asked for again: new events of the spacecraft do not wait for it.
-    sa.Column("again", sa.Boolean, nullable=False),
-    sa.Column("dead", sa.Boolean, nullable=False),
-    sa.Column("queued", Moment, nullable=False),
-    sa.Column("due", Moment, nullable=False),
-    sa.Column("attempts", sa.Integer, nullable=False),
-    sa.Column("last_attempt", Moment),
-    sa.Column("last_status", sa.SmallInteger),
-    sa.Column("last_fault", sa.Text),
-    sa.Index(
-        "ix_webhook_deliveries_queue", "webhook_id", "dead", "again", "spacecraft", "event_id"
-    ),
-)
-
-webhook_sender = sa.Table(
-    "webhook_sender",
-    metadata,
-    # One row: the process that delivers, and a number that it raises every few seconds.
-    sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
-    sa.Column("holder", Id),
-    sa.Column("beat", sa.BigInteger, nullable=False),
 )
 
 
@@ -469,6 +403,7 @@ projector = sa.Table(
     # One row: every result up to this one is in the projections, and none after it.
     sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
     sa.Column("seq", sa.BigInteger, nullable=False),
+    info={HAS_FIRST_ROW: True},
 )
 
 events = sa.Table(
@@ -489,6 +424,7 @@ event_counter = sa.Table(
     # One row, whose lock orders the events of several processes as they are committed.
     sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
     sa.Column("last", sa.BigInteger, nullable=False),
+    info={HAS_FIRST_ROW: True},
 )
 
 WRITTEN_BY_POSTS = (

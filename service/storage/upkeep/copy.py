@@ -20,14 +20,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import BadConfiguration
 from service.storage.sql import engines, migrations
+from service.storage.sql.columns import HAS_FIRST_ROW
 from service.storage.sql.database_file import writing_alone
 from service.storage.sql.projector_lock import ProjectorLock
 from service.storage.sql.statements import count, insert_all
-from service.storage.sql.tables import event_counter, projector, webhook_sender
 from service.storage.upkeep.verify import verify
 
-FIRST_ROWS = (event_counter, projector, webhook_sender)
-"""The tables that have a row in a new database."""
 ROWS_AT_ONCE, LARGE_ROWS_AT_ONCE = 2_000, 20
 """The second for tables with packed samples and pictures, of up to a megabyte a row."""
 
@@ -161,8 +159,9 @@ def _begin(connection: sa.Connection, tables: Sequence[sa.Table], counts: Counts
             return True
         if revision == migrations.HEAD:
             present = _counted(connection, tables)
-            if not any(present[table.name] for table in tables if table not in FIRST_ROWS):
-                for table in FIRST_ROWS:
+            first = [table for table in tables if HAS_FIRST_ROW in table.info]
+            if not any(present[table.name] for table in tables if table not in first):
+                for table in first:
                     connection.execute(sa.delete(table))
                 _set_revision(connection, marked)
                 return True

@@ -14,7 +14,7 @@ import msgspec
 from fastapi import Depends
 from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
-from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined, pass_context
 from jinja2.runtime import Context
 from markupsafe import Markup
 from starlette.exceptions import HTTPException
@@ -26,6 +26,7 @@ from service.access import Caller
 from service.alarms.limits import Severity
 from service.app.factory import App
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
+from service.feature import feature_folders, feature_modules
 from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, parse_utc
@@ -219,6 +220,12 @@ class PageContext:
         """The page, which shows a run."""
         return rendered(template, self._layout(run), **values)
 
+    def panels(self, page: str, *shown: Any) -> list[Any]:
+        """What features add to a page, by the name of its handler; `shown` is what it shows."""
+        modules = feature_modules("panels", self.app.settings.features_off)
+        makers = (module.PANELS.get(page) for module in modules)
+        return [panel for make in makers if make is not None for panel in make(self, *shown)]
+
     def _layout(self, run: str) -> Layout:
         batches = {each.run: each.batches for each in self.app.runs.all(self.caller.spacecraft)}
         active = self.app.alarms.active(run)
@@ -316,7 +323,9 @@ def _data(value: object) -> Markup:
 def _environment() -> Environment:
     # Text from clients is escaped; a misspelt name is an error, not an empty string.
     environment = Environment(
-        loader=PackageLoader("service.web.console"),
+        loader=ChoiceLoader(
+            [PackageLoader(each) for each in ("service.web.console", *feature_folders("templates"))]
+        ),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

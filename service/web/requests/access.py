@@ -146,19 +146,8 @@ POLICIES: dict[str, Policy] = {
     "list_tokens": OPERATE,
     "add_token": OPERATE,
     "revoke_token": OPERATE,
-    # What a webhook sends is about every spacecraft, and its URL may be a secret.
-    "list_webhooks": OPERATE,
-    "get_webhook": OPERATE,
-    "add_webhook": OPERATE,
-    "change_webhook": OPERATE,
-    "delete_webhook": OPERATE,
-    "rotate_webhook_secret": OPERATE,
-    "test_webhook": OPERATE,
-    "list_webhook_deliveries": OPERATE,
-    "retry_dead_letters": OPERATE,
-    "replay_events": OPERATE,
 }
-"""The policy of every route by its name; the console's pages add theirs."""
+"""The policy of every route by its name; pages of the console and features add theirs."""
 
 _LINK_NAVIGATION = (
     ("sec-fetch-mode", "navigate"),

@@ -3,7 +3,7 @@
 import collections
 import logging
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from itertools import product
 from typing import Any
@@ -25,15 +25,14 @@ from starlette.types import Scope
 from service import __version__
 from service.alarms.limits import Severity
 from service.app.factory import App
+from service.feature import feature_modules
 from service.ingest.queue import OUTCOMES, Backlog, RecordedCounts
 from service.storage.models.alarms import Alarm
 from service.storage.models.spacecraft import ZoneCache
 from service.storage.progress import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
-from service.storage.webhooks import Webhook
-from service.times import recorded_utc, unix_seconds, utc_now
-from service.webhooks.messages import Result
+from service.times import recorded_utc, unix_seconds
 
 log = logging.getLogger(__name__)
 
@@ -88,6 +87,7 @@ class _GaugeCollector(Collector):
 
     def __init__(self, app: App) -> None:
         self._app = app
+        self._features = feature_modules("metrics", app.settings.features_off)
         self._reads = _TimedReads(
             zones=app.zones.state,
             processes=app.replays.processes,
@@ -95,7 +95,7 @@ class _GaugeCollector(Collector):
             backlog=app.submissions.backlog,
             lag=app.store.progress.lag,
             expiries=app.expiries.dates,
-            webhooks=app.webhooks.all,
+            **{name: read for each in self._features for name, read in each.reads(app).items()},
         )
         self.close = self._reads.close
 
@@ -115,14 +115,13 @@ class _GaugeCollector(Collector):
             yield from _of_backlog(found["backlog"], found.get("lag"))
         if "expiries" in found:
             yield from _of_expiries(found["expiries"])
-        if "webhooks" in found:
-            yield from _of_webhooks(found["webhooks"])
         yield GaugeMetricFamily(
             "starid_projecting",
             "1 where this one of the services that share a database projects what all record.",
             value=float(self._app.single_projector.is_projecting),
         )
-        yield _of_attempts(self._app.webhooks.sender.log.counts)
+        for feature in self._features:
+            yield from feature.collect(self._app, found)
 
 
 def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
@@ -209,48 +208,6 @@ def _of_expiries(dates: Expiries) -> Iterator[Metric]:
 
 def _unix_s(moment: str) -> float:
     return float(unix_seconds(recorded_utc(moment).tai_ns))
-
-
-def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
-    """The number that waits for each webhook, and whether anything is sent to it."""
-    labels = ("webhook", "name")
-    active = GaugeMetricFamily(
-        "starid_webhook_active",
-        "1 where events are sent, 0 where not, though nobody paused it.",
-        labels=labels,
-    )
-    waiting = GaugeMetricFamily(
-        "starid_webhook_waiting", "Events that are queued for a webhook.", labels=labels
-    )
-    oldest = GaugeMetricFamily(
-        "starid_webhook_oldest_seconds", "The age of the oldest of them.", labels=labels
-    )
-    dead = GaugeMetricFamily(
-        "starid_webhook_dead_letters", "Events that were not delivered within a day.", labels=labels
-    )
-    now = utc_now()
-    for each in webhooks:
-        names = (each.id, each.name)
-        age_s = (
-            0.0 if each.oldest is None else (now.tai_ns - recorded_utc(each.oldest).tai_ns) / 1e9
-        )
-        if each.enabled:
-            active.add_metric(names, float(each.state == "active"))
-        waiting.add_metric(names, each.waiting)
-        oldest.add_metric(names, max(age_s, 0.0))
-        dead.add_metric(names, each.dead)
-    yield from (active, waiting, oldest, dead)
-
-
-def _of_attempts(counts: Mapping[tuple[str, str, Result], int]) -> Metric:
-    family = CounterMetricFamily(
-        "starid_webhook_attempts",
-        "Attempts to deliver an event to a webhook; of dead ones it was the last.",
-        labels=("webhook", "name", "result"),
-    )
-    for labels, count in sorted(counts.items()):
-        family.add_metric(labels, count)
-    return family
 
 
 class Metrics:

@@ -13,7 +13,14 @@ from service.errors import AcquisitionError
 from service.storage.progress import WAIT_S
 from service.times import recorded_utc, utc_now
 from service.web.console.formatting import age, count, plural, size
-from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
+from service.web.console.page import (
+    PAGES,
+    ContextDep,
+    FromQuery,
+    PageContext,
+    PageQuery,
+    console_page,
+)
 from service.web.requests.access import Policy
 
 LEAST_FREE = 0.1
@@ -40,9 +47,14 @@ def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
     about = context.app.service.about(context.caller.spacecraft)
     # Queues, machine and cache tell what others send: a token of some spacecraft sees none.
     sees_all = context.caller.spacecraft is None
-    checks = list(_checks(context)) if sees_all else []
-    cache = context.app.zones.state() if sees_all else None
-    return context.rendered("about.html.jinja", query.run, about=about, checks=checks, cache=cache)
+    return context.rendered(
+        "about.html.jinja",
+        query.run,
+        about=about,
+        checks=list(_checks(context)) if sees_all else [],
+        cache=context.app.zones.state() if sees_all else None,
+        operation=[each for each in PAGES.values() if each.section == "/about" != each.path],
+    )
 
 
 def _checks(context: PageContext) -> Iterator[Check]:
@@ -80,16 +92,7 @@ def _checks(context: PageContext) -> Iterator[Check]:
         lag.seconds <= WAIT_S,
         "They catch up by themselves; until then the newest batches are missing in them.",
     )
-    if context.may_operate:
-        webhooks = app.webhooks.all()
-        dead = sum(each.dead for each in webhooks)
-        yield Check(
-            "webhooks",
-            f"{len(webhooks)}; {plural(sum(each.waiting for each in webhooks), 'event')} waiting, "
-            f"{plural(dead, 'dead letter')}",
-            not dead and all(each.failing_since is None for each in webhooks),
-            "Open Webhooks: correct the address of the receiver, then send the dead letters again.",
-        )
+    yield from context.panels("about_page")
     yield from _machine(app)
     yield from _ends(app)
 

@@ -162,6 +162,15 @@ def _is_long(seconds: float | None) -> bool:
     return seconds is not None and seconds > STALE_AFTER_S
 
 
+@dataclass(frozen=True)
+class Notice:
+    """A problem that a feature reports, and the page that says more."""
+
+    text: str
+    path: str
+    title: str
+
+
 @page.console_page("/", "Overview", Policy("read", "nothing"), position=10)
 def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep) -> Response:
     """State, attitude, shares, alarms and age of every spacecraft in a run."""
@@ -195,7 +204,7 @@ def overview_page(query: page.FromQuery[OverviewQuery], context: page.ContextDep
         shown=SHOWN,
         heat=_heat(fleet, found, shares, query.period),
         alarms=page.alarm_counts([each for line in every for each in line.item.alarms]),
-        webhooks=_webhooks_in_trouble(context),
+        notices=context.panels("overview_page"),
     )
 
 
@@ -209,21 +218,6 @@ def _words_of(lines: list[OverviewLine]) -> str:
         (len(silent), "that never sent a batch"),
     )
     return ", ".join(f"{count} {words}" for count, words in parts if count)
-
-
-def _webhooks_in_trouble(context: page.PageContext) -> list[str]:
-    """The webhooks that do not deliver, in words, for who may see their page."""
-    if context.caller.spacecraft is not None or "operate" not in context.caller.scopes:
-        return []
-    found = []
-    for each in context.app.webhooks.all():
-        if each.state == "disabled" or (each.state == "paused" and each.waiting):
-            found.append(f"{each.name} is {each.state}, {each.waiting} events wait")
-        elif each.failing_since is not None:
-            found.append(f"{each.name} fails, {each.waiting} events wait")
-        if each.dead:
-            found.append(f"{each.name} has {each.dead} dead letters")
-    return found
 
 
 def _shares(cells: FleetCells) -> dict[str, Matrix]:

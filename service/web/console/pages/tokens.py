@@ -1,4 +1,4 @@
-"""The pages of operators: tokens, the audit list of changes, signing in, and webhooks."""
+"""The pages of operators: tokens, the audit list of changes, and signing in."""
 
 from typing import Annotated
 
@@ -6,7 +6,6 @@ from pydantic import Field
 from starlette.responses import Response
 
 from service.access import MAX_DAYS, SCOPES, list_entries
-from service.storage.recording.events import EVENT_KINDS
 from service.web.console.page import (
     EMPTY_LAYOUT,
     ContextDep,
@@ -74,30 +73,3 @@ class SignInQuery(Query):
 def sign_in_page(query: FromQuery[SignInQuery]) -> Response:
     """Ask for a token."""
     return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
-
-
-SHOWN_DELIVERIES = 20
-SEVERITIES = ("watch", "warning", "critical")
-
-
-@console_page("/webhooks", "Webhooks", OPERATE, section="/about")
-def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Every webhook with what waits for it."""
-    webhooks = context.app.webhooks.all()
-    waiting = {
-        each.id: context.app.webhooks.deliveries(
-            each.id, limit=SHOWN_DELIVERIES, oldest_first=True
-        ).items
-        for each in webhooks
-    }
-    return context.rendered(
-        "webhooks.html.jinja",
-        query.run,
-        webhooks=webhooks,
-        deliveries=waiting,
-        most=SHOWN_DELIVERIES,
-        kinds=EVENT_KINDS,
-        severities=SEVERITIES,
-        spacecraft=context.spacecraft,
-        may_add="read" in context.caller.scopes,
-    )

@@ -2,10 +2,10 @@
 
 import pytest
 
+from tests.features.webhooks.conftest import HERE
 from tests.waiting import wait_until
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults
-from tests.webhooks.conftest import HERE
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="there is no chromium on this machine")
 

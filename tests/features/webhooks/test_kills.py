@@ -9,10 +9,10 @@ from collections import defaultdict
 import pytest
 
 from service.app.factory import open_app
+from tests.features.webhooks.conftest import HERE, LOOPBACK, NOON, serving
 from tests.scale import size
 from tests.waiting import wait_until
 from tests.web.serving import in_process_settings
-from tests.webhooks.conftest import HERE, LOOPBACK, NOON, serving
 
 EVENTS, KILLS = 1_000, 20
 SPACECRAFT = ("XTE", "SWAS", "SOHO")
@@ -28,7 +28,7 @@ class Killable:
         self.port = self.secret = self._process = None
 
     def start(self):
-        command = [sys.executable, "-m", "tests.webhooks.receiver", str(self.port)]
+        command = [sys.executable, "-m", "tests.features.webhooks.receiver", str(self.port)]
         self._process = subprocess.Popen(
             [*command, self.file, self.secret], stdout=subprocess.PIPE, text=True
         )

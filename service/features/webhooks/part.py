@@ -6,31 +6,35 @@ from sqlalchemy import Connection
 
 from service.access import Access, Caller, Entry
 from service.app.context import Context, known_id
+from service.app.factory import App
 from service.errors import WrongState
-from service.ingest.solver_pool import mission_in_input
-from service.settings import networks
-from service.storage import webhooks
-from service.storage.models.base import Page
-from service.storage.recording.events import events_between, last_event
-from service.storage.recording.ids import Ulids
-from service.storage.sql.columns import Row
-from service.storage.webhooks import (
+from service.features.webhooks import records as webhooks
+from service.features.webhooks.addresses import require_http_allowed, require_url
+from service.features.webhooks.messages import delivery_row, new_webhook_secret, wants
+from service.features.webhooks.records import (
     Webhook,
     WebhookDelivery,
     WebhookQueued,
     WebhookTest,
     WebhookWithSecret,
 )
+from service.features.webhooks.sender import WebhookSender
+from service.ingest.solver_pool import mission_in_input
+from service.settings import networks
+from service.storage.models.base import Page
+from service.storage.recording.events import events_between, last_event
+from service.storage.recording.ids import Ulids
+from service.storage.sql.columns import Row
 from service.times import HOUR_S, Utc, shifted, utc_now
-from service.webhooks.addresses import require_http_allowed, require_url
-from service.webhooks.messages import delivery_row, new_webhook_secret, wants
-from service.webhooks.sender import WebhookSender
 
 MAX_WEBHOOKS = 50
 
 
 class Webhooks:
-    """Reads and changes webhooks.  `entry` goes to the audit list with a change."""
+    """Reads and changes webhooks, and delivers to them.
+
+    `entry` goes to the audit list with a change.
+    """
 
     def __init__(self, context: Context, access: Access) -> None:
         self._context = context
@@ -38,6 +42,10 @@ class Webhooks:
         self._ids = Ulids()
         self._allowed = networks(context.settings.webhook_networks)
         self.sender = WebhookSender(context.store, self._allowed, lambda: access.is_open)
+
+    def close(self) -> None:
+        """Stop delivering."""
+        self.sender.stop()
 
     def all(self) -> list[Webhook]:
         """Every webhook, the oldest first."""
@@ -223,3 +231,8 @@ def _of(caller: Caller) -> Row:
 def _with_secret(webhook: Webhook, secret: str) -> WebhookWithSecret:
     fields = {name: getattr(webhook, name) for name in Webhook.__struct_fields__}
     return WebhookWithSecret(**fields, secret=secret)
+
+
+def open_part(app: App) -> Webhooks:
+    """The webhooks of an open app."""
+    return Webhooks(app.context, app.access)

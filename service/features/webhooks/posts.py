@@ -8,9 +8,9 @@ from email.utils import parsedate_to_datetime
 import httpx
 
 from service import __version__
+from service.features.webhooks.addresses import Refused, reachable_addresses
+from service.features.webhooks.messages import TOTAL_S, Outcome
 from service.settings import Network
-from service.webhooks.addresses import Refused, reachable_addresses
-from service.webhooks.messages import TOTAL_S, Outcome
 
 MAX_ANSWER_BYTES = 64 << 10
 MAX_FAULT = 300

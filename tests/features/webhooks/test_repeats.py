@@ -9,11 +9,12 @@ from functools import partial
 import pytest
 
 from service.errors import Busy
-from service.storage import webhooks
+from service.features.webhooks import posts
+from service.features.webhooks import records as webhooks
+from service.features.webhooks.part import Webhooks
 from service.storage.recording import events
-from service.webhooks import posts
+from tests.features.webhooks.conftest import HERE, LOOPBACK, receiving, serving
 from tests.waiting import wait_until
-from tests.webhooks.conftest import HERE, LOOPBACK, receiving, serving
 
 
 def texts(receiver):
@@ -25,7 +26,7 @@ def test_events_that_are_recorded_while_others_are_queued_are_sent_once(
     service, receiver, monkeypatch
 ):
     """Between the look at the last number and the look at the events, another one is recorded."""
-    sender = service.app.webhooks.sender
+    sender = service.app.part(Webhooks).sender
     look, left = sender._last_and_waiting, list(range(12))
 
     def look_then_write():

@@ -1,6 +1,6 @@
 """A receiver of webhooks as a program: it checks each signature and writes down what came.
 
-    python -m tests.webhooks.receiver PORT FILE SECRET
+    python -m tests.features.webhooks.receiver PORT FILE SECRET
 
 A line of JSON for each request, written before the answer: killed at any moment, it has not
 said yes to what it did not write.  The signatures are checked by the standard's own library.

@@ -2,18 +2,20 @@
 
 from typing import Annotated, Any, Literal, Self
 
-from fastapi import Path
+from fastapi import Depends, Path
 from pydantic import Field, StringConstraints, model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access import Caller
+from service.features.webhooks import records
+from service.features.webhooks.part import Webhooks
 from service.observations.schema import VISIBLE_PATTERN, Key, RunName, Wire
-from service.storage import webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests.access import (
+    OPERATE,
     AppDep,
     ChangeDep,
     json_response,
@@ -24,9 +26,26 @@ from service.web.requests.query_parameters import Cursor, FromQuery, PageLimit, 
 from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_model
 
 router = ApiRouter("webhooks")
+ROUTERS = (router,)
+# What a webhook sends is about every spacecraft, and its URL may be a secret.
+POLICIES = dict.fromkeys(
+    (
+        *("list_webhooks", "get_webhook", "add_webhook", "change_webhook", "delete_webhook"),
+        *("rotate_webhook_secret", "test_webhook", "list_webhook_deliveries"),
+        *("retry_dead_letters", "replay_events"),
+    ),
+    OPERATE,
+)
 
 WebhookId = Annotated[str, Path(description="The `id` of a webhook.")]
 ALL = "*"
+
+
+async def _webhooks(app: AppDep) -> Webhooks:
+    return app.part(Webhooks)
+
+
+WebhooksDep = Annotated[Webhooks, Depends(_webhooks)]
 
 
 class WebhookIn(Wire):
@@ -115,90 +134,92 @@ class DeliveryQuery(Query):
     cursor: Cursor = None
 
 
-@router.serves("GET /webhooks", Returns("All webhooks.", webhooks.WebhookList))
-def list_webhooks(app: AppDep) -> Response:
+@router.serves("GET /webhooks", Returns("All webhooks.", records.WebhookList))
+def list_webhooks(webhooks: WebhooksDep) -> Response:
     """Every webhook, with its state and its last failure."""
-    return json_response({"items": app.webhooks.all()})
+    return json_response({"items": webhooks.all()})
 
 
-@router.serves("GET /webhooks/{id}", Returns("The webhook.", webhooks.Webhook))
-def get_webhook(id: WebhookId, app: AppDep) -> Response:
+@router.serves("GET /webhooks/{id}", Returns("The webhook.", records.Webhook))
+def get_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
     """One webhook."""
-    return json_response(app.webhooks.get(id))
+    return json_response(webhooks.get(id))
 
 
 @router.serves(
     "POST /webhooks",
     Returns(
-        "The webhook, and its secret this once.", webhooks.WebhookWithSecret, LOCATION, status=201
+        "The webhook, and its secret this once.", records.WebhookWithSecret, LOCATION, status=201
     ),
     body=WebhookIn,
     problems=(409,),
 )
-def add_webhook(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
+def add_webhook(body: JsonBody, webhooks: WebhooksDep, change: ChangeDep) -> Response:
     """Register a receiver, which is sent the events from now on, signed (Standard Webhooks)."""
     _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    added = app.webhooks.add(asked.settings(), change.caller, change.entry(201))
+    added = webhooks.add(asked.settings(), change.caller, change.entry(201))
     return json_response(added, 201, {"Location": f"/api/v1/webhooks/{added.id}"})
 
 
-@router.serves("PUT /webhooks/{id}", Returns("The webhook.", webhooks.Webhook), body=WebhookIn)
-def change_webhook(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
+@router.serves("PUT /webhooks/{id}", Returns("The webhook.", records.Webhook), body=WebhookIn)
+def change_webhook(
+    id: WebhookId, body: JsonBody, webhooks: WebhooksDep, change: ChangeDep
+) -> Response:
     """Replace all settings; a webhook that was paused or disabled goes on where it stopped."""
     _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
-    return json_response(app.webhooks.change(id, asked.settings(), change.caller, change.entry()))
+    return json_response(webhooks.change(id, asked.settings(), change.caller, change.entry()))
 
 
 @router.serves(
     "DELETE /webhooks/{id}",
-    Returns("The webhook that was deleted.", webhooks.Webhook),
+    Returns("The webhook that was deleted.", records.Webhook),
     problems=(503,),
 )
-def delete_webhook(id: WebhookId, app: AppDep, change: ChangeDep) -> Response:
+def delete_webhook(id: WebhookId, webhooks: WebhooksDep, change: ChangeDep) -> Response:
     """Delete a webhook with its queue and its dead letters."""
-    return json_response(app.webhooks.delete(id, change.entry()))
+    return json_response(webhooks.delete(id, change.entry()))
 
 
 @router.serves(
     "POST /webhooks/{id}/secret",
-    Returns("The webhook, and its new secret this once.", webhooks.WebhookWithSecret),
+    Returns("The webhook, and its new secret this once.", records.WebhookWithSecret),
     body=SecretIn,
     body_required=False,
     problems=(409,),
 )
 def rotate_webhook_secret(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
+    id: WebhookId, body: OptionalJsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
     """Make a new secret; deliveries are signed by the previous one too for some hours.
 
     A second time within these hours only with `previous_hours` 0, which ends both.
     """
     asked = read_model(SecretIn, body)
-    return json_response(app.webhooks.rotate(id, asked.previous_hours, change.entry()))
+    return json_response(webhooks.rotate(id, asked.previous_hours, change.entry()))
 
 
 @router.serves(
     "POST /webhooks/{id}/test",
-    Returns("What came of the attempt.", webhooks.WebhookTest),
+    Returns("What came of the attempt.", records.WebhookTest),
     problems=(409, 503),
 )
-def test_webhook(id: WebhookId, app: AppDep) -> Response:
+def test_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
     """Send an event of the type `test` at once, and wait for the receiver's answer."""
-    return json_response(app.webhooks.try_out(id))
+    return json_response(webhooks.try_out(id))
 
 
 @router.serves(
     "GET /webhooks/{id}/deliveries",
-    Returns("A page of deliveries.", webhooks.WebhookDeliveryPage, LINK),
+    Returns("A page of deliveries.", records.WebhookDeliveryPage, LINK),
 )
 def list_webhook_deliveries(
-    id: WebhookId, request: Request, query: FromQuery[DeliveryQuery], app: AppDep
+    id: WebhookId, request: Request, query: FromQuery[DeliveryQuery], webhooks: WebhooksDep
 ) -> Response:
     """Events that wait for a webhook, and its dead letters; by default the latest event first."""
     dead = None if query.state is None else query.state == "dead"
-    page = app.webhooks.deliveries(
+    page = webhooks.deliveries(
         id, dead, query.limit, query.cursor, oldest_first=query.order == "oldest"
     )
     return page_response(request, page)
@@ -206,27 +227,29 @@ def list_webhook_deliveries(
 
 @router.serves(
     "POST /webhooks/{id}/retry",
-    Returns("How many were queued.", webhooks.WebhookQueued),
+    Returns("How many were queued.", records.WebhookQueued),
     body=RetryIn,
     body_required=False,
 )
 def retry_dead_letters(
-    id: WebhookId, body: OptionalJsonBody, app: AppDep, change: ChangeDep
+    id: WebhookId, body: OptionalJsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
     """Send dead letters again; new events of the spacecraft do not wait for them."""
     asked = read_model(RetryIn, body)
-    return json_response(app.webhooks.retry(id, asked.events, change.entry()))
+    return json_response(webhooks.retry(id, asked.events, change.entry()))
 
 
 @router.serves(
     "POST /webhooks/{id}/replay",
-    Returns("How many were queued.", webhooks.WebhookQueued),
+    Returns("How many were queued.", records.WebhookQueued),
     body=ReplayEventsIn,
 )
-def replay_events(id: WebhookId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
+def replay_events(
+    id: WebhookId, body: JsonBody, webhooks: WebhooksDep, change: ChangeDep
+) -> Response:
     """Send the kept events of a period again, with the ids that they had."""
     asked = read_model(ReplayEventsIn, body)
-    return json_response(app.webhooks.replay(id, asked.since, asked.until, change.entry()))
+    return json_response(webhooks.replay(id, asked.since, asked.until, change.entry()))
 
 
 def _require_reader(caller: Caller) -> None:

@@ -8,13 +8,14 @@ import pytest
 from sqlalchemy import select
 
 from service import access as sessions
+from service.features.webhooks.records import read_sender
+from service.features.webhooks.tables import webhooks
 from service.storage.recording.ids import Ulids
-from service.storage.sql.tables import audit, webhooks
-from service.storage.webhooks import read_sender
+from service.storage.sql.tables import audit
+from tests.features.webhooks.conftest import HERE, serving
 from tests.waiting import wait_until
 from tests.web.conformance import check
 from tests.web.test_access import Guarded, shown
-from tests.webhooks.conftest import HERE, serving
 
 SETTINGS = {"name": "pager", "url": "https://receiver.example/"}
 

@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
-from service.storage.webhooks import Registered
-from service.webhooks.messages import DeliveryLog
+from service.features.webhooks.messages import DeliveryLog
+from service.features.webhooks.records import Registered
 
 HOOK = Registered(
     id="01JD0000000000000000000001",

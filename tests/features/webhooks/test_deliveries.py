@@ -9,12 +9,12 @@ import pytest
 from sqlalchemy import update
 from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
+from service.features.webhooks import sender
+from service.features.webhooks.sender import retry_delay_s
+from service.features.webhooks.tables import webhooks
 from service.storage.recording import events
-from service.storage.sql.tables import webhooks
-from service.webhooks import sender
-from service.webhooks.sender import retry_delay_s
+from tests.features.webhooks.conftest import HERE, receiving, serving
 from tests.waiting import wait_until
-from tests.webhooks.conftest import HERE, receiving, serving
 
 
 def texts(receiver):
@@ -210,7 +210,7 @@ def test_filters_choose_by_kind_spacecraft_run_and_severity(service, receiver):
 def test_a_receiver_that_hangs_or_drips_holds_up_no_other_and_no_request(
     service, receiver, monkeypatch
 ):
-    monkeypatch.setattr("service.webhooks.posts.TOTAL_S", 1.0)
+    monkeypatch.setattr("service.features.webhooks.posts.TOTAL_S", 1.0)
     release = threading.Event()
 
     def hang(handler, request):

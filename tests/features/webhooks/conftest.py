@@ -12,9 +12,9 @@ import httpx
 import pytest
 
 from service.app.factory import open_app
+from service.features.webhooks import sender
 from service.times import parse_utc
 from service.web.app import create_app
-from service.webhooks import sender
 from tests.web.serving import Server, in_process_settings
 
 HERE = "/api/v1/webhooks"

@@ -21,17 +21,17 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from sqlalchemy import Connection
 
 from service.errors import Busy, Stopping
+from service.features.webhooks import messages
+from service.features.webhooks import records as webhooks
+from service.features.webhooks.records import Attempt, Queue, Registered, Waiting
 from service.settings import Network
-from service.storage import webhooks
 from service.storage.recording.events import Event, events_after, first_event, last_event
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.store import Store
-from service.storage.webhooks import Attempt, Queue, Registered, Waiting
 from service.times import DAY_S, recorded_utc, shifted, utc_now
-from service.webhooks import messages
 
 if TYPE_CHECKING:
-    from service.webhooks.posts import Poster
+    from service.features.webhooks.posts import Poster
 
 log = logging.getLogger(__name__)
 
@@ -310,7 +310,7 @@ class WebhookSender:
         headers = messages.signed_headers(webhook.secrets(now), message_id, unix_s, body)
         if self._poster is None:
             # Not before: httpx, and the certificates of all authorities, take a while to read.
-            from service.webhooks.posts import Poster
+            from service.features.webhooks.posts import Poster
 
             self._poster = Poster(self._allowed)
         return await self._poster.post(webhook.url, headers, body)

@@ -13,9 +13,9 @@ from typing import Literal
 import msgspec
 
 from service.alarms.limits import Severity
+from service.features.webhooks.records import Registered
 from service.storage.recording.events import Event
 from service.storage.sql.columns import Row
-from service.storage.webhooks import Registered
 
 log = logging.getLogger(__name__)
 

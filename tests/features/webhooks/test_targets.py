@@ -9,16 +9,16 @@ from ipaddress import ip_address
 import pytest
 
 from service.errors import BadInput
-from service.settings import networks
-from service.webhooks.addresses import (
+from service.features.webhooks.addresses import (
     MAX_URL,
     NOT_PUBLIC,
     Refused,
     require_reachable,
     require_url,
 )
+from service.settings import networks
+from tests.features.webhooks.conftest import HERE, receiving, serving
 from tests.waiting import wait_until
-from tests.webhooks.conftest import HERE, receiving, serving
 
 LITERALS = [
     "https://127.0.0.1/",
