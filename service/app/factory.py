@@ -17,7 +17,6 @@ from service.app.runs import Runs
 from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Gyro, Spacecraft
-from service.app.tracks import Tracks
 from service.app.zones import Zones
 from service.feature import feature_modules
 from service.ingest.spool import Spool
@@ -87,7 +86,6 @@ class App:
         self.grades = Grades(context)
         self.definitive = DefinitiveAttitudes(context, self.grades, kernels)
         self.live_filter = LiveFilter(context, kernels)
-        self.tracks = Tracks(context)
         self.limits = Limits(context)
         self.alarms = Alarms(context)
         self.annotations = Annotations(context)

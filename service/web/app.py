@@ -58,7 +58,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     spacecraft.router,
     products.router,
     batches.gyro_router,
-    products.tracks_router,
     spacecraft.advice_router,
     batches.compare_router,
     calibrations.router,

@@ -51,7 +51,7 @@ from service.times import shifted, utc_now
 from service.web import event_stream as live
 from service.web.app import create_app
 from tests.client.cutting_proxy import CuttingProxy
-from tests.tracks.drawn import conjunctions, draw
+from tests.features.tracks.drawn import conjunctions, draw
 from tests.web.serving import Server, in_process_settings
 
 GYRO = {

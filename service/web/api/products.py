@@ -12,7 +12,6 @@ from starlette.responses import Response
 from service.observations.schema import RunName, Wire
 from service.products import formats
 from service.storage.models import products
-from service.storage.tracks import TrackList
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, author, json_response, page_response
@@ -173,27 +172,3 @@ def get_definitive_attitude(
 ) -> Response:
     """How far a job is."""
     return json_response(app.definitive.get(name, id))
-
-
-tracks_router = ApiRouter("products")
-
-
-@tracks_router.serves(
-    "GET /spacecraft/{name}/tracks",
-    Returns("The tracks.", TrackList, also=params.TDM_MEDIA_TYPE),
-    problems=(503,),
-)
-def list_tracks(
-    name: SpacecraftPath, query: FromQuery[params.TracksQuery], app: AppDep
-) -> Response:
-    """Tracks of a period: points that no catalog star explains and that move together.
-
-    They are computed from the record: unmatched stars of the batches with an attitude, of at most
-    2,000 batches. As `tdm` the moving ones are a CCSDS TDM of right ascensions and declinations;
-    404 if there are none.
-    """
-    found = app.tracks.of_period(name, **query.run_and_times)
-    if query.format == "json":
-        return json_response(found)
-    attached = {"Content-Disposition": f'attachment; filename="{name}-{query.run}-tracks.tdm"'}
-    return Response(b"".join(app.tracks.tdm(found)), 200, attached, params.TDM_MEDIA_TYPE)

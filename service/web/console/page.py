@@ -198,6 +198,14 @@ def open_layout(run: str, title: str, section: str) -> Layout:
 
 
 @dataclass(frozen=True)
+class Panel:
+    """A part of a page that a feature draws: its template, which sees `values`."""
+
+    template: str
+    values: Any
+
+
+@dataclass(frozen=True)
 class PageContext:
     """The context of the handler of a page.
 

@@ -91,7 +91,6 @@ POLICIES: dict[str, Policy] = {
     "get_attitude_at": Policy("read", "path"),
     "get_live_attitude": Policy("read", "path"),
     "get_table": Policy("read", "path"),
-    "list_tracks": Policy("read", "path"),
     "submit_gyro": Policy("submit", "path"),
     "list_gyro": Policy("read", "path"),
     "get_gyro": Policy("read", "path"),

@@ -322,7 +322,6 @@ NO_QUERY = Depends(require_no_query)
 SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
 
 
-TDM_MEDIA_TYPE = "text/plain"
 LargestGap = Annotated[
     float | None,
     Field(
@@ -384,15 +383,6 @@ class AttitudeQuery(PeriodQuery):
             description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
         ),
     ] = None
-
-
-class TracksQuery(PeriodQuery):
-    """Tracks of a period, in a format."""
-
-    format: Annotated[
-        Literal["json", "tdm"],
-        Field(description="`json`: every track; `tdm`: the moving ones as a file, a CCSDS TDM."),
-    ] = "json"
 
 
 class AttitudeAtQuery(RunQuery):

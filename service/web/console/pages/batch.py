@@ -22,7 +22,6 @@ from service.storage.queries.results import OutcomeName, StatusName, answer_from
 from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.tracks import TrackList
 from service.times import Utc, recorded_utc
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
@@ -148,7 +147,7 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
         adoption=adoption(answer, shown),
         pointing=_pointing(shown),
         timings_us=structs.asdict(shown.timings_us),
-        tracks=_tracks(context, id, answer),
+        panels=context.panels("batch_page", id, answer),
         around=context.app.results.neighbours(id),
         other_settings=mission.digest != answer.provenance.mission,
     )
@@ -227,13 +226,6 @@ def _trackers(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         row | {"ratio": ratio, "width": (ratio or 0.0) / scale, "mark": 1.0 / scale}
         for row, ratio in zip(rows, ratios, strict=True)
     ]
-
-
-def _tracks(context: ContextDep, id: str, answer: Answer) -> TrackList | None:
-    """The tracks of the result's unmatched stars, if it has any and their directions are known."""
-    if answer.attitude is None or not answer.counts.unmatched:
-        return None
-    return context.app.tracks.through_batch(id, answer.spacecraft, answer.run)
 
 
 def _pointing(shown: Answer) -> list[dict[str, Any]]:

@@ -22,9 +22,6 @@ from service.web.console.pages import files
 from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
 from service.web.requests.access import Policy
 
-MOST_LINKED = 600
-"""Batches whose tracks are looked for: reading and linking them takes about a second."""
-
 
 @dataclass(frozen=True)
 class TrackerCharts:
@@ -47,13 +44,9 @@ def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
     if query.tracker is not None and query.tracker not in retired:
         mission.tracker(query.tracker, "tracker")
     shown = shown_period(context, name, query)
-    found, tracks, trackers = None, None, list[TrackerStarsOfPeriod]()
+    found, trackers = None, list[TrackerStarsOfPeriod]()
     if shown is not None:
         found = context.app.results.period(name, run=query.run, start=shown.start, end=shown.end)
-        if found.total <= MOST_LINKED:
-            tracks = context.app.tracks.of_period(
-                name, run=query.run, start=shown.start, end=shown.end
-            )
         trackers = [each for each in found.trackers if query.tracker in (None, each.tracker)]
     is_any = found is not None and found.read > 0
     return context.rendered(
@@ -65,8 +58,9 @@ def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
         stretch=shown,
         ranges=list(RANGES_S),
         found=found,
-        tracks=tracks,
-        most_linked=MOST_LINKED,
+        panels=context.panels("period_page", name, query.run, shown, found)
+        if is_any and found and shown
+        else [],
         sky=all_sky_chart(found, trackers) if is_any and found else None,
         trackers=[_tracker_charts(each) for each in trackers],
         attitude=attitude_charts(found.attitudes, shown.start, shown.end)

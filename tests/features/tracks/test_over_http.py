@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from service.cli import main
+from service.features.tracks.part import Tracks
 from service.vectors import from_ra_dec, unit
-from tests.tracks.drawn import conjunctions, draw
+from tests.features.tracks.drawn import conjunctions, draw
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import assert_fits
 
@@ -105,7 +106,7 @@ def test_an_unknown_spacecraft_is_not_found(client):
 
 def test_a_period_of_too_many_batches_is_refused(app, posted):
     with pytest.raises(Exception, match="more than 20 batches; choose a shorter one"):
-        app.tracks.of_period("XTE", run=RUN, most_batches=20)
+        app.part(Tracks).of_period("XTE", run=RUN, most_batches=20)
 
 
 def test_the_period_s_page_lists_the_tracks(client, posted, drawn):

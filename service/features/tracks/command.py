@@ -34,15 +34,17 @@ def run(parsed: Namespace) -> int:
     acquire tracks XTE --run night-3 --format tdm --output night-3.tdm
     """
     from service.app.factory import open_app
-    from service.cli.texts import tracks_text
+    from service.features.tracks.part import Tracks
+    from service.features.tracks.text import tracks_text
 
     if parsed.output is not None and parsed.format != "tdm":
         raise BadInput(Fault("--output", "is for --format tdm alone"))
     start, end = arguments.period_of(parsed)
     with closing(open_app(arguments.settings_of_existing(parsed), reads_only=True)) as app:
-        found = app.tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
+        tracks = app.part(Tracks)
+        found = tracks.of_period(parsed.spacecraft, run=parsed.run, start=start, end=end)
         if parsed.format == "tdm":
-            arguments.written_to(parsed.output, app.tracks.tdm(found))
+            arguments.written_to(parsed.output, tracks.tdm(found))
         elif parsed.format == "json":
             arguments.print_json(found)
         else:

@@ -6,9 +6,10 @@ import numpy as np
 
 from service import __version__
 from service.app.context import Context, known_id
+from service.app.factory import App
 from service.errors import NotFound
+from service.features.tracks import records as tracks
 from service.products.ccsds import TrackedObject, write_tdm
-from service.storage import tracks
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now
@@ -28,6 +29,9 @@ class Tracks:
 
     def __init__(self, context: Context) -> None:
         self._context = context
+
+    def close(self) -> None:
+        """Nothing is open."""
 
     def of_period(
         self,
@@ -153,3 +157,8 @@ def _record(track: FoundTrack, points: Points, batches: Batches) -> tracks.Track
             for n, k in enumerate(own.tolist())
         ],
     )
+
+
+def open_part(app: App) -> Tracks:
+    """The tracks of an open app."""
+    return Tracks(app.context)

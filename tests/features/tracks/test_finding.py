@@ -10,8 +10,7 @@ from service.tracks.finding import figures, find_tracks
 from service.tracks.linking import Batches, Points
 from service.vectors import ARCSEC_PER_RADIAN, to_ra_dec, unit
 from tests.chance import at_least, at_most
-from tests.scale import size
-from tests.tracks.drawn import (
+from tests.features.tracks.drawn import (
     BATCHES,
     CADENCE_S,
     OBJECT_MAG,
@@ -20,6 +19,7 @@ from tests.tracks.drawn import (
     draw,
     gathered,
 )
+from tests.scale import size
 
 STRETCHES, FEW_STRETCHES = 300, 3
 EACH = {"object": 1, "planet": 2, "hot": 3}

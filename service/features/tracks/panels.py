@@ -1,0 +1,41 @@
+"""The tracks on the pages of a period and of a batch."""
+
+from collections.abc import Iterator
+
+from service.features.tracks.part import Tracks
+from service.storage.models.answers import Answer
+from service.storage.queries.period import PeriodStars
+from service.web.console.page import PageContext, Panel
+from service.web.console.pages.spacecraft import ShownPeriod
+
+MOST_LINKED = 600
+"""Batches whose tracks are looked for: reading and linking them takes about a second."""
+
+
+def tracks_of_period(
+    context: PageContext, name: str, run: str, shown: ShownPeriod, found: PeriodStars
+) -> Iterator[Panel]:
+    """The tracks of a period of a spacecraft, where it has few enough batches."""
+    tracks = None
+    if found.total <= MOST_LINKED:
+        tracks = context.app.part(Tracks).of_period(name, run=run, start=shown.start, end=shown.end)
+    values = {
+        "name": name,
+        "start": shown.start.text,
+        "end": shown.end.text,
+        "tracks": tracks,
+        "most_linked": MOST_LINKED,
+    }
+    yield Panel("_tracks_of_period.html.jinja", values)
+
+
+def tracks_of_batch(context: PageContext, id: str, answer: Answer) -> Iterator[Panel]:
+    """The tracks of a result's unmatched stars, if it has any and their directions are known."""
+    if answer.attitude is None or not answer.counts.unmatched:
+        return
+    tracks = context.app.part(Tracks).through_batch(id, answer.spacecraft, answer.run)
+    if tracks.items:
+        yield Panel("_tracks_of_batch.html.jinja", {"id": id, "tracks": tracks})
+
+
+PANELS = {"period_page": tracks_of_period, "batch_page": tracks_of_batch}

@@ -1,0 +1,5 @@
+"""Fixtures that the tests of several features use."""
+
+from tests.web.conftest import address, app, client
+
+__all__ = ["address", "app", "client"]
