@@ -31,7 +31,7 @@ from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("follow", "tracks", "webhooks")
+SHIPPED = ("advice", "follow", "tracks", "webhooks")
 """The features that come with the service, in the order of their routes and commands."""
 
 KINDS = (

@@ -11,8 +11,8 @@ from service.observations.schema import submission_from_json
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.vectors import rotate_about
-from tests.advice.passes import mission_like
 from tests.chance import at_least, at_most
+from tests.features.advice.passes import mission_like
 from tests.reference.two_group_views import GHOST_SHIFT_DEG, Views
 from tests.reference.two_groups import acquired, is_at, is_good, simple, two_groups
 from tests.scale import draws

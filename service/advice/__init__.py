@@ -1,1 +1,1 @@
-"""Advice on a mission's settings from recorded batches."""
+"""The size of zones, checks of mission files, and intervals of estimates."""

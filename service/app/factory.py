@@ -4,7 +4,6 @@ from typing import Protocol, TypeVar
 
 from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
-from service.app.advice import AdviceService
 from service.app.alarms import Alarms, Annotations, Limits
 from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
@@ -92,7 +91,6 @@ class App:
         self.runs = Runs(context)
         self.replays = Replays(context, self.submissions, self.gyro.record_many)
         self.zones = Zones(context)
-        self.advice = AdviceService(context, self.submissions, self.zones)
         self.comparisons = Comparisons(context, self.submissions)
         self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
         self.events = Events(context)

@@ -58,7 +58,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     spacecraft.router,
     products.router,
     batches.gyro_router,
-    spacecraft.advice_router,
     batches.compare_router,
     calibrations.router,
     zones.router,
@@ -70,12 +69,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     access.router,
     probes.router,
 )
-
-SUBJECTS = (
-    *("batches", "frames", "spacecraft", "products", "gyro", "calibrations", "zones"),
-    *("runs and replays", "alarms", "annotations", "events", "webhooks", "access", "probes"),
-)
-"""The order of the routes in `openapi.yaml`, by their tags; those with another tag come last."""
 
 COMPRESS_LEVEL = 4
 """The level of gzip: a third of the time of its default, for 7 % more bytes of a list."""
@@ -157,7 +150,7 @@ def bare_app(features_off: str = "") -> FastAPI:
     features = feature_modules("routes", features_off)
     for module in features:
         POLICIES.update(module.POLICIES)
-    api = sorted((*ROUTERS, *(router for each in features for router in each.ROUTERS)), key=_place)
+    of_features = [router for each in features for router in each.ROUTERS]
     web_app = FastAPI(
         title="Attitude acquisition",
         version=__version__,
@@ -168,7 +161,7 @@ def bare_app(features_off: str = "") -> FastAPI:
         redirect_slashes=False,
         generate_unique_id_function=_operation_id,
     )
-    routers = (*api, console_router())
+    routers = (*ROUTERS, *of_features, console_router())
     for router in routers:
         web_app.include_router(router, dependencies=[Depends(authorize)])
     web_app.state.routers = routers
@@ -179,11 +172,6 @@ def bare_app(features_off: str = "") -> FastAPI:
     web_app.add_exception_handler(HTTPException, page_or_problem)
     add_reference(web_app)
     return web_app
-
-
-def _place(router: APIRouter) -> int:
-    (subject,) = router.tags
-    return SUBJECTS.index(str(subject)) if subject in SUBJECTS else len(SUBJECTS)
 
 
 def _warm_up(web_app: FastAPI, app: App, loop: asyncio.AbstractEventLoop) -> None:

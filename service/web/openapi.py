@@ -324,12 +324,21 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
     )
     described["components"] = {"schemas": _schemas(), "securitySchemes": SECURITY}
     described["webhooks"] = {kind: _webhook(kind, data) for kind, data in EVENT_DATA.items()}
+    described["paths"] = dict(sorted(described["paths"].items(), key=_place))
     for address, methods in described["paths"].items():
         for method, operation in methods.items():
             if method == "get" and address.startswith(API):
                 _add_conditional(operation)
             _finish(operation)
     return described
+
+
+def _place(path: tuple[str, Mapping[str, Any]]) -> tuple[int, str]:
+    """The place of a path in the document: by the first tag of its operations, then by name."""
+    address, methods = path
+    (tag,) = next(iter(methods.values()))["tags"]
+    known = list(TAGS)
+    return known.index(tag) if tag in known else len(known), address
 
 
 def _webhook(kind: str, data: type[Record]) -> dict[str, Any]:

@@ -40,7 +40,7 @@ def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypa
     monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "follow, folow")
     code, _, complaint = acquire("version")
     assert code == 2
-    assert "ACQUIRE_FEATURES_OFF: must be features of follow" in complaint
+    assert "ACQUIRE_FEATURES_OFF: must be features of advice, follow" in complaint
     assert "(got 'folow')" in complaint
     with pytest.raises(BadConfiguration, match="ACQUIRE_FEATURES_OFF"):
         features_on("folow")
@@ -67,7 +67,7 @@ print("commands", *build_parser(off).commands.choices)
 settings = Settings(database="sqlite:///" + sys.argv[1], replay_processes=0, features_off=off)
 with Server(create_app(open_app(settings, serving=True))) as url:
     for address in addresses:
-        answer = httpx.get(url + address)
+        answer = httpx.get(url + address, timeout=120)
         print(answer.status_code, address, answer.text.replace(os.linesep, " "))
 print("modules", *sys.modules)
 """

@@ -1,17 +1,11 @@
-"""Spacecraft: settings, state, attitude history, star rates, advice, and all at a glance."""
+"""Spacecraft: settings, state, attitude history, star rates, and all at a glance."""
 
-from typing import Annotated, Any
-
-from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.app.advice import ADVICE_SAMPLE
 from service.app.spacecraft import batch_table, history_table
-from service.observations.schema import tolerances_from_text
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.storage.models import spacecraft as models
-from service.storage.models.advice import Advice
 from service.storage.models.answers import Result
 from service.storage.models.spacecraft import About, Overview
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
@@ -138,39 +132,3 @@ def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerD
 def get_about(app: AppDep, caller: CallerDep) -> Response:
     """Version, catalog, missions, database and credits."""
     return json_response(app.service.about(caller.spacecraft))
-
-
-advice_router = ApiRouter("spacecraft")
-
-MAX_SAMPLE = 2_000
-ADVICE_LIMIT_S = 20.0
-"""The longest wait for an answer; a sample that takes longer is cut short, and says so."""
-
-
-class AdviceQuery(params.PeriodQuery):
-    """Which batches to advise from, and how much work to spend on them."""
-
-    sample: Annotated[
-        int, Field(ge=1, le=MAX_SAMPLE, description="Maximum number of batches to process again.")
-    ] = ADVICE_SAMPLE
-    tolerance: Annotated[
-        list[Annotated[str, Field(max_length=80)]],
-        Field(
-            default_factory=list,
-            max_length=8,
-            description="Further tolerances to try, all together: `separation_deg=0.01`.",
-        ),
-    ]
-
-    def asked(self) -> dict[str, Any]:
-        """Every parameter as the app's functions take them."""
-        asked = super().asked()
-        return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
-
-
-@advice_router.serves(
-    "GET /spacecraft/{name}/advice", Returns("The advice.", Advice), problems=(503,)
-)
-def get_advice(name: SpacecraftPath, query: FromQuery[AdviceQuery], app: AppDep) -> Response:
-    """Recommended mission settings from recorded batches: tolerances, noise, alignment."""
-    return json_response(app.advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S))

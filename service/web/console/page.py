@@ -341,7 +341,7 @@ def _environment() -> Environment:
     )
     environment.filters.update(FILTERS)
     environment.filters["of_run"] = _of_run
-    environment.globals.update(to=_to, data=_data, version=__version__)
+    environment.globals.update(to=_to, data=_data, pages=PAGES, version=__version__)
     return environment
 
 

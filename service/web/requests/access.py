@@ -101,7 +101,6 @@ POLICIES: dict[str, Policy] = {
     "list_rates": Policy("read", "path"),
     "get_history": Policy("read", "path"),
     "list_worst": Policy("read", "path"),
-    "get_advice": Policy("read", "path"),
     "list_zones": READ,
     "warm_zones": Policy("operate", "body"),
     "drop_zones": Policy("operate", "query"),

@@ -45,7 +45,8 @@ def run(parsed: Namespace) -> int:
     import msgspec
 
     from service.app.factory import open_app
-    from service.cli.texts import advice_text
+    from service.features.advice.part import AdviceService
+    from service.features.advice.text import advice_text
     from service.observations.schema import tolerances_from_text
 
     start, end = period_of(parsed)
@@ -54,7 +55,7 @@ def run(parsed: Namespace) -> int:
         closing(open_app(settings_of_existing(parsed), reads_only=True)) as app,
         progress_bar("batches", "running again", parsed.quiet, leave=True) as bar,
     ):
-        advice = app.advice.of_spacecraft(
+        advice = app.part(AdviceService).of_spacecraft(
             parsed.spacecraft,
             run=parsed.run,
             start=start,

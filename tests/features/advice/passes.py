@@ -8,8 +8,8 @@ import numpy as np
 from msgspec import structs
 
 from service.acquire import acquire
-from service.advice.advice import advise
-from service.advice.evidence import evidence_of, merged
+from service.features.advice.advice import advise
+from service.features.advice.evidence import evidence_of, merged
 from service.missions.mission import SHIPPED_FOLDER, Mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass

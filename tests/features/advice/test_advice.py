@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 
 from service.acquire import acquire
-from service.advice.advice import WorkLimit
-from service.advice.statements import alignment_statement, noise_statement
-from service.advice.tolerances import rounded_up, tolerance_findings
-from service.advice.trackers import alignment_findings, magnitude_findings, noise_findings
-from service.app.advice import advice_record
-from service.cli.texts import advice_text
+from service.features.advice.advice import WorkLimit
+from service.features.advice.part import advice_record
+from service.features.advice.statements import alignment_statement, noise_statement
+from service.features.advice.text import advice_text
+from service.features.advice.tolerances import rounded_up, tolerance_findings
+from service.features.advice.trackers import alignment_findings, magnitude_findings, noise_findings
 from service.missions.mission import Mission
 from service.simulate.stretches import NO_TROUBLES, Trouble, Troubles
 from service.storage.queries.results import BatchSample
@@ -24,7 +24,7 @@ from service.vectors import (
     rotate_about,
     unit,
 )
-from tests.advice.passes import (
+from tests.features.advice.passes import (
     advice_from,
     evidence_from,
     flown,

@@ -28,8 +28,8 @@ import numpy as np
 import numpy.typing as npt
 
 from service.advice.intervals import Interval
-from service.advice.statements import FileChange, Statement
-from service.advice.trackers import NoiseFinding
+from service.features.advice.statements import FileChange, Statement
+from service.features.advice.trackers import NoiseFinding
 from service.filtering.result import Outcome
 from service.grades.day import MeasuredInnovations
 from service.missions.mission import Mission

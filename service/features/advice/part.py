@@ -7,10 +7,19 @@ from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 
 from service.acquire.choices import idle_reason
-from service.advice.advice import Findings, VariantOutcome, WorkLimit, advise
-from service.advice.innovations import InnovationFinding, innovation_findings, innovation_noise
 from service.advice.intervals import Interval
-from service.advice.statements import (
+from service.app.context import Context
+from service.app.factory import App
+from service.app.zones import Zones
+from service.errors import BadInput, Busy, Fault
+from service.features.advice import records
+from service.features.advice.advice import Findings, VariantOutcome, WorkLimit, advise
+from service.features.advice.innovations import (
+    InnovationFinding,
+    innovation_findings,
+    innovation_noise,
+)
+from service.features.advice.statements import (
     Statement,
     alignment_statement,
     group_statements,
@@ -19,15 +28,16 @@ from service.advice.statements import (
     tolerance_statement,
     zone_statements,
 )
-from service.advice.tolerances import ToleranceFinding
-from service.advice.trackers import AlignmentFinding, MagnitudeFinding, NoiseFinding, NoisePeriod
-from service.app.context import Context
-from service.app.zones import Zones
-from service.errors import BadInput, Busy, Fault
+from service.features.advice.tolerances import ToleranceFinding
+from service.features.advice.trackers import (
+    AlignmentFinding,
+    MagnitudeFinding,
+    NoiseFinding,
+    NoisePeriod,
+)
 from service.ingest.submit import SubmissionService
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
-from service.storage.models import advice as records
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.results import BatchSample, sample_batches
 from service.storage.recording.unsaved_result import LIVE
@@ -48,6 +58,9 @@ class AdviceService:
         self._submissions = submissions
         self._lock = threading.Lock()
 
+    def close(self) -> None:
+        """Nothing is open."""
+
     def of_spacecraft(
         self,
         name: str,
@@ -60,7 +73,7 @@ class AdviceService:
         limit_s: float = math.inf,
         step: Callable[[], object] = lambda: None,
     ) -> records.Advice:
-        """Advice on a mission's settings from the batches of a run; see `service.advice`.
+        """Advice on a mission's settings from the batches of a run; see `advise`.
 
         Of the batches at most `sample` are run again, fewer where `limit_s`
         seconds run out; `step` is called after each, twice a batch.  `tolerances`
@@ -275,3 +288,8 @@ def no_changes_text(advice: records.Advice) -> str:
     if "wait" in actions:
         return "The batches so far give no reason to change the mission file."
     return "The mission file needs no change."
+
+
+def open_part(app: App) -> AdviceService:
+    """The advice of an open app."""
+    return AdviceService(app.context, app.submissions, app.zones)

@@ -8,10 +8,10 @@ from msgspec import to_builtins
 from sqlalchemy import func, select
 
 from service.acquire import acquire
-from service.advice.advice import advise
-from service.advice.statements import zone_statements
-from service.app.advice import advice_record
 from service.errors import BadBatch, Busy, NotFound
+from service.features.advice.advice import advise
+from service.features.advice.part import AdviceService, advice_record
+from service.features.advice.statements import zone_statements
 from service.observations.schema import OptionsIn, submission_from_json, tolerances_from_text
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
@@ -108,7 +108,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     """As the core gives it of the same bodies, without any database."""
     before = rows(app)
     own = tolerances_from_text(["separation_deg=0.01"], "--try")
-    found = app.advice.of_spacecraft("XTE", run="night", sample=1000, tolerances=own)
+    found = app.part(AdviceService).of_spacecraft("XTE", run="night", sample=1000, tolerances=own)
     assert rows(app) == before
     batches = [submission_from_json(json.dumps(body)).batch for body in recorded]
     mission = missions["XTE"]
@@ -149,13 +149,13 @@ def _rounded(thing):
 
 
 def test_a_run_without_batches_gives_no_advice_and_no_error(app):
-    found = app.advice.of_spacecraft("SOHO")
+    found = app.part(AdviceService).of_spacecraft("SOHO")
     assert (found.first, found.batches_in_range, found.changes) == (None, 0, [])
 
 
 def test_an_unknown_spacecraft_is_named(app):
     with pytest.raises(NotFound, match="NOPE"):
-        app.advice.of_spacecraft("NOPE")
+        app.part(AdviceService).of_spacecraft("NOPE")
 
 
 def test_while_advice_is_worked_out_another_asks_again_later(app, recorded):
@@ -168,19 +168,19 @@ def test_while_advice_is_worked_out_another_asks_again_later(app, recorded):
     found = []
     thread = threading.Thread(
         target=lambda: found.append(
-            app.advice.of_spacecraft("XTE", run="night", sample=2, step=step)
+            app.part(AdviceService).of_spacecraft("XTE", run="night", sample=2, step=step)
         )
     )
     thread.start()
     try:
         assert begun.wait(30)
         with pytest.raises(Busy, match="advice"):
-            app.advice.of_spacecraft("XTE", run="night")
+            app.part(AdviceService).of_spacecraft("XTE", run="night")
     finally:
         go_on.set()
         thread.join()
     assert found[0].batches_sampled == 2
-    assert app.advice.of_spacecraft("XTE", run="night", sample=1).batches_sampled == 1
+    assert app.part(AdviceService).of_spacecraft("XTE", run="night", sample=1).batches_sampled == 1
 
 
 @pytest.mark.parametrize(

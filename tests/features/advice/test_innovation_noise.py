@@ -6,9 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from service.advice.innovations import LEAST, InnovationNoise, innovation_findings, innovation_noise
 from service.advice.intervals import Interval
-from service.advice.trackers import NoiseFinding
+from service.features.advice.innovations import (
+    LEAST,
+    InnovationNoise,
+    innovation_findings,
+    innovation_noise,
+)
+from service.features.advice.trackers import NoiseFinding
 from service.filtering.filter import filter_attitude
 from service.filtering.inputs import AttitudeMeasurements, GyroModel
 from service.filtering.smoother import smooth
