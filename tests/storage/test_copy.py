@@ -31,12 +31,13 @@ from service.app.factory import open_app
 from service.errors import BadConfiguration
 from service.observations.schema import OptionsIn
 from service.settings import Settings
+from service.storage.sql.columns import HAS_FIRST_ROW
 from service.storage.sql.engines import database_url
 from service.storage.sql.migrations import UNFINISHED, all_tables, check, revision_of, upgrade
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import batches, projector, results, runs
 from service.storage.upkeep import copy
-from service.storage.upkeep.copy import FIRST_ROWS, copy_record
+from service.storage.upkeep.copy import copy_record
 from service.storage.upkeep.verify import verify
 from tests.databases.make import restore_sqlite
 from tests.fresh_databases import sqlite_at
@@ -101,7 +102,7 @@ def fill_at_random(connection, rng, count):
     """Random rows of every table that keep all that the schema demands, and no more."""
     keys = {}
     for table in all_tables():
-        if table in FIRST_ROWS:
+        if HAS_FIRST_ROW in table.info:
             connection.execute(
                 update(table).values({list(table.c)[-1]: int(rng.integers(1 << 40))})
             )
