@@ -14,7 +14,6 @@ from sqlalchemy import Connection, case, delete, func, insert, select, tuple_, u
 
 from service import errors
 from service.errors import BadBatch, BadInput, NotFound, shown_value
-from service.features.webhooks.tables import webhook_deliveries, webhook_sender, webhooks
 from service.storage.models.alarms import SeverityName
 from service.storage.models.base import (
     Count,
@@ -31,6 +30,7 @@ from service.storage.recording.events import EventKind
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
 from service.storage.sql.tables import access_tokens
+from service.storage.sql.webhook_tables import webhook_deliveries, webhook_sender, webhooks
 
 _row = webhook_deliveries.c
 _SHOWN = (

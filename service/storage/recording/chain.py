@@ -12,7 +12,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Connection, Double, LargeBinary, Table, insert, select
 
-from service.storage.sql import alarm_tables, grade_tables, tables
+from service.storage.sql import alarm_tables, grade_tables, tables, webhook_tables
 from service.storage.sql.chain_tables import record_facts
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import rows_of
@@ -177,7 +177,7 @@ BOUND: Mapping[Table, Bound] = {
     tables.mission_uses: Bound(frozenset({"row_digest"})),
     tables.audit: Bound(),
     tables.access_tokens: Bound(closed_by="revoked"),
-    tables.webhooks: Bound(_OF_DELIVERIES | {"last_fault"}),
+    webhook_tables.webhooks: Bound(_OF_DELIVERIES | {"last_fault"}),
     tables.calibrations: Bound(closed_by="ended", open_free=_OF_PROGRESS),
     tables.calibration_adoptions: Bound(),
     alarm_tables.limits: Bound(closed_by="until"),

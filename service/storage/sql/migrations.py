@@ -106,7 +106,13 @@ def check(database: str) -> list[str]:
 def all_tables() -> list[Table]:
     """All tables of the code, each after those that it refers to."""
     # A table is known to the metadata when its module is loaded.
-    from service.storage.sql import alarm_tables, grade_tables, tables  # noqa: F401
+    from service.storage.sql import (  # noqa: F401
+        alarm_tables,
+        chain_tables,
+        grade_tables,
+        tables,
+        webhook_tables,
+    )
 
     # A feature that is off keeps its tables.
     feature_modules("tables", off="")
