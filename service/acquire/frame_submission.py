@@ -18,7 +18,6 @@ from service.acquire.picture import (
 )
 from service.identify.blind.lens import Lens
 from service.imaging import submit
-from service.imaging.detection.levels import rounded_counts
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera
@@ -195,8 +194,8 @@ def _record(
         height_px=points.height_px,
         exposure_s=result.frame.exposure_s or camera.exposure_s,
         centroid=camera.centroid,
-        background_counts=rounded_counts(points.background_counts, 3),
-        noise_counts=rounded_counts(points.noise_counts, 3),
+        background_counts=submit.rounded_counts(points.background_counts, 3),
+        noise_counts=submit.rounded_counts(points.noise_counts, 3),
         candidates=points.count,
         sharp=[],
         stars=[
@@ -205,7 +204,7 @@ def _record(
                 "v_px": round(float(points.v_px[k]), 4),
                 "sigma_u_px": round(float(points.sigma_px[k]), 5),
                 "sigma_v_px": round(float(points.sigma_px[k]), 5),
-                "flux_counts": rounded_counts(float(points.flux_counts[k]), 1),
+                "flux_counts": submit.rounded_counts(float(points.flux_counts[k]), 1),
                 "magnitude": star["magnitude"],
                 "signal_ratio": round(float(points.signal_ratio[k]), 1),
                 "flags": [],

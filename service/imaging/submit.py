@@ -18,7 +18,6 @@ from pydantic import AfterValidator, Field
 
 from service.errors import BadBatch, Fault
 from service.imaging.centroids.window import Flag
-from service.imaging.detection.levels import rounded_counts
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import CountArray, Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import STARS_TO_MAG, Camera, CentroidMethod
@@ -312,6 +311,13 @@ def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
 
 def _rounded(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
+
+
+def rounded_counts(value: float, digits: int) -> float:
+    """A number of counts rounded to digits behind the point, or to four of its own if small."""
+    if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
+        return round(value, digits)
+    return round(value, 3 - math.floor(math.log10(abs(value))))
 
 
 def _rounded_counts(value: float, digits: int) -> float | None:

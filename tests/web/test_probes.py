@@ -22,6 +22,7 @@ from service.web.app import create_app
 from service.web.middleware import warm_request
 from tests.fresh_databases import sqlite_at
 from tests.scale import draws
+from tests.storage.samples import submission
 from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
 
@@ -136,12 +137,16 @@ def test_the_warm_up_request_reaches_the_queue_and_is_not_counted(
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")
-def test_a_writer_that_has_ended_is_told_by_the_probe_of_life(tmp_path):
+def test_a_queue_whose_thread_has_ended_is_told_by_the_probe_of_life(
+    tmp_path, sky, missions, monkeypatch
+):
     app = open_app(in_process_settings(sqlite_at(tmp_path / "ended.db")))
     with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
         assert client.get("/livez").status_code == 200
-        app.store.writer.change(lambda connection: sys.exit())
-        app.store.writer._thread.join(10)
+        monkeypatch.setattr("service.ingest.queue.look_up", lambda *asked: sys.exit())
+        body, headers = submission(sky, missions).text, {"Content-Type": "application/json"}
+        refused = client.post("/api/v1/batches", content=body, headers=headers)
+        assert refused.status_code == 503
         assert client.get("/livez").status_code == 503
 
 

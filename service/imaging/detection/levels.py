@@ -86,10 +86,3 @@ def _step(levels: CountArray, least: float, most: float) -> float:
     if len(levels) < _FEW_LEVELS:
         return span / _LEVELS_OF_8_BITS
     return max(float(np.diff(levels).min()), span * 2.0**-_ROUNDING_BITS)
-
-
-def rounded_counts(value: float, digits: int) -> float:
-    """A number of counts rounded to digits behind the point, or to four of its own if small."""
-    if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
-        return round(value, digits)
-    return round(value, 3 - math.floor(math.log10(abs(value))))
