@@ -22,7 +22,7 @@ from service.imaging.frames.files import read_frame
 from service.imaging.frames.frame import Frame, FrameLimits, bad_frame, require_light
 from service.missions.camera import Camera
 from service.missions.mission import Mission
-from service.observations.frame_record import FrameRecord
+from service.observations.frame_record import FrameRecord, rounded_counts
 from service.observations.schema import Submission, submission_from_model
 from service.sky.catalog.star_catalog import Catalog
 from service.times import parse_utc
@@ -194,8 +194,8 @@ def _record(
         height_px=points.height_px,
         exposure_s=result.frame.exposure_s or camera.exposure_s,
         centroid=camera.centroid,
-        background_counts=submit.rounded_counts(points.background_counts, 3),
-        noise_counts=submit.rounded_counts(points.noise_counts, 3),
+        background_counts=rounded_counts(points.background_counts, 3),
+        noise_counts=rounded_counts(points.noise_counts, 3),
         candidates=points.count,
         sharp=[],
         stars=[
@@ -204,7 +204,7 @@ def _record(
                 "v_px": round(float(points.v_px[k]), 4),
                 "sigma_u_px": round(float(points.sigma_px[k]), 5),
                 "sigma_v_px": round(float(points.sigma_px[k]), 5),
-                "flux_counts": submit.rounded_counts(float(points.flux_counts[k]), 1),
+                "flux_counts": rounded_counts(float(points.flux_counts[k]), 1),
                 "magnitude": star["magnitude"],
                 "signal_ratio": round(float(points.signal_ratio[k]), 1),
                 "flags": [],

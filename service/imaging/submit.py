@@ -24,7 +24,7 @@ from service.missions.camera import STARS_TO_MAG, Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
-from service.observations.frame_record import FrameRecord
+from service.observations.frame_record import FrameRecord, rounded_counts
 from service.observations.schema import checked_by
 from service.times import utc_now
 from service.vectors import Vector
@@ -311,13 +311,6 @@ def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
 
 def _rounded(value: float, digits: int) -> float | None:
     return round(value, digits) if math.isfinite(value) else None
-
-
-def rounded_counts(value: float, digits: int) -> float:
-    """A number of counts rounded to digits behind the point, or to four of its own if small."""
-    if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
-        return round(value, digits)
-    return round(value, 3 - math.floor(math.log10(abs(value))))
 
 
 def _rounded_counts(value: float, digits: int) -> float | None:

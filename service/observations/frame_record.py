@@ -1,5 +1,6 @@
 """The record of a frame beside the batch that was made of it."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -51,3 +52,10 @@ class FrameRecord:
             "timings_us": dict(self.timings_us),
             **({"remarks": list(self.remarks)} if self.remarks else {}),
         }
+
+
+def rounded_counts(value: float, digits: int) -> float:
+    """A number of counts rounded to digits behind the point, or to four of its own if small."""
+    if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
+        return round(value, digits)
+    return round(value, 3 - math.floor(math.log10(abs(value))))

@@ -3,7 +3,7 @@
 import math
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
-from service.imaging.detection.levels import rounded_counts
+from service.observations.frame_record import rounded_counts
 from service.storage.models.base import Components, Count, Quaternion, Record, doc
 
 if TYPE_CHECKING:
