@@ -110,24 +110,27 @@ def submission_of_frame(
     from service.imaging.detection.detect import detect
     from service.imaging.detection.measure import measure
     from service.imaging.detection.star_images import psf_of
+    from service.imaging.detection.trailed_frames import (
+        measure_trails,
+        remarks_on_trails,
+        trails_of_frame,
+    )
 
     rates_deg_per_s = np.array(known.body_rates_deg_per_s)
     exposure_s = frame.exposure_s or camera.exposure_s
     found = detect(frame, camera, psf_of(camera, tracker, rates_deg_per_s, exposure_s))
     clock.append(clock_ns())
-    faintest_mag = camera.faintest_mag
-    stars = measure(
-        frame,
-        found,
-        tracker,
-        camera,
-        rates_deg_per_s,
-        known.centroid or camera.centroid,
-        mission.catalog.magnitude_limit_mag if faintest_mag is None else faintest_mag,
-    )
+    method, faintest_mag = known.centroid or camera.centroid, camera.faintest_mag
+    faintest_mag = mission.catalog.magnitude_limit_mag if faintest_mag is None else faintest_mag
+    trails = trails_of_frame(frame, found, tracker, camera, rates_deg_per_s, exposure_s)
+    if trails is None:
+        stars = measure(frame, found, tracker, camera, rates_deg_per_s, method, faintest_mag)
+    else:
+        stars = measure_trails(frame, found, trails, camera, method, faintest_mag, exposure_s)
+        remarks += remarks_on_trails(trails, tracker, camera, rates_deg_per_s, exposure_s)
     clock.append(clock_ns())
     used = [star for star in stars if star.left_out is None]
-    doubt = doubt_of_exposure(found, camera, frame.exposure_s, stated)
+    doubt = [] if trails else doubt_of_exposure(found, camera, frame.exposure_s, stated)
     if not used:
         message = "; ".join(["shows no star that could be used", *doubt])
         raise bad_frame(message, f"{found.count} candidates")

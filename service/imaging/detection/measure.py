@@ -97,7 +97,7 @@ def measure(
             records[k] = placed(clean, k)
     flux = np.array([record.flux_counts for record in records], dtype=np.float64)
     magnitudes = camera.magnitude(flux, exposure_s)
-    return _chosen(records, magnitudes.tolist(), faintest_mag, camera.most_stars)
+    return chosen_stars(records, magnitudes.tolist(), faintest_mag, camera.most_stars)
 
 
 def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
@@ -141,7 +141,7 @@ def _without(
     return dataclasses.replace(window, counts=counts)
 
 
-def _chosen(
+def chosen_stars(
     records: Sequence[CentroidRecord],
     magnitudes: Sequence[float],
     faintest_mag: float,

@@ -195,7 +195,7 @@ def _still_places(
     order = np.argsort(-ratio, kind="stable")[:MAX_POINTS]
     u, v, ratio = u[order], v[order], ratio[order]
     weight = max(psf, 1.0)
-    shapes = _moments(light, u, v, weight)
+    shapes = image_moments(light, u, v, weight)
     # A place between two dark pixels may stand out behind the filter without any light of its own.
     lit = shapes.weighted > 0.0
     ratio = ratio[lit]
@@ -235,7 +235,7 @@ def _trails(
     clear = np.argsort(-ratio, kind="stable")[:TRAIL_PEAKS]
     clear = clear[ratio[clear] > 2.0 * FIRST_THRESHOLD]
     u, v = u[clear], v[clear]
-    shapes = _moments(light, u, v, TRAIL_WEIGHT_PX, TRAIL_ROUNDS)
+    shapes = image_moments(light, u, v, TRAIL_WEIGHT_PX, TRAIL_ROUNDS)
     if not may_trail(shapes.u_px, shapes.v_px, shapes.drawn_out, max(light.shape)):
         return None
     return measured_trails(light, noise_counts, _below_full(light))
@@ -263,7 +263,7 @@ def _middles_of_trails(
 
 
 @dataclass(frozen=True)
-class _Shapes:
+class ImageShapes:
     """Every image's place, width, lack of roundness (0 to 1), and light under the weight.
 
     `drawn_out` has the ellipticity as its size, and twice the direction of the longer axis from
@@ -323,7 +323,7 @@ def _measured_psf(
     """One standard deviation of a star's image: the median of clear, round, whole ones."""
     order = np.argsort(-ratio)[:60]
     u, v, ratio = u[order], v[order], ratio[order]
-    shapes = _moments(light, u, v, GUESSED_PSF_PX)
+    shapes = image_moments(light, u, v, GUESSED_PSF_PX)
     round_ = (shapes.ellipticity < 0.3) & (shapes.sigma_px < MOST_PSF_PX)
     whole = light[v, u] < FULL_SHARE * light.max(initial=0.0)
     clear = ratio > FIRST_THRESHOLD + 1.0
@@ -399,13 +399,13 @@ def _peaks(
     return u, v, np.asarray(filtered[v, u] / noise[v // 2, u // 2], dtype=np.float64)
 
 
-def _moments(
+def image_moments(
     light: CountArray,
     u: npt.NDArray[np.int64],
     v: npt.NDArray[np.int64],
     weight_px: float,
     rounds: int = _CENTROID_ROUNDS,
-) -> _Shapes:
+) -> ImageShapes:
     """Centroids and second moments under a Gaussian weight that follows each image."""
     half = max(3, math.ceil(3.0 * weight_px))
     steps = np.arange(-half, half + 1)
@@ -436,7 +436,7 @@ def _moments(
     sigma = np.sqrt(1.0 / np.clip(1.0 / size - 1.0 / weight_px**2, 0.01, 25.0))
     stretch = np.hypot(uu - vv, 2.0 * uv) / (2.0 * size)
     drawn_out = (uu - vv + 2j * uv) / (2.0 * size)
-    return _Shapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0), drawn_out)
+    return ImageShapes(u + x, v + y, sigma, stretch, np.maximum(total, 0.0), drawn_out)
 
 
 HOT_SIGMAS = 8.0

@@ -101,7 +101,10 @@ class Trails:
 
 
 def measured_trails(
-    light: CountArray, noise_counts: float, usable: npt.NDArray[np.bool_] | None = None
+    light: CountArray,
+    noise_counts: float,
+    usable: npt.NDArray[np.bool_] | None = None,
+    least_widths: float = LEAST_WIDTHS,
 ) -> Trails | None:
     """The trails of the stars on light (rows, columns) above its background.
 
@@ -119,7 +122,7 @@ def measured_trails(
         return None
     along_u, along_v, _ = motion.trails(found["x"], found["y"])
     length = float(np.median(np.hypot(along_u, along_v)))
-    if length < LEAST_WIDTHS * width:
+    if length < least_widths * width:
         return None
     trails = Trails(motion, width, length)
     corner_u, corner_v = np.array([0.0, columns, 0.0, columns]), np.array([0.0, 0.0, rows, rows])
