@@ -70,7 +70,9 @@ def _of_unknown_lens(
     frame = replace(frame, exposure_s=exposure_s)
     read = perf_counter_ns()
     sky, solver = blind_sky(catalog, round(parse_utc(time).julian_year))
-    result = solve_picture(_without_time(frame), sky, solver, camera.focal_length_px)
+    result = solve_picture(
+        _without_time(frame), sky, solver, camera.focal_length_px, whole_only=True
+    )
     if result.points.trailed is not None:
         raise bad_frame(f"cannot be measured: {trail_refusal(result.points)}")
     if result.points.count == 0:

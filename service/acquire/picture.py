@@ -47,6 +47,12 @@ from service.vectors import (
 GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
+CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
+"""Signal to noise of clear points, and how many of them without an attitude speak for a lens or
+pixels of another kind."""
+LEAST_SIDE_PX = 100
+MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
+"""Parts of the sides of a wide picture that are solved alone."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
 """The share of the longer side above which an attitude's sigma is too large for an answer.
 
@@ -169,14 +175,19 @@ class PictureResult:
 
 
 def solve_picture(
-    frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None = None
+    frame: Frame,
+    sky: BrightStars,
+    solver: BlindSolver,
+    guess_px: float | None = None,
+    whole_only: bool = False,
 ) -> PictureResult:
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
 
     Where what is told leads to nothing all other focal lengths are tried, and where the
     clear candidates do, so are fainter ones.  Where all of that leads to nothing, the mirror
-    image is tried: a result then is of the mirrored frame, which it holds.  Raises `BadFile`
-    for a picture without light.
+    image is tried: a result then is of the mirrored frame, which it holds.  Last, unless
+    `whole_only`, its middle alone and pixels averaged in pairs are tried, and a result is of
+    such a frame.  Raises `BadFile` for a picture without light.
     """
     require_light(frame, math.inf)
     side = max(frame.width_px, frame.height_px)
@@ -206,7 +217,46 @@ def solve_picture(
             found = _solved(turned, flipped, sky, solver, focal, guess_px)
             if found.attitude is not None:
                 return found
+    clear = np.count_nonzero(tried[0].signal_ratio > CLEAR_RATIO)
+    if clear >= LEAST_CLEAR and not whole_only:
+        for changed, remark in other_shapes(frame):
+            if min(changed.counts.shape) < LEAST_SIDE_PX:
+                continue
+            points = find_points(changed.counts)
+            focal = FocalRange.of_fields(max(changed.counts.shape), WIDEST_FIELD_DEG)
+            found = _solved(changed, points, sky, solver, focal, None)
+            if found.attitude is not None:
+                return replace(found, remarks=(remark, *found.remarks))
+    points = tried[min(1, len(tried) - 1)]
     return replace(result, points=points, remarks=tuple(_advice(points, frame, guess_px)))
+
+
+def other_shapes(frame: Frame) -> Iterator[tuple[Frame, str]]:
+    """Changed pictures that a simple lens may fit, each with a remark that says what was changed.
+
+    The middle of a picture has the same direction and roll as the whole.  Behind a fisheye, or
+    where a plane spans more than the solver looks for, the middle is like any other lens's.
+    """
+    height, width = frame.counts.shape
+    for share in MIDDLE_SHARES:
+        down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
+        counts = frame.counts[down : height - down, across : width - across]
+        size = f"{counts.shape[1]} x {counts.shape[0]} px"
+        remark = (
+            f"wide_lens: the whole picture fits no lens of {WIDEST_FIELD_DEG[1]:g} degrees or less "
+            f"without strong distortion; only its middle, {size}, was solved, and field and lens "
+            "are those of the middle"
+        )
+        yield replace(frame, counts=counts), remark
+    for name, counts in (
+        ("columns", frame.counts[:, : width // 2 * 2].reshape(height, -1, 2).mean(axis=2)),
+        ("rows", frame.counts[: height // 2 * 2].reshape(-1, 2, width).mean(axis=1)),
+    ):
+        remark = (
+            f"unequal_pixels: the pixels fit the sky once pairs of {name} are averaged, as after "
+            "binning 1 x 2; places and focal length are in pixels of the averaged picture"
+        )
+        yield replace(frame, counts=counts), remark
 
 
 def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:
@@ -467,6 +517,14 @@ def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Itera
             steps += [] if dark else ["take off hot pixels with a dark frame (--dark FILE)"]
             steps.append("use a shorter exposure with less noise")
         yield f"clutter: {MAX_POINTS} candidates and more: {', or '.join(steps)}"
+    clear = np.count_nonzero(points.signal_ratio > CLEAR_RATIO)
+    if clear >= LEAST_CLEAR:
+        least_deg, most_deg = WIDEST_FIELD_DEG
+        yield (
+            f"no_match: {clear} clear points fit no sky behind a lens of {least_deg:g} to "
+            f"{most_deg:g} degrees: they may be no stars, or the lens may be too wide, or the "
+            "pixels of unequal sides"
+        )
     yield from _light(points, dark)
     if guess_px is None:
         yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"

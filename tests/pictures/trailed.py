@@ -67,11 +67,11 @@ def draw_trailed(
     path_u = np.array([each[0] for each in moved]) + offsets[:, :1]
     path_v = np.array([each[1] for each in moved]) + offsets[:, 1:]
     for k in np.flatnonzero(np.isfinite(path_u + path_v).all(axis=0)):
-        _add(counts, path_u[:, k], path_v[:, k], psf_px, light * flux[k])
+        add_path(counts, path_u[:, k], path_v[:, k], psf_px, light * flux[k])
     return TrailedPicture(counts, lens, attitude, u, v, flux)
 
 
-def _add(counts: Any, u: Any, v: Any, psf: float, light: Any) -> None:
+def add_path(counts: Any, u: Any, v: Any, psf: float, light: Any) -> None:
     """Add the images (k) of a star along its path, each with its light."""
     half = int(np.ceil(4.0 * psf + 1.0))
     columns = np.arange(max(0, round(u.min()) - half), min(counts.shape[1], round(u.max()) + half))

@@ -86,7 +86,7 @@ def _solved(
             guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
             if used and used[0].attitude is not None:
                 guess_px = used[0].attitude.lens.focal_px
-            result = solve_picture(frame, sky, solver, guess_px)
+            result = solve_picture(frame, sky, solver, guess_px, whole_only=True)
         except BadInput as error:
             print(f"acquire: {file}: {error}", file=sys.stderr)
             continue

@@ -141,7 +141,8 @@ def measure_trails(
 def _record(placed: TrailPlaces, number: int, method: str) -> CentroidRecord:
     """The record of one star; what its image leaves unexplained widens its sigmas."""
     covariance = placed.covariance[number] * max(float(placed.chi_square[number]), 1.0)
-    flux, sigma = float(placed.flux_counts[number]), math.sqrt(float(placed.covariance[number][2, 2]))
+    flux = float(placed.flux_counts[number])
+    sigma = math.sqrt(float(placed.covariance[number][2, 2]))
     if not flux > BREAKDOWN_RATIO * sigma:
         return too_faint(method, flux, sigma, ())
     sigma_u, sigma_v = math.sqrt(covariance[0, 0]), math.sqrt(covariance[1, 1])
