@@ -15,7 +15,7 @@ from service.imaging.centroids.window import Array, Mask
 
 ROUNDS = 7
 MARGIN_PX = 2.0
-"""Of the pixels that are kept about a path, so that it may move to the star."""
+"""Further pixels kept about a path, so that it may move to the star."""
 REACH_SIGMAS = 3.5
 """Pixels farther from a path, in widths of a still star's image, are left out of its fit."""
 LONGEST_STEP = 0.6

@@ -52,7 +52,7 @@ def trails_of_frame(
     rates_deg_per_s: Vector,
     exposure_s: float,
 ) -> Trails | None:
-    """The trails of the stars on a frame; None where they are short, or the camera's images reach far.
+    """The trails of the stars on a frame; None where they are short, or images reach far.
 
     Raises `BadFile` where stars moved in a way that tells no place at mid exposure.
     """
@@ -163,10 +163,11 @@ def remarks_on_trails(
     trails: Trails, tracker: Tracker, camera: Camera, rates_deg_per_s: Vector, exposure_s: float
 ) -> list[str]:
     """What is to be said of a frame whose stars trail, also where the rates contradict it."""
-    remarks = [
+    middles = (
         f"trailed: stars moved by about {trails.length_px:.0f} px during the exposure; the middles "
         "of their trails were taken, where they were at mid exposure"
-    ]
+    )
+    remarks = [middles]
     expected = _by_rates(tracker, camera, rates_deg_per_s, exposure_s)
     u, v = np.array([camera.center_u_px]), np.array([camera.center_v_px])
     seen_px = float(np.hypot(*trails.motion.trails(u, v)[:2])[0])

@@ -30,7 +30,7 @@ LEAST_WIDTHS = 2.5
 LONGEST_SHARE = 0.25
 """The longest trail that is measured, as a share of the shorter side."""
 BRIGHT_SIGMAS, CLEAR_SIGMAS = 4.0, 8.0
-"""Of noise behind a filter of a star's size, at the edge of a patch of light and at its peak."""
+"""Least light at the edge and at the peak of a patch, in sigmas behind a filter of star size."""
 FILTER_PX = 1.2
 LEAST_PIXELS = 12
 COMPONENTS, LEAST_COMPONENTS, JUDGED = 80, 6, 30
@@ -42,11 +42,11 @@ FOCAL_SIDES = (math.inf, 3.0, 1.5, 1.0, 0.7, 0.5)
 LONGEST_FOCAL_PX = 1e6
 FITTED_STARS = 24
 UNEVEN_SHARE = 0.06
-"""Of the squares of a bright trail's light, the share beyond noise that its path may leave."""
+"""Largest share of a bright trail's squared light that its fitted path may leave beyond noise."""
 LARGEST_BOW = 0.2
-"""Of a trail's chord, how far the middle of its path may lie from that of its chord."""
+"""Largest distance of a path's middle from its chord's middle, as a share of the chord."""
 UNEVEN_LIGHT = 0.03
-"""Of a trail's length, how far half of its light may lie from its middle."""
+"""Largest distance of a trail's mean light from its middle, as a share of its length."""
 
 
 @dataclass(frozen=True)
@@ -326,14 +326,14 @@ def _refusal(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> str | 
         return "too strongly bent"
     if float(np.median(placed.unexplained)) > UNEVEN_SHARE:
         return "not evenly along one line"
-    off = float(np.median(_half_light(trails, pixels, placed)))
+    off = float(np.median(_mean_light_px(trails, pixels, placed)))
     if abs(off) > UNEVEN_LIGHT * trails.length_px:
         return "more at one end than at the other"
     return None
 
 
-def _half_light(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Vector:
-    """How far along each trail (n,) the point lies before which half of its light falls, px."""
+def _mean_light_px(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Vector:
+    """The distance (n,) along each trail from its middle to the mean of its light, in pixels."""
     u, v = placed.u_px, placed.v_px
     image = trails.image_at(u, v)
     along, across, *_ = image.along_and_across(pixels.u_px - u[:, None], pixels.v_px - v[:, None])
@@ -347,7 +347,7 @@ def _half_light(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Vec
 
 
 LEAST_CLEAR, LEAST_DRAWN_OUT, LEAST_COHERENCE = 8, 0.15, 0.6
-"""Images alike: at least so many, so little round, and so much of it smooth over the picture."""
+"""Images that trail: their least number, ellipticity, and share of it smooth over the picture."""
 
 
 def may_trail(
@@ -404,7 +404,7 @@ def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> 
 PEAK_WIDTHS = 1.5
 TILE_PX, LEAST_TILE_PX = 256, 48
 TILE_WIDTHS = 3.0
-"""How much trails may differ within a tile, in widths of a star's image."""
+"""Largest difference of trails within a tile, in widths of a star's image."""
 SURROUND = 3.0
 FILTER_REACH = 4.0
 MOST_UNEXPLAINED = 0.5
