@@ -9,6 +9,7 @@
     ├── KeyReused             the Idempotency-Key was used with another body
     ├── WrongState            the state does not allow this, as of a cleared alarm
     ├── NotFound              no such spacecraft, batch, zone, run or replay
+    │   └── UnknownSpacecraft no mission of that name
     ├── Unauthenticated       the token is absent, unknown, expired or revoked
     ├── Forbidden             the token lacks the scope or the spacecraft
     ├── RateLimited           more requests than the token's rate allows
@@ -94,6 +95,10 @@ class WrongState(AcquisitionError):
 
 class NotFound(AcquisitionError):
     """There is no such object; names it, and where the list is short those that exist."""
+
+
+class UnknownSpacecraft(NotFound):
+    """There is no mission of that name."""
 
 
 class NotAvailable(BadInput):

@@ -6,7 +6,7 @@ import os
 import re
 import socket
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from service.errors import BadConfiguration, shown_value
 from service.logs import FORMATS, LEVELS, LogSettings
 
 PREFIX = "ACQUIRE_"
+LOCAL_MISSIONS = Path("missions")
 MOST_USEFUL_PROCESSES = 4
 """One process writes: it takes no more than so many can compute."""
 _TOKEN = re.compile(r"[!-~]+")
@@ -27,8 +28,9 @@ class Settings:
     """What an operator may set; each field is the variable ACQUIRE_<FIELD>.
 
     `database` is a SQLAlchemy URL.  `missions` is a folder with a site's own
-    mission files, `catalog` a site's own star catalog; None takes the shipped
-    ones alone.  `shelf_mb` bounds the cache of zones and run catalogs.  `host`
+    mission files, beside `./missions`; `shipped_missions` off hides XTE, SWAS, SOHO and IMAGER.
+    `catalog` is a site's own star catalog; None takes the shipped one.  `shelf_mb` bounds
+    the cache of zones and run catalogs.  `host`
     other than loopback is served once there are tokens.  `token` is what
     commands show that talk to a running service.  `frame_mb` and `frame_megapixels`
     bound a frame's file and what it unfolds into.  `replay_processes` is how
@@ -53,6 +55,7 @@ class Settings:
 
     database: str = "sqlite:///acquire.db"
     missions: Path | None = None
+    shipped_missions: str = "on"
     catalog: Path | None = None
     shelf_mb: int = 256
     host: str = "127.0.0.1"
@@ -79,6 +82,8 @@ class Settings:
     follow_authority: Path | None = None
     features_off: str = ""
     record_key: str | None = None
+    mission_file: Path | None = field(default=None, metadata={"is_option": True})
+    """The mission file that a command was given in place of a spacecraft's name; no variable."""
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -95,6 +100,8 @@ class Settings:
         for name, known in (("log_format", FORMATS), ("log_level", LEVELS)):
             if getattr(self, name) not in known:
                 raise _refusal(name, f"must be {' or '.join(known)}", getattr(self, name))
+        if self.shipped_missions not in ("on", "off"):
+            raise _refusal("shipped_missions", "must be on or off", self.shipped_missions)
         if not 0 <= self.port <= 65535:
             raise _refusal("port", "must be from 0 to 65535", self.port)
         if self.probe_port is not None and not 1 <= self.probe_port <= 65535:
@@ -125,6 +132,28 @@ class Settings:
             raise _refusal("host", "must be an address or a name, such as 127.0.0.1", self.host)
 
     @property
+    def mission_places(self) -> tuple[Path, ...]:
+        """The folders and files with a site's own missions, in the order of their search.
+
+        They are `./missions`, if there is such a folder, then ACQUIRE_MISSIONS; a file that a
+        command was given comes last, and replaces a mission of its name.
+        """
+        here = (LOCAL_MISSIONS,) if LOCAL_MISSIONS.is_dir() else ()
+        return (*here, *filter(None, (self.missions, self.mission_file)))
+
+    @property
+    def ships_missions(self) -> bool:
+        """True if the missions of the package are offered."""
+        return self.shipped_missions == "on"
+
+    @property
+    def mission_places_text(self) -> str:
+        """Where missions are looked for, in words."""
+        own = "not set" if self.missions is None else str(self.missions)
+        shipped = "the shipped missions" if self.ships_missions else "no shipped missions"
+        return f"./{LOCAL_MISSIONS}/*.toml, ACQUIRE_MISSIONS ({own}), {shipped}"
+
+    @property
     def spool_folder(self) -> Path:
         """Where uploads are stored: `spool`, by default beside SQLite's file, or here."""
         if self.spool is not None:
@@ -145,7 +174,7 @@ class Settings:
         that is no setting: a misspelt ACQUIRE_DATABASE must not quietly record
         somewhere else.
         """
-        known = {PREFIX + field.name.upper(): field.name for field in fields(cls)}
+        known = {PREFIX + each.name.upper(): each.name for each in fields(cls) if not each.metadata}
         values = {
             name: text for name, text in environment.items() if name.startswith(PREFIX) and text
         }

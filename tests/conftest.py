@@ -26,13 +26,14 @@ import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
 
 from service.cli import main
-from service.missions.mission import SHIPPED_FOLDER, load_missions
+from service.missions.mission import load_missions
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.storage import progress
 from tests import fresh_databases, scale
 from tests.fresh_databases import sqlite_at
+from tests.missions.stated_files import STATED_FOLDER
 from tests.torture import FIGURES
 
 DEFAULT_SEED = 19941026
@@ -252,10 +253,10 @@ def missions():
 
 @pytest.fixture(scope="session")
 def mission_files():
-    """The shipped mission files as plain dictionaries."""
+    """The shipped missions as plain dictionaries that state every value."""
     return {
         path.stem.upper(): tomllib.loads(path.read_text(encoding="utf-8"))
-        for path in sorted(SHIPPED_FOLDER.glob("*.toml"))
+        for path in sorted(STATED_FOLDER.glob("*.toml"))
     }
 
 

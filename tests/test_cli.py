@@ -19,11 +19,11 @@ import pytest
 from service import __version__
 from service.acquire import kernel_build
 from service.cli import build_parser
-from service.missions.mission import SHIPPED_FOLDER
 from service.observations.csv_rows import COLUMNS
 from service.simulate.telemetry import read_objects
 from service.times import parse_utc
 from tests.fresh_databases import sqlite_at
+from tests.missions.stated_files import STATED_FOLDER
 from tests.sky.test_sky2000 import SIRIUS, written
 from tests.waiting import wait_until
 from tests.web.serving import free_port, served
@@ -398,7 +398,7 @@ def test_advice_is_printed_in_sentences_or_as_the_api_answers_it(acquire, tmp_pa
 def test_batches_are_run_again_with_another_mission_file_and_compared(acquire, tmp_path):
     telemetry(acquire, tmp_path / "pass.ndjson", "XTE", 8, "--nominal")
     assert acquire("replay", tmp_path / "pass.ndjson", "--in-process", "--run", "r")[0] == 0
-    shipped = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+    shipped = (STATED_FOLDER / "xte.toml").read_text(encoding="utf-8")
     narrow = tmp_path / "narrow.toml"
     votes = re.sub(r'identifier = "\w+"', 'identifier = "starid"', shipped)
     narrow.write_text(votes.replace("separation_deg = 0.0066", "separation_deg = 1e-7"))

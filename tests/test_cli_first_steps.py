@@ -13,6 +13,7 @@ from service.missions.mission import SHIPPED_FOLDER
 from service.sky.zones import SearchRegion, build_zone
 from service.times import parse_utc
 from service.vectors import from_ra_dec
+from tests.missions.stated_files import STATED_FOLDER
 from tests.test_cli import COMMANDS, telemetry
 
 SHIPPED = sorted(each.stem for each in SHIPPED_FOLDER.glob("*.toml"))
@@ -122,7 +123,7 @@ def checked(acquire, tmp_path, text):
 
 
 def shipped(name, *changes):
-    text = (SHIPPED_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
+    text = (STATED_FOLDER / f"{name}.toml").read_text(encoding="utf-8")
     for before, after in changes:
         assert before in text
         text = text.replace(before, after)

@@ -420,7 +420,8 @@ class CalibrationAdoptions:
 
     def changed_files(self) -> dict[str, str]:
         """By spacecraft, what the next start would change; raises `BadConfiguration`."""
-        now = load_missions(self._context.settings.missions)
+        settings = self._context.settings
+        now = load_missions(*settings.mission_places, shipped=settings.ships_missions)
         found = {}
         for name, mission in self._files.items():
             if name not in now:

@@ -13,6 +13,7 @@ from sqlalchemy import Connection
 from service.access import Entry
 from service.alarms.quantities import limited_trackers
 from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
 from service.settings import Settings
@@ -133,5 +134,5 @@ def checked_run_name(text: str) -> str:
     try:
         return _RUN_NAME.validate_python(text)
     except ValidationError as error:
-        message = str(error.errors()[0]["msg"])
+        message = plain_message(error.errors()[0])
         raise BadBatch(Fault("run", message, shown_value(text))) from None

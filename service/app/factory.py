@@ -159,7 +159,7 @@ def open_app(
     and `serving` are about the database; see `Store`.
     Raises `BadConfiguration` for whatever of these cannot be used.
     """
-    missions = load_missions(settings.missions)
+    missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
     if mission is not None:
         missions[mission.name] = mission
     # A key that cannot be used is named before the database is opened.

@@ -212,7 +212,7 @@ def open_products(settings: Settings) -> Iterator[Products]:
     Without a sky and what computes it takes 80 MB less memory than the whole app.
     Raises `BadConfiguration` for missions or a database that cannot be used.
     """
-    missions = load_missions(settings.missions)
+    missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
     store = Store(settings.database, archive_folder=settings.archive_folder)
     try:
         with store.reading() as connection:

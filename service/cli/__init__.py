@@ -15,9 +15,10 @@ from io import TextIOWrapper
 
 from service import __version__
 from service.cli import commands
-from service.cli.arguments import add_command, add_subcommands
-from service.errors import AcquisitionError, BadInput
+from service.cli.arguments import add_command, add_subcommands, name_spacecraft
+from service.errors import AcquisitionError, BadInput, UnknownSpacecraft
 from service.feature import SETTING, feature_modules
+from service.settings import Settings
 
 USAGE_ERROR = 2
 INTERRUPTED = 130
@@ -36,12 +37,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parsed = None
     try:
         parsed = build_parser(os.environ.get(SETTING, "")).parse_args(arguments)
+        name_spacecraft(parsed)
         code: int = parsed.function(parsed)
         sys.stdout.flush()
         return code
     except BadInput as error:
         for fault in error.faults:
             _complain(str(fault))
+    except UnknownSpacecraft as error:
+        _complain(f"{error}; looked for in {Settings.from_environment().mission_places_text}")
     except AcquisitionError as error:
         text = str(error)
         if getattr(parsed, "database", None) is not None:

@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 
 SERVICE = "the service; default: ACQUIRE_HOST and ACQUIRE_PORT, else http://127.0.0.1:8000"
-MISSION = "XTE, SWAS, SOHO, or one of your own"
-CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera"
+MISSION = "XTE, SWAS, SOHO, the name of one of your own, or its file (.toml)"
+CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera, or its file (.toml)"
+FILE_OR_NAME = "a mission file (.toml), or the name of a spacecraft"
 
 Function = Callable[[argparse.Namespace], int]
 
@@ -288,6 +289,8 @@ def settings_of(parsed: Namespace) -> Settings:
         for name in ("database", "host", "port")
         if (value := getattr(parsed, name, None)) is not None
     }
+    if isinstance(spacecraft := getattr(parsed, "spacecraft", None), SpacecraftName):
+        overrides["mission_file"] = spacecraft.file
     return dataclasses.replace(Settings.from_environment(), **overrides)
 
 
@@ -337,23 +340,55 @@ def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
     return start, end
 
 
+class SpacecraftName(str):
+    """The name of a spacecraft whose mission file was given in its place."""
+
+    file: Path
+
+
+def name_spacecraft(parsed: Namespace) -> None:
+    """Replace the mission file of an option that takes a spacecraft by the spacecraft's name.
+
+    `settings_of` then offers the mission of that file beside the others.  Raises
+    `BadConfiguration` for a file with an error.
+    """
+    from service.missions.mission import read_mission
+
+    for option, value in vars(parsed).items():
+        if option != "spacecraft" or value is None:
+            continue
+        names: list[str] = [value] if isinstance(value, str) else value
+        for place, each in enumerate(names):
+            if each.endswith(".toml"):
+                name = SpacecraftName(read_mission(Path(each)).name)
+                name.file = Path(each)
+                names[place] = name
+        parsed.spacecraft = names[0] if isinstance(value, str) else names
+
+
 def mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":
     """The mission of that name and the star catalog that the environment chooses."""
-    from service.missions.mission import load_missions, mission_named
     from service.sky.catalog.star_catalog import open_catalog
 
+    return mission_and_file(name)[0], open_catalog(Settings.from_environment().catalog)
+
+
+def mission_and_file(text: str) -> "tuple[Mission, Path]":
+    """The mission of a file whose name ends in `.toml`, else of a spacecraft's name; its file."""
+    from service.missions.mission import mission_files, mission_named, read_mission
+
+    if isinstance(text, SpacecraftName) or text.endswith(".toml"):
+        file = text.file if isinstance(text, SpacecraftName) else Path(text)
+        return read_mission(file), file
     settings = Settings.from_environment()
-    mission = mission_named(load_missions(settings.missions), name)
-    return mission, open_catalog(settings.catalog)
+    found = mission_files(*settings.mission_places, shipped=settings.ships_missions)
+    mission = mission_named({name: each for name, (each, _) in found.items()}, text)
+    return mission, found[mission.name][1]
 
 
 def mission_of_file_or_name(text: str) -> "Mission":
     """The mission of a file whose name ends in `.toml`, else that of a spacecraft's name."""
-    from service.missions.mission import load_missions, mission_named, read_mission
-
-    if text.endswith(".toml"):
-        return read_mission(Path(text))
-    return mission_named(load_missions(Settings.from_environment().missions), text)
+    return mission_and_file(text)[0]
 
 
 class Progress:

@@ -115,7 +115,8 @@ class _Direct:
 
 class _InDatabase:
     def __init__(self, store: Store, settings: Settings) -> None:
-        self._tokens = Tokens(_Direct(store, store), load_missions(settings.missions))
+        missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
+        self._tokens = Tokens(_Direct(store, store), missions)
 
     def add(self, name: str, scopes: Collection[str], **more: Any) -> NewToken:
         return self._tokens.add(name, scopes, **more, entry=_entry("token_create", name))

@@ -4,6 +4,7 @@ From its size and field of view follows the rest of a mission: a file of a few l
 """
 
 import math
+from collections.abc import Mapping, Sequence
 from functools import cached_property
 from typing import Annotated, Any, Literal, Self
 
@@ -51,6 +52,19 @@ STARS_TO_MAG = ((4.0, 516), (5.0, 1610), (6.0, 4999), (7.0, 15495), (8.0, 45598)
 """How many stars of the sky are brighter than a magnitude."""
 SIGMA_PX, ROUGH_SIGMA_PX = 0.3, 1.0
 LARGEST_PAIR_DEG = 8.0
+REQUIRED_OF_CAMERAS = frozenset(
+    (
+        "center_u_px",
+        "center_v_px",
+        "exposure_s",
+        "focal_length_px",
+        "gain_e_per_count",
+        "psf_sigma_px",
+        "read_noise_e",
+        "saturation_counts",
+    )
+)
+"""The keys without which a table `[trackers.camera]` gets the defaults of `camera_defaults`."""
 _SCALES = ("focal_length_px", "field_of_view_deg", "focal_length_mm", "pixel_um")
 
 
@@ -290,22 +304,51 @@ def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
                     (SIGMA_PX if exact else ROUGH_SIGMA_PX) * 3600.0 * pixel_deg, 2
                 ),
                 "magnitude_sigma_mag": 0.3,
-                "camera": {
-                    "center_u_px": 0.5 * (width - 1.0),
-                    "center_v_px": 0.5 * (height - 1.0),
-                    "gain_e_per_count": 1.0,
-                    "read_noise_e": 0.0,
-                    "saturation_counts": 1e9,
-                    "exposure_s": 1.0,
-                    "psf_sigma_px": 1.2,
-                    "sigma_floor_px": 0.1,
-                    "calibrated": exact,
-                    **{key: value for key, value in camera.items() if key not in _SCALES},
-                    "focal_length_px": focal_px,
-                },
+                "camera": camera_defaults(camera),
             }
         ],
     }
+
+
+def camera_defaults(
+    camera: dict[str, Any], field_of_view_deg: Sequence[float] | None = None
+) -> dict[str, Any]:
+    """The table of a camera with its defaults.
+
+    Without a focal length it follows from the tracker's `field_of_view_deg`, width and height.
+    Raises `KeyError`, `TypeError` or `ValueError` for a size or scale that is missing or wrong.
+    """
+    if field_of_view_deg is not None and not any(each in camera for each in _SCALES):
+        tangent = math.tan(math.radians(0.5 * field_of_view_deg[0]))
+        camera = {**camera, "focal_length_px": round(0.5 * camera["width_px"] / tangent, 3)}
+    focal_px, scale_key = _focal_px(camera)
+    return {
+        "center_u_px": 0.5 * (float(camera["width_px"]) - 1.0),
+        "center_v_px": 0.5 * (float(camera["height_px"]) - 1.0),
+        "gain_e_per_count": 1.0,
+        "read_noise_e": 0.0,
+        "saturation_counts": 1e9,
+        "exposure_s": 1.0,
+        "psf_sigma_px": 1.2,
+        "sigma_floor_px": 0.1,
+        "calibrated": scale_key == "focal_length_px",
+        **{key: value for key, value in camera.items() if key not in _SCALES},
+        "focal_length_px": focal_px,
+    }
+
+
+def field_of_camera_deg(camera: Mapping[str, Any]) -> tuple[float, float]:
+    """The width and height of a camera's field of view, about its boresight."""
+    return tuple(  # type: ignore[return-value]
+        round(2.0 * math.degrees(math.atan(_half_px(camera, axis) / camera["focal_length_px"])), 3)
+        for axis in (("width_px", "center_u_px"), ("height_px", "center_v_px"))
+    )
+
+
+def _half_px(camera: Mapping[str, Any], axis: tuple[str, str]) -> float:
+    """The distance from the boresight to the farther edge of the sensor."""
+    size_px, center_px = (float(camera[key]) for key in axis)
+    return max(center_px + 0.5, size_px - 0.5 - center_px)
 
 
 def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:

@@ -4,20 +4,20 @@ Our word names a setting; the paper's symbol stands in the comment, here and in
 the files (Fink & Shoup 1994, Table 1).
 """
 
+import difflib
 import hashlib
 import json
 import math
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import (
     AfterValidator,
-    BaseModel,
     Field,
     ValidationError,
     ValidationInfo,
@@ -25,8 +25,16 @@ from pydantic import (
     model_validator,
 )
 
-from service.errors import BadConfiguration, BadInput, Fault, NotFound, shown_value
-from service.missions.camera import Camera, with_camera_defaults
+from service.errors import (
+    BadConfiguration,
+    BadInput,
+    Fault,
+    UnknownSpacecraft,
+    shown_value,
+)
+from service.missions.camera import Camera
+from service.missions.defaults import Completed, completed, needs
+from service.missions.faults import PydanticFault, causes, dotted_key, explained, of_the_form_given
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.motion import (
     GyroSettings,
@@ -213,6 +221,9 @@ class Magnitudes(Strict):
 AS_MEASURED = Magnitudes()
 
 
+FieldSide = Annotated[float, Field(gt=0, lt=120)]
+
+
 class Tracker(Strict):
     """One star tracker: where it looks in the body, how far it sees, how well it measures."""
 
@@ -222,6 +233,12 @@ class Tracker(Strict):
     z_axis_body: Components
     """The tracker's axes in body components; +Z is the boresight."""
     field_of_view_radius_deg: float = Field(gt=0, le=60)  # FOVMAX
+    field_of_view_deg: tuple[FieldSide, FieldSide] | None = Field(default=None, exclude=True)
+    """Width along X and height along Y of a field that is no circle; its corners lie within
+    `field_of_view_radius_deg`.  It changes no answer: the check and the simulator use it."""
+    limit_mag: float | None = Field(default=None, ge=-2, le=15, exclude=True)
+    """The faintest star that this tracker sees; the simulator draws none beyond it.  It changes no
+    answer itself."""
     sigma_arcsec: float = Field(gt=0, le=3600)
     """One standard deviation per tangent axis: the paper's radial SIGOBS over the root of two."""
     magnitude_sigma_mag: float = Field(gt=0, le=10)  # SIGMAG
@@ -264,6 +281,13 @@ class Mission(Strict):
     retired: ClassVar[bool] = False
     name: Name
     description: str = ""
+    a_priori_error_deg: float | None = Field(default=None, gt=0, le=180, exclude=True)
+    """Largest error of the a priori attitude about each axis, in bands of the pole.
+
+    The zone's size follows from it where the file leaves that out.  It changes no answer, so it is
+    no part of the digest."""
+    sun_pointed_axis_body: Direction | None = Field(default=None, exclude=True)
+    """The body axis that is kept on the Sun: the pole of the band that follows from it."""
     identifier: Identifier = "verified"
     solver: SolverName = "quest"
     lost_in_space_fallback: bool = True
@@ -350,6 +374,26 @@ class Mission(Strict):
         tests = self.tests.model_copy(update=dict.fromkeys(TESTS_OF_ROLL, False))
         return rules_of(self.tolerances, tests)
 
+    @property
+    def knows_attitude(self) -> bool:
+        """False for a mission whose file states no a priori knowledge of the attitude."""
+        is_lost = self.identifier == "lost_in_space" and self.sun_pointed_axis_body is None
+        return not is_lost or self.a_priori_error_deg is not None
+
+    @cached_property
+    def presumed_error_deg(self) -> float:
+        """Largest error of the a priori attitude about each axis, in bands of the pole.
+
+        Without `a_priori_error_deg` it is what the zone leaves beside the field of view.
+        """
+        if self.a_priori_error_deg is not None:
+            return self.a_priori_error_deg
+        field_deg = max(each.field_of_view_radius_deg for each in self.trackers)
+        if isinstance(self.zone, Band):
+            return max(self.zone.half_width_deg - field_deg, 0.0)
+        # Errors about both axes across the boresight add.
+        return max(self.zone.radius_deg - field_deg, 0.0) / math.sqrt(2.0)
+
     @cached_property
     def axis_body(self) -> Vector:
         """The zone's body axis as a unit vector."""
@@ -379,17 +423,37 @@ class Mission(Strict):
 def parse_mission(text: str, file: str) -> Mission:
     """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
     try:
-        table = with_camera_defaults(tomllib.loads(text))
-        return Mission.model_validate(table, context=beside(file))
+        table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise BadConfiguration(f"{file}: not TOML: {error}") from None
+    whole = completed(table)
+    try:
+        return Mission.model_validate(whole.table, context=beside(file))
     except ValidationError as error:
-        lines = [
-            f"{file}: {dotted_key(Mission, e['loc'])}: {explained(Mission, e)} "
-            f"(got {shown_value(e['input'])})"
-            for e in error.errors()
-        ]
-        raise BadConfiguration("\n".join(lines)) from None
+        faults = of_the_form_given(
+            causes(error.errors()), lambda fault: dotted_key(Mission, fault["loc"])
+        )
+    waiting = [fault for fault in faults if _is_waiting(fault, whole)]
+    lines = [
+        f"{file}: {_key_and_message(fault)} (got {shown_value(fault['input'])})"
+        if fault["type"] != "missing"
+        else f"{file}: {_key_and_message(fault)}"
+        for fault in faults
+        if fault not in waiting
+    ]
+    lines += [f"{file}: {each}" for each in needs(table)]
+    raise BadConfiguration("\n".join(lines))
+
+
+def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
+    """True for a missing value that would follow from one that is wrong or missing itself."""
+    key = dotted_key(Mission, fault["loc"])
+    within = (each == key or each.startswith(f"{key}.") for each in whole.waiting)
+    return fault["type"] == "missing" and (any(within) or key.endswith("field_of_view_radius_deg"))
+
+
+def _key_and_message(fault: PydanticFault) -> str:
+    return f"{dotted_key(Mission, fault['loc'])}: {explained(Mission, fault)}"
 
 
 def read_mission(path: Path) -> Mission:
@@ -401,84 +465,55 @@ def read_mission(path: Path) -> Mission:
     return parse_mission(text, str(path))
 
 
-def load_missions(folder: Path | None = None) -> dict[str, Mission]:
-    """The shipped missions by name, with those of a site's folder added or put in their place."""
-    missions: dict[str, Mission] = {}
-    for place in filter(None, (SHIPPED_FOLDER, folder)):
-        if not place.is_dir():
-            raise BadConfiguration(f"{place}: no such folder of mission files (ACQUIRE_MISSIONS)")
-        origin: dict[str, str] = {}
-        for path in sorted(place.glob("*.toml")):
+def load_missions(*places: Path | None, shipped: bool = True) -> dict[str, Mission]:
+    """The shipped missions by name, with those of a site's folders and files added.
+
+    A site's mission takes the place of a shipped one, and a file that of any mission of its name.
+    Raises `BadConfiguration` for a folder that does not exist, and for one name in two files of
+    folders.
+    """
+    return {name: mission for name, (mission, _) in mission_files(*places, shipped=shipped).items()}
+
+
+def mission_files(*places: Path | None, shipped: bool = True) -> dict[str, tuple[Mission, Path]]:
+    """The missions of `load_missions` by name, each with its file."""
+    found: dict[str, tuple[Mission, Path]] = {}
+    if shipped:
+        found |= {
+            each.name: (each, path)
+            for path in _files(SHIPPED_FOLDER)
+            for each in [read_mission(path)]
+        }
+    own: set[str] = set()
+    searched: set[Path] = set()
+    for place in filter(None, places):
+        if (resolved := place.resolve()) in searched:
+            continue
+        searched.add(resolved)
+        for path in [place] if place.suffix == ".toml" else _files(place):
             mission = read_mission(path)
-            if mission.name in origin:
-                raise BadConfiguration(
-                    f"{path}: name: {mission.name} is already in {origin[mission.name]}"
-                )
-            origin[mission.name] = str(path)
-            missions[mission.name] = mission
-    return missions
+            if mission.name in own and path != place:
+                other = found[mission.name][1]
+                raise BadConfiguration(f"{path}: name: {mission.name} is already in {other}")
+            own.add(mission.name)
+            found[mission.name] = mission, path
+    return found
+
+
+def _files(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise BadConfiguration(f"{folder}: no such folder of mission files (ACQUIRE_MISSIONS)")
+    return sorted(folder.glob("*.toml"))
 
 
 def mission_named(missions: Mapping[str, Mission], name: str) -> Mission:
-    """The mission of a spacecraft; raises `NotFound` naming those there are."""
+    """The mission of a spacecraft; raises `UnknownSpacecraft` naming the nearest and all."""
     try:
         return missions[name]
     except KeyError:
-        known = ", ".join(sorted(missions))
-        raise NotFound(f"no spacecraft {shown_value(name)}; there are {known}") from None
-
-
-Models = list[type[BaseModel]]
-
-
-def dotted_key(model: type[BaseModel], location: Sequence[str | int]) -> str:
-    """The key at which pydantic found a fault, without the tags that it puts in between."""
-    return ".".join(str(part) for part in _steps(model, location)) or "the file"
-
-
-def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """The keys of the table at a location."""
-    models = [model]
-    for part in location:
-        models = _after(models, part)[1]
-    return list(dict.fromkeys(key for each in models for key in each.model_fields))
-
-
-def explained(model: type[BaseModel], error: Mapping[str, Any]) -> str:
-    """A fault that pydantic found; for an unknown key the keys that are allowed there."""
-    if error["type"] == "missing":
-        return "is required"
-    if error["type"] != "extra_forbidden":
-        return str(error["msg"]).removeprefix("Value error, ")
-    allowed = allowed_keys(model, error["loc"][:-1])
-    return f"no such key; allowed here: {', '.join(allowed)}"
-
-
-def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[str | int]:
-    models = [model]
-    for part in location:
-        is_key, models = _after(models, part)
-        if is_key:
-            yield part
-
-
-def _after(models: Models, part: str | int) -> tuple[bool, Models]:
-    """Whether a part of a location is a key or an index, and the tables to which it leads."""
-    fields = [each.model_fields[part] for each in models if part in each.model_fields]
-    if fields:
-        return True, [found for field in fields for found in _models_in(field.annotation)]
-    tagged = [each for each in models if part in _tags(each)]
-    # Below a table pydantic also names the members of a union of values.
-    is_key = isinstance(part, int) or bool(models and not tagged)
-    return is_key, tagged or models
-
-
-def _tags(model: type[BaseModel]) -> tuple[Any, ...]:
-    kind = model.model_fields.get("kind")
-    return () if kind is None else get_args(kind.annotation)
-
-
-def _models_in(annotation: Any) -> Models:
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return [annotation]
-    return [found for part in get_args(annotation) for found in _models_in(part)]
+        pass
+    upper = {each.upper(): each for each in sorted(missions)}
+    near = difflib.get_close_matches(name.upper(), upper, n=1)
+    meant = f"; did you mean {upper[near[0]]}?" if near else ""
+    known = ", ".join(sorted(missions)) or "none"
+    raise UnknownSpacecraft(f"no spacecraft {shown_value(name)}{meant}; there are {known}")

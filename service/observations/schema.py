@@ -26,6 +26,7 @@ from pydantic import (
 )
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
+from service.missions.faults import causes, plain_message
 from service.missions.mission import GridStep, Identifier, SolverName
 from service.missions.scan import MOST_LINES, MOST_SAMPLES, MOST_WIRES
 from service.observations.batch import (
@@ -55,8 +56,8 @@ PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")
 def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
     """Faults that pydantic found, in the service's words: a dotted field, a message, the value."""
     return [
-        Fault(_field((*prefix, *fault["loc"])), _message(fault), _value(fault))
-        for fault in error.errors(include_url=False)[:MAX_FAULTS_SHOWN]
+        Fault(_field((*prefix, *fault["loc"])), plain_message(fault), _value(fault))
+        for fault in causes(error.errors(include_url=False))[:MAX_FAULTS_SHOWN]
     ]
 
 
@@ -90,12 +91,6 @@ def _field(location: tuple[str | int, ...]) -> str:
         )
     ]
     return ".".join(parts) or "body"
-
-
-def _message(fault: Any) -> str:
-    if fault["type"] == "extra_forbidden":
-        return "there is no such field"
-    return str(fault["msg"]).removeprefix("Value error, ")
 
 
 def _value(fault: Any) -> str | None:

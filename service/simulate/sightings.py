@@ -145,6 +145,9 @@ class BatchScene:
     rates_deg_per_s: Vector
     stretch: Stretch
     rng: np.random.Generator
+    noise_arcsec: float | None = None
+    false_stars: int = 0
+    missing_share: float = 0.0
 
     def look(self, attitude: Matrix, most: int) -> tuple[Matrix, list[Seen]]:
         """Up to `most` stars a tracker; where no tracker sees any, from an attitude nearby.
@@ -171,21 +174,31 @@ class BatchScene:
         offset_s = np.round(self.rng.uniform(-TIME_OFFSET_S, TIME_OFFSET_S, len(row)), 3)
         turn = -np.radians(self.rates_deg_per_s) * offset_s[:, None]
         direction = rotate_about(turn, direction @ attitude.T) @ alignment
-        inside = np.flatnonzero(direction[:, 2] >= math.cos(radius))
-        chosen = self.rng.permutation(inside)[:most]
+        inside = np.flatnonzero(in_field(tracker, direction) & self._bright_enough(tracker, row))
+        chosen = self.rng.permutation(inside)
+        if self.missing_share:
+            chosen = chosen[self.rng.random(len(chosen)) >= self.missing_share]
+        chosen = chosen[:most]
         star, direction = row[chosen], direction[chosen]
         magnitude = self.sky.magnitude_mag[star]
-        if self.stretch.kind == "spurious":
-            false = self.rng.permutation(len(star))[: int(self.stretch.size)]
+        is_spurious = self.stretch.kind == "spurious"
+        if count := max(self.false_stars, int(self.stretch.size) if is_spurious else 0):
+            false = self.rng.permutation(len(star))[:count]
             star[false] = -1
-            direction[false] = anywhere(radius, len(false), self.rng)
+            direction[false] = anywhere_in_field(tracker, len(false), self.rng)
             magnitude[false] = self.rng.choice(self.sky.magnitude_mag, len(false))
         return Seen(tracker, direction, offset_s[chosen], magnitude, star)
+
+    def _bright_enough(self, tracker: Tracker, row: Rows) -> npt.NDArray[np.bool_]:
+        if tracker.limit_mag is None:
+            return np.ones(len(row), dtype=bool)
+        return np.asarray(self.sky.magnitude_mag[row] <= tracker.limit_mag)
 
     def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
         """The stars as they are sent, with noise; a scanning tracker's has that of its scan."""
         kind, size = self.stretch.kind, self.stretch.size
-        sigma_arcsec = size if kind == "position_error" else seen.tracker.sigma_arcsec
+        own_arcsec = seen.tracker.sigma_arcsec if self.noise_arcsec is None else self.noise_arcsec
+        sigma_arcsec = size if kind == "position_error" else own_arcsec
         sigma_mag = size if kind == "magnitude_error" else seen.tracker.magnitude_sigma_mag
         direction = shaken(seen.direction, sigma_arcsec / ARCSEC_PER_RADIAN, self.rng)
         error = self.rng.normal(size=len(seen.star))
@@ -213,8 +226,26 @@ class BatchScene:
         ]
 
 
+def in_field(tracker: Tracker, direction: Vector) -> npt.NDArray[np.bool_]:
+    """True for each direction (n, 3), in tracker axes, within the tracker's field of view."""
+    inside = direction[:, 2] >= tracker.least_cosine
+    if tracker.field_of_view_deg is not None:
+        tangent = np.tan(np.radians(tracker.field_of_view_deg) / 2.0)
+        inside &= (np.abs(direction[:, :2]) <= tangent * direction[:, 2:]).all(axis=1)
+    return np.asarray(inside)
+
+
+def anywhere_in_field(tracker: Tracker, count: int, rng: np.random.Generator) -> Vector:
+    """Directions (count, 3) drawn evenly over a tracker's field of view, in its axes."""
+    radius_rad = math.radians(tracker.field_of_view_radius_deg)
+    direction = anywhere(radius_rad, count, rng)
+    while (outside := ~in_field(tracker, direction)).any():
+        direction[outside] = anywhere(radius_rad, int(outside.sum()), rng)
+    return direction
+
+
 def anywhere(radius_rad: float, count: int, rng: np.random.Generator) -> Vector:
-    """Directions (count, 3) drawn evenly over a field of view, in tracker axes."""
+    """Directions (count, 3) drawn evenly over a circle about +Z."""
     z = rng.uniform(math.cos(radius_rad), 1.0, count)
     angle = rng.uniform(0.0, math.tau, count)
     across = np.sqrt(1.0 - z * z)

@@ -8,7 +8,7 @@ from service.errors import BadInput, Fault, shown_value
 from service.missions.mission import Band, Mission
 from service.observations.batch import MAX_STARS_PER_TRACKER, Aberration
 
-PriorKind = Literal["quaternion", "direction", "mixed"]
+PriorKind = Literal["quaternion", "direction", "mixed", "none"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
 
 DEFAULT_START = "1999-03-01T00:00:00.000Z"
@@ -78,6 +78,15 @@ class Pass:
     """The share of batches whose stars come as `h_deg`, `v_deg`; the others come as vectors."""
     aberration: Mapping[Aberration, float] = field(default_factory=lambda: {"to_correct": 1.0})
     troubles: Troubles = Troubles()
+    a_priori_error_deg: float | None = None
+    """Largest error of the a priori attitude about each axis, in bands of the pole; None: the
+    mission's own."""
+    noise_arcsec: float | None = None
+    """Sigma of positions along each tangent axis; None: that of each tracker."""
+    false_stars: int = 0
+    """Random points in place of real stars, in every batch."""
+    missing_share: float = 0.0
+    """Share of the stars in the field of view that the trackers do not report."""
 
     def __post_init__(self) -> None:
         _require(self.batches >= 1, "batches", "must be at least 1", self.batches)
@@ -90,6 +99,17 @@ class Pass:
         _require(
             self.prior in get_args(PriorKind), "prior", f"must be {_any_of(PriorKind)}", self.prior
         )
+        for name, given, largest in (
+            ("a_priori_error", self.a_priori_error_deg, 180.0),
+            ("noise", self.noise_arcsec, 3600.0),
+        ):
+            within = given is None or 0 < given <= largest
+            _require(within, name, f"must be above 0, to {largest:g}", given)
+        most = MAX_STARS_PER_TRACKER
+        within = 0 <= self.false_stars <= most
+        _require(within, "false_stars", f"must be from 0 to {most}", self.false_stars)
+        missing = self.missing_share
+        _require(0 <= missing < 1, "missing", "must be from 0 to below 1", missing)
         for word, share in self.aberration.items():
             known = word in get_args(Aberration)
             _require(known, "aberration", f"must be of {_any_of(Aberration)}", word)
@@ -104,6 +124,12 @@ class Pass:
             _require(within, name, f"must be above 0, to {largest:g}", size)
         total = sum(shares.values())
         _require(total <= 1, "shares", "the stretches must not be more than the pass", total)
+
+    def error_deg_of(self, mission: Mission) -> float:
+        """Largest error of the a priori attitude about each axis, in bands of the pole."""
+        if self.a_priori_error_deg is None:
+            return mission.presumed_error_deg
+        return self.a_priori_error_deg
 
     def start_of(self, mission: Mission) -> str:
         """The time of the first batch."""

@@ -38,9 +38,6 @@ from service.sky.model import SkyModel
 from service.times import Utc, parse_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 
-CAP_A_PRIORI_DEG = 3.0
-BAND_A_PRIORI_DEG = 0.1
-
 
 @dataclass(frozen=True)
 class DrawnBatch:
@@ -85,12 +82,16 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
             rates_deg_per_s=rates[k],
             stretch=stretch,
             rng=rng,
+            noise_arcsec=wanted.noise_arcsec,
+            false_stars=wanted.false_stars,
+            missing_share=wanted.missing_share,
         )
+        error_deg = wanted.error_deg_of(mission)
         if isinstance(state, float):
             sun = sun_direction(time, position_km)
-            attitude, presumed, seen = _on_the_sun(scene, sun, state, wanted.stars)
+            attitude, presumed, seen = _on_the_sun(scene, sun, state, error_deg, wanted.stars)
         else:
-            attitude, presumed, seen = _on_the_sky(scene, state, drift, wanted.stars)
+            attitude, presumed, seen = _on_the_sky(scene, state, drift, error_deg, wanted.stars)
         by_direction = wanted.prior == "direction" or (
             wanted.prior == "mixed" and bool(rng.random() < 0.5)
         )
@@ -99,7 +100,9 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
             "spacecraft": mission.name,
             "batch": f"{time.text[:4]}-{time.day_of_year:03d}-{k + 1:0{digits}d}",
             "time": time.text,
-            "a_priori": _prior(mission, presumed, by_direction),
+            "a_priori": (
+                None if wanted.prior == "none" else _prior(mission, presumed, by_direction)
+            ),
             "body_rates_deg_per_s": rates[k].tolist(),
             "velocity_km_per_s": velocity_km_per_s.tolist(),
             "position_km": position_km.tolist(),
@@ -110,6 +113,32 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
             ],
         }
         yield DrawnBatch(batch, _truth(batch, scene, attitude, presumed, seen))
+
+
+def outside_zone(mission: Mission, drawn: DrawnBatch) -> bool:
+    """True if a field of view of the batch reaches beyond the zone about the a priori attitude.
+
+    Its stars at that edge are not in the zone, and so cannot be identified there.
+    """
+    prior, zone = drawn.batch["a_priori"], mission.zone
+    if prior is None:
+        return False
+    off_deg = [drawn.truth["a_priori_axis_error_deg"]] * len(mission.trackers)
+    if isinstance(zone, Band):
+        size_deg = zone.half_width_deg
+    else:
+        size_deg = zone.radius_deg
+        if "quaternion" in prior:
+            presumed = vectors.matrix_from_quaternion(prior["quaternion"])
+            attitude = vectors.matrix_from_quaternion(drawn.truth["quaternion"])
+            off_deg = [
+                float(vectors.angle_between_deg(b @ presumed, b @ attitude))
+                for b in (tracker.boresight_body for tracker in mission.trackers)
+            ]
+    return any(
+        off + tracker.field_of_view_radius_deg > size_deg
+        for off, tracker in zip(off_deg, mission.trackers, strict=True)
+    )
 
 
 def _motion(
@@ -127,23 +156,27 @@ def _motion(
 
 
 def _on_the_sun(
-    scene: BatchScene, sun: vectors.Vector, roll_rad: float, most: int
+    scene: BatchScene, sun: vectors.Vector, roll_rad: float, limit: float, most: int
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
     """A pole close to the Sun; the a priori attitude has it on the Sun, with any roll."""
     rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
-    tilt_deg = rng.uniform(0.0, BAND_A_PRIORI_DEG)
+    tilt_deg = rng.uniform(0.0, limit)
     if stretch.kind == "attitude_error":
-        tilt_deg = BAND_A_PRIORI_DEG + (stretch.size - BAND_A_PRIORI_DEG) * stretch.progress
+        tilt_deg = limit + (stretch.size - limit) * stretch.progress
     pole = motion.tilted(sun, math.radians(tilt_deg), rng)
     attitude, seen = scene.look(motion.pointed(axis, pole, roll_rad), most)
     return attitude, _as_sent(motion.pointed(axis, sun, rng.uniform(0.0, math.tau))), seen
 
 
 def _on_the_sky(
-    scene: BatchScene, attitude: vectors.Matrix, drift: vectors.Vector, most: int
+    scene: BatchScene,
+    attitude: vectors.Matrix,
+    drift: vectors.Vector,
+    limit: float,
+    most: int,
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
     """Anywhere; the a priori attitude is off: attitude = R1(psi) R2(theta) R3(phi) a priori."""
-    rng, stretch, limit = scene.rng, scene.stretch, CAP_A_PRIORI_DEG
+    rng, stretch = scene.rng, scene.stretch
     attitude, seen = scene.look(attitude, most)
     angles = rng.uniform(-limit, limit, 3)
     if stretch.kind == "attitude_error":
@@ -193,7 +226,9 @@ def _truth(
         "time": batch["time"],
         "stretch": scene.stretch.kind,
         "quaternion": vectors.quaternion_from_matrix(attitude).tolist(),
-        "a_priori_error_deg": error_deg.tolist() if "quaternion" in batch["a_priori"] else None,
+        "a_priori_error_deg": (
+            error_deg.tolist() if "quaternion" in (batch["a_priori"] or ()) else None
+        ),
         "a_priori_axis_error_deg": float(
             vectors.angle_between_deg(presumed.T @ axis, attitude.T @ axis)
         ),

@@ -69,10 +69,10 @@ def test_the_shipped_field_of_view_reaches_to_the_corners_of_the_sensor():
             "focal_length_mm = 50",
             ("focal_length_mm", "focal_length_px"),
         ),
-        ("gain_e_per_count = 2.0", "gain_e_per_count = 0", ("gain_e_per_count", "greater than 0")),
+        ("gain_e_per_count = 2.0", "gain_e_per_count = 0", ("gain_e_per_count", "above 0")),
         ('centroid = "matched"', 'centroid = "guess"', ("centroid", "'recursive'")),
         ("bias_counts = 200.0", "bias_counts = 50000", ("camera", "below saturation_counts")),
-        ("[[3, 0, 0.0135]", "[[-3, 0, 0.0135]", ("u_terms", "greater than or equal to 0")),
+        ("[[3, 0, 0.0135]", "[[-3, 0, 0.0135]", ("u_terms", "at least 0")),
     ],
 )
 def test_a_mistake_in_a_camera_names_the_key_and_what_is_allowed(old, new, words):

@@ -46,8 +46,9 @@ from service.web.app import bare_app, create_app
 from service.web.console.options import fields_of
 from tests.observations.example import BATCH
 from tests.web.serving import Server
+from tests.missions.stated_files import STATED_FOLDER
 
-text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+text = (STATED_FOLDER / "xte.toml").read_text(encoding="utf-8")
 mission = parse_mission(text.replace('identifier = "verified"', 'identifier = "nothing"'), "xte")
 body = json.dumps(BATCH | {"options": {"identifier": "nothing", "zone_grid_deg": 0.0}})
 batch = submission_from_json(body).batch

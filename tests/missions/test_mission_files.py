@@ -7,7 +7,6 @@ import pytest
 
 from service.errors import BadConfiguration, NotFound
 from service.missions.mission import (
-    SHIPPED_FOLDER,
     Band,
     Cap,
     load_missions,
@@ -15,10 +14,11 @@ from service.missions.mission import (
     parse_mission,
     rules_of,
 )
+from tests.missions.stated_files import STATED_FOLDER
 from tests.missions.without_gyro import mission_without_gyro
 
-XTE = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
-SOHO = (SHIPPED_FOLDER / "soho.toml").read_text(encoding="utf-8")
+XTE = (STATED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+SOHO = (STATED_FOLDER / "soho.toml").read_text(encoding="utf-8")
 
 
 def test_the_paper_s_three_missions_and_one_with_a_camera_are_shipped(missions):
@@ -75,7 +75,7 @@ MISTAKES = [
     (XTE.replace('kind = "cap"', 'kind = "cone"'), ("zone", "cap", "band", "cone")),
     (
         XTE.replace("radius_deg = 10.66", "radius_deg = -3"),
-        ("zone.radius_deg", "greater than 0", "-3"),
+        ("zone.radius_deg", "above 0, such as 10.66", "-3"),
     ),
     (
         XTE.replace("magnitude_limit_mag = 6.5", 'magnitude_limit_mag = "faint"'),
@@ -91,14 +91,21 @@ MISTAKES = [
     ),
     (XTE.replace("z_axis_body = [1.0", "z_axis_body = [-1.0"), ("trackers.0", "right-handed")),
     (XTE.replace("z_axis_body = [1.0", "z_axis_body = [2.0"), ("trackers.0", "unit vectors")),
-    (XTE.replace('name = "STARTRACKER_1"\n', ""), ("trackers.0.name", "required")),
+    (
+        XTE.replace("z_axis_body = [1.0, 0.0, 0.0]\n", "").replace("y_axis_body", "# y"),
+        ("trackers.0.z_axis_body: is required, such as [0.0, 0.0, 1.0]",),
+    ),
     (
         XTE + XTE[XTE.index("[[trackers]]") :].partition("\n[gyro]")[0],
         ("trackers: each needs a name of its own; several are STARTRACKER_1",),
     ),
     (
-        XTE.replace("axis_body = [1.0, 0.0, 0.0]      #", "#"),
-        ("zone.axis_body: is required",),
+        XTE.replace("z_axis_body = [1.0, 0.0, 0.0]", "z_axis_body = [1.0, 0.0]"),
+        ("trackers.0.z_axis_body: must have 3 entries, not 2, such as",),
+    ),
+    (
+        XTE.replace("\nsigma_arcsec =", "\nsigma ="),
+        ("sigma: no such key; did you mean sigma_arcsec?",),
     ),
     (
         XTE.replace("axis_body = [1.0, 0.0, 0.0]      #", "axis_body = [0.0, 0.0, 0.0] #"),
@@ -112,10 +119,10 @@ MISTAKES = [
         XTE.replace("pole = false", "pole = true"),
         ("tests", "a cap has no pole", "false is allowed"),
     ),
-    (XTE + "\n[products]\nlargest_gap_s = 0\n", ("products.largest_gap_s", "greater than 0")),
-    (XTE + '\n[products]\nobject_id = "1995\\n074A"\n', ("products.object_id", "pattern")),
-    (XTE + "\n[products]\nnaif_id = 95\n", ("products.naif_id", "less than 0", "95")),
-    (XTE + "\n[products]\ngap_s = 10\n", ("products.gap_s", "no such key", "largest_gap_s")),
+    (XTE + "\n[products]\nlargest_gap_s = 0\n", ("products.largest_gap_s", "above 0")),
+    (XTE + '\n[products]\nobject_id = "1995\\n074A"\n', ("products.object_id", "text of the form")),
+    (XTE + "\n[products]\nnaif_id = 95\n", ("products.naif_id", "below 0", "95")),
+    (XTE + "\n[products]\ngap_s = 10\n", ("products.gap_s: no such key; allowed here: largest",)),
     (XTE + '\n[products]\nsclk_kernel = "x.tsc"\n', ("products", "needs naif_id")),
     (XTE + "\n[surprise]\nx = 1\n", ("surprise", "trackers")),
     ("name = ", ("not TOML",)),

@@ -75,7 +75,7 @@ def test_an_epoch_of_seconds_is_read_on_its_own_clock():
 
 MISTAKES = [
     ('batch = "ST_FRAME"', 'frame = "ST_FRAME"', ("packets.frame", "batch", "join_within_s")),
-    ('day = "ST_DAY"', 'days = "ST_DAY"', ("packets.time.day", "required")),
+    ('day = "ST_DAY"', 'days = "ST_DAY"', ("packets.time.days", "did you mean day?")),
     ('day = "ST_DAY"', 'day = "A"\nhour = "B"', ("packets.time.hour", "millisecond, microsecond")),
     ('kind = "cds"', 'kind = "sclk"', ("packets.time", "cds", "cuc", "sclk")),
     ('day = "ST_DAY"', 'day = "ST DAY"', ("packets.time.day", "ST DAY")),
@@ -84,7 +84,7 @@ MISTAKES = [
     ("slots = 3", "slots = 4", ("packets.trackers.0", "magnitude names 3 parameters for 4 slots")),
     ("slots = 3", "slots = 0", ("packets.trackers.0.slots", "0")),
     ('"ST1_V_{}"', '"ST1_{}_{}"', ("packets.trackers.0.v", "with one {}", "ST1_{}_{}")),
-    ('"Q1", ', "", ("packets.prior.quaternion", "required")),
+    ('"Q1", ', "", ("packets.prior.quaternion", "must have 4 entries, not 3")),
     ('"Q1", ', '"Q0", "Q1", ', ("packets.prior.quaternion",)),
     ("scale_deg = [1e-5,", "scale_deg = [0.0,", ("packets.gyro", "scale_deg", "other than 0")),
     ("[packets.prior]\n", "[packets.prior]\nsun_pointed = true\n", ("packets.prior", "either")),

@@ -20,6 +20,7 @@ from studies.mission_rates.simulation import (
     zone_counts,
 )
 from studies.paper_1994.printed import the_paper
+from tests.missions.stated_files import STATED_FOLDER
 from tests.scale import draws
 
 BASELINE = ("phi_deg=0.0111111", "theta_deg=0.0111111")
@@ -131,7 +132,7 @@ class TestSettings:
             assert errors.magnitude_bound_mag == pytest.approx(0.6)
 
     def test_a_cap_lies_about_the_boresight_of_the_chosen_tracker(self):
-        text = (SHIPPED_FOLDER / "xte.toml").read_text()
+        text = (STATED_FOLDER / "xte.toml").read_text()
         second = text[text.index("[[trackers]]") :].replace("STARTRACKER_1", "SIDE")
         second = second.replace("z_axis_body = [1.0, 0.0, 0.0]", "z_axis_body = [0.0, 1.0, 0.0]")
         second = second.replace("x_axis_body = [0.0, 1.0, 0.0]", "x_axis_body = [0.0, 0.0, 1.0]")

@@ -95,7 +95,7 @@ def test_an_unknown_format_is_refused_with_the_known_ones_named(client):
     (fault,) = answer.json()["errors"]
     assert fault == {
         "field": "format",
-        "message": "Input should be 'json', 'csv', 'parquet' or 'fits'",
+        "message": "must be 'json', 'csv', 'parquet' or 'fits'",
         "value": "'xml'",
     }
 

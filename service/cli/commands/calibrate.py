@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.arguments import period_of, progress_bar, settings_of, settings_of_existing
+from service.cli.arguments import period_of, progress_bar, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
@@ -129,8 +129,4 @@ def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
 
 def _mission_file(parsed: Namespace) -> Path:
     """The file that the spacecraft's mission is read from: a site's own before the shipped one."""
-    from service.missions.mission import SHIPPED_FOLDER, read_mission
-
-    folders = [each for each in (settings_of(parsed).missions, SHIPPED_FOLDER) if each]
-    files = (path for folder in folders for path in sorted(Path(folder).glob("*.toml")))
-    return next(path for path in files if read_mission(path).name == parsed.spacecraft)
+    return arguments.mission_and_file(parsed.spacecraft)[1]

@@ -37,6 +37,22 @@ def add(commands: Any) -> None:
     )
     arguments.add_json(parser, "findings and counts")
     add_estimate(group)
+    parser = arguments.add_command(group, "show", show)
+    parser.add_argument("mission", metavar="MISSION", help=arguments.FILE_OR_NAME)
+
+
+def show(parsed: Namespace) -> int:
+    """Print a whole mission as TOML, with the origin of each value: given in the file, derived from
+    other values by a rule, or the default.
+
+    acquire mission show mine.toml
+    acquire mission show XTE
+    """
+    from service.cli.mission_files import whole_text
+
+    mission, path = arguments.mission_and_file(parsed.mission)
+    print(whole_text(mission, path))
+    return 0
 
 
 def check(parsed: Namespace) -> int:
@@ -177,11 +193,14 @@ def _changed(mission: "Mission", table: str, key: str, value: float, option: str
     """The mission with another value; raises `BadInput` naming the option where it is no value."""
     from pydantic import ValidationError
 
+    from service.missions.faults import plain_message
+
     old: Any = getattr(mission, table)
     try:
         new = type(old).model_validate({**old.model_dump(), key: value})
     except ValidationError as error:
-        raise BadInput(Fault(option, error.errors()[0]["msg"], shown_value(value))) from None
+        message = plain_message(error.errors()[0])
+        raise BadInput(Fault(option, message, shown_value(value))) from None
     return mission.model_copy(update={table: new})
 
 

@@ -270,6 +270,8 @@ def _packet_reader(parsed: Namespace) -> "PacketReader":
     from service.packets.mapping import packet_mission
     from service.packets.reader import PacketReader
 
-    mission = packet_mission(load_missions(settings_of(parsed).missions), parsed.spacecraft)
+    settings = settings_of(parsed)
+    missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
+    mission = packet_mission(missions, parsed.spacecraft)
     assert mission.packets is not None
     return PacketReader(mission, read_definition(parsed.xtce, mission.packets.root_container))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.arguments import period_of, settings_of, settings_of_existing
+from service.cli.arguments import period_of, settings_of_existing
 from service.errors import BadConfiguration, BadInput, Fault
 
 if TYPE_CHECKING:
@@ -143,12 +143,12 @@ def run(parsed: Namespace) -> int:
 
 def _chosen(parsed: Namespace) -> "tuple[Mission | None, str | None]":
     """The mission of `--mission`, and the spacecraft whose batches are asked for."""
-    from service.missions.mission import load_missions, mission_named, read_mission
+    from service.missions.mission import read_mission
 
     spacecraft: str | None = parsed.spacecraft
     if parsed.mission is None:
         if spacecraft is not None:
-            mission_named(load_missions(settings_of(parsed).missions), spacecraft)
+            arguments.mission_and_file(spacecraft)
         return None, spacecraft
     mission = read_mission(parsed.mission)
     if spacecraft not in (None, mission.name):

@@ -75,7 +75,7 @@ def prepare(parsed: Namespace) -> int:
     logging.basicConfig(format="%(message)s", level=logging.INFO)
     moment = utc_now() if parsed.time is None else parse_utc(parsed.time, "--time")
     settings = settings_of(parsed)
-    missions = load_missions(settings.missions)
+    missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
     build = KernelBuild()
     if build.is_needed:
         print("kernels: compiling for a minute or two", flush=True)

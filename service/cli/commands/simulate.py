@@ -1,6 +1,8 @@
 """`acquire simulate`: skies whose truth is known."""
 
+import sys
 from argparse import Namespace
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -9,9 +11,12 @@ from service.cli.arguments import mission_and_catalog
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from service.missions.mission import Mission
     from service.observations.batch import Aberration
     from service.simulate.stretches import Pass
-    from service.simulate.telemetry import GyroWanted
+    from service.simulate.telemetry import DrawnBatch, GyroWanted
 
 
 def add(commands: Any) -> None:
@@ -160,10 +165,37 @@ def _add_telemetry(group: Any) -> None:
     )
     parser.add_argument(
         "--prior",
-        choices=("quaternion", "direction", "mixed"),
-        default="quaternion",
+        choices=("quaternion", "direction", "mixed", "none"),
         help="a priori attitude: full (quaternion), boresight or sun_pointed only (direction), "
-        "or both kinds (mixed)",
+        "both kinds (mixed), or none; default quaternion, or none for a mission that is lost in "
+        "space",
+    )
+    parser.add_argument(
+        "--a-priori-error",
+        type=arguments.positive,
+        metavar="DEG",
+        help="largest error of the a priori attitude about each axis, in bands of the pole; "
+        "default: the mission's",
+    )
+    parser.add_argument(
+        "--noise",
+        type=arguments.positive,
+        metavar="ARCSEC",
+        help="sigma of positions along each tangent axis; default: that of each tracker",
+    )
+    parser.add_argument(
+        "--false-stars",
+        type=int,
+        default=0,
+        metavar="N",
+        help="false stars in place of real ones, per tracker and batch; default 0",
+    )
+    parser.add_argument(
+        "--missing",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the stars in the field that are not reported, from 0 to below 1; default 0",
     )
     parser.add_argument(
         "--angles",
@@ -233,22 +265,67 @@ def _run_telemetry(parsed: Namespace) -> int:
     acquire simulate telemetry --spacecraft XTE --batches 9 --aberration ignore xte.ndjson
     acquire simulate telemetry --spacecraft XTE --batches 240 --gyro 1 --gyro-gap 90 xte.ndjson
     """
-    from service.simulate.telemetry import draw_pass, truth_path, with_gyro, write_pass
+    from service.simulate.telemetry import (
+        draw_pass,
+        outside_zone,
+        truth_path,
+        with_gyro,
+        write_pass,
+    )
     from service.sky.cache import LruCache
     from service.sky.model import SkyModel
 
-    wanted = _pass_of(parsed)
-    gyro = _gyro_of(parsed)
     mission, catalog = mission_and_catalog(parsed.spacecraft)
+    wanted = _pass_of(parsed, mission)
+    gyro = _gyro_of(parsed)
     drawn = draw_pass(mission, SkyModel(catalog, LruCache(64 << 20)), wanted)
     if gyro is not None:
         duration_s = (wanted.batches - 1) * wanted.cadence_of(mission)
         drawn = with_gyro(drawn, mission, gyro, duration_s, wanted.seed)
-    written = write_pass(drawn, parsed.output)
+    outside = 0
+
+    def counted() -> "Iterator[DrawnBatch]":
+        nonlocal outside
+        for each in drawn:
+            outside += outside_zone(mission, each)
+            yield each
+
+    written = write_pass(counted(), parsed.output)
     print(
         f"{parsed.output}: {written} batches of {mission.name}; truth: {truth_path(parsed.output)}"
     )
+    print(f"drawn: {_drawn_text(wanted, mission)}")
+    if outside:
+        print(
+            f"warning: in {100 * outside / written:.1f} % of the batches the a priori error takes "
+            "a field of view beyond the mission's zone, where stars at its edge stay unmatched",
+            file=sys.stderr,
+        )
     return 0
+
+
+def _drawn_text(wanted: "Pass", mission: "Mission") -> str:
+    """The errors of a pass in one line."""
+    if wanted.prior == "none":
+        parts = ["no a priori attitude"]
+    else:
+        of = "the pole" if mission.zone.kind == "band" else "each axis"
+        parts = [f"a priori error up to {wanted.error_deg_of(mission):.3g} deg about {of}"]
+    noises = {
+        (wanted.noise_arcsec or each.sigma_arcsec, each.magnitude_sigma_mag)
+        for each in mission.trackers
+    }
+    parts += [f"noise {arcsec:.3g} arcsec and {mag:g} mag" for arcsec, mag in sorted(noises)]
+    if wanted.false_stars:
+        parts.append(f"{wanted.false_stars} false stars per tracker")
+    if wanted.missing_share:
+        parts.append(f"{100 * wanted.missing_share:g} % of the stars missing")
+    kinds = Counter(each.kind for each in wanted.stretches(mission))
+    for kind, count in sorted(kinds.items()):
+        if kind != "nominal":
+            share = 100 * count / wanted.batches
+            parts.append(f"{kind.replace('_', ' ')} in {share:.0f} % (--nominal: none)")
+    return ", ".join(parts)
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
@@ -265,7 +342,7 @@ def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
     return GyroWanted(parsed.gyro, *flaws)
 
 
-def _pass_of(parsed: Namespace) -> "Pass":
+def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
     """The pass that the arguments describe; raises `BadInput` for an impossible one."""
     from service.simulate.stretches import Pass, Trouble, Troubles
 
@@ -284,7 +361,11 @@ def _pass_of(parsed: Namespace) -> "Pass":
         start=parsed.start,
         cadence_s=parsed.cadence,
         stars=parsed.stars,
-        prior=parsed.prior,
+        prior=parsed.prior or ("quaternion" if mission.knows_attitude else "none"),
+        a_priori_error_deg=parsed.a_priori_error,
+        noise_arcsec=parsed.noise,
+        false_stars=parsed.false_stars,
+        missing_share=parsed.missing,
         angles_share=parsed.angles,
         aberration=_shares(parsed.aberration),
         troubles=Troubles(**troubles),

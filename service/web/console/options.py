@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from service.acquire.choices import Choices, idle_reason
 from service.errors import BadBatch, Fault, shown_value
+from service.missions.faults import causes, plain_message
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission, SolverName, Tests, Tolerances
 from service.observations.schema import OptionsIn
@@ -86,10 +87,10 @@ def faults_of_form(error: ValidationError, prefix: str = "") -> list[Fault]:
     return [
         Fault(
             prefix + ".".join(str(part)[:80] for part in each["loc"]),
-            str(each["msg"]),
+            plain_message(each),
             shown_value(each["input"]),
         )
-        for each in error.errors()
+        for each in causes(error.errors())
     ]
 
 

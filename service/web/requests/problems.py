@@ -21,6 +21,7 @@ from starlette.routing import Match
 
 from service import errors
 from service.gyro import SampleTaken
+from service.missions.faults import causes, plain_message
 from service.storage.models.base import Problem
 
 
@@ -250,10 +251,10 @@ def faults_in_query(error: RequestValidationError) -> list[errors.Fault]:
         errors.Fault(
             # Below the parameter, `loc` names the form of it that was tried.
             str(each["loc"][min(1, len(each["loc"]) - 1)])[:80],
-            str(each["msg"]).removeprefix("Value error, "),
+            plain_message(each),
             None if each["type"] == "missing" else errors.shown_value(each["input"]),
         )
-        for each in error.errors()
+        for each in causes(error.errors())
     ]
 
 
