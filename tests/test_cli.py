@@ -239,7 +239,7 @@ def test_the_version_is_the_packages(acquire):
         ("database prune --before noon", "--before: must be UTC as"),
         ("reprocess --spacecraft NO", "no spacecraft 'NO'; there are IMAGER, SOHO"),
         ("reprocess --run live", "run: must be another run than the one"),
-        ("reprocess --run a/b", "run: String should match"),
+        ("reprocess --run a/b", "run: must be letters, digits"),
         ("reprocess --track --archive /", "--track: cannot be used with --archive: each batch"),
         ("reprocess --track --processes 2", "--processes: leave it out with --track, which"),
         ("reprocess --mission none.toml", "none.toml: cannot be read: "),

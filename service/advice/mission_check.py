@@ -57,11 +57,22 @@ def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView
     """The view of each tracker."""
     found = []
     for tracker in mission.trackers:
-        view = run_catalog.direction, 0.0, tracker.field_of_view_radius_deg
+        view = run_catalog.direction, 0.0, _round_field_deg(tracker)
         counts = zone_census.star_counts(*view)
         stars = zone_census.star_spread(zone_census.Extremes(*view), counts)
         found.append(TrackerView(tracker.name, stars, zone_census.share_below(counts, FEW_STARS)))
     return found
+
+
+def _round_field_deg(tracker: Tracker) -> float:
+    """The radius of the round field of view with the area of the tracker's own."""
+    if tracker.field_of_view_deg is None:
+        return tracker.field_of_view_radius_deg
+    half = [math.radians(0.5 * each) for each in tracker.field_of_view_deg]
+    area_sr = 4.0 * math.asin(
+        math.sin(math.atan(math.tan(half[0]) * math.cos(half[1]))) * math.sin(half[1])
+    )
+    return math.degrees(math.acos(1.0 - area_sr / math.tau))
 
 
 def axis_findings(mission: Mission) -> list[Finding]:

@@ -1,11 +1,14 @@
-"""A whole mission as TOML, each value with its origin."""
+"""Mission files as text: a whole mission with the origin of each value, and a new short file."""
 
 import json
+import sys
 import tomllib
+from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from service.errors import BadInput, Fault, shown_value
 from service.missions.defaults import completed
 
 if TYPE_CHECKING:
@@ -80,3 +83,132 @@ def _value(value: Any) -> str:
     if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     return json.dumps(value, ensure_ascii=False)
+
+
+AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
+ACROSS = {"x": "y", "y": "z", "z": "x"}
+"""The body axis that becomes the tracker's X axis for a boresight along each body axis."""
+QUESTIONS = (
+    ("name", "Name of the spacecraft", "MYCUBE"),
+    ("field", "Field of view of the tracker in degrees: WIDTHxHEIGHT, or the radius", "8x8"),
+    ("sigma", "Error of a star's position along each axis, one sigma, in arcsec", "5"),
+    ("limit", "Faintest star that the tracker sees, in magnitudes", "6.5"),
+    ("boresight", "Body axis of the boresight: x, -x, y, -y, z, -z, or three numbers", "z"),
+    (
+        "a_priori_error",
+        "Largest a priori error about each axis, in degrees; nothing: no a priori attitude",
+        "0.5",
+    ),
+    ("sun_axis", "Body axis on the Sun, if only the Sun's direction is known; else nothing", ""),
+)
+"""The options of `acquire mission new`, each with its question and an example."""
+
+
+def asked(parsed: Namespace) -> Namespace:
+    """The options of a new mission, with what is missing asked for on the terminal.
+
+    Questions go to the standard error, so that the file can be redirected.
+    """
+    for name, question, example in QUESTIONS:
+        if getattr(parsed, name) is None:
+            such = f", such as {example}" if example else ""
+            print(f"{question}{such}: ", end="", file=sys.stderr, flush=True)
+            answer = sys.stdin.readline().strip()
+            repeats = name in ("field", "sigma", "limit", "boresight")
+            setattr(parsed, name, ([answer] if repeats else answer) if answer else None)
+    return parsed
+
+
+def new_text(parsed: Namespace) -> str:
+    """The file of a new mission, with comments; raises `BadInput` naming the option."""
+    for name in ("name", "field", "sigma", "limit"):
+        if not getattr(parsed, name):
+            option = "NAME" if name == "name" else f"--{name}"
+            example = next(each for key, _, each in QUESTIONS if key == name)
+            raise BadInput(Fault(option, f"is required, such as {example}"))
+    lines = [f"name = {_value(parsed.name)}"]
+    if parsed.identifier:
+        lines.append(f"identifier = {_value(parsed.identifier)}")
+    if parsed.sun_axis:
+        axis = _axis("--sun-axis", parsed.sun_axis)
+        lines.append(_line(f"sun_pointed_axis_body = {axis}", "the body axis on the Sun"))
+    if parsed.a_priori_error is not None:
+        error_deg = _number("--a-priori-error", parsed.a_priori_error)
+        about = "of the Sun-pointed axis" if parsed.sun_axis else "about each axis"
+        lines.append(_line(f"a_priori_error_deg = {error_deg}", f"largest a priori error {about}"))
+    elif not parsed.sun_axis:
+        lines.append("# Without a_priori_error_deg the mission is lost in space.")
+    boresights = parsed.boresight or ["z"]
+    for place in range(max(len(boresights), len(parsed.field))):
+        lines += ["", *_tracker(parsed, place)]
+    return "\n".join(lines) + "\n"
+
+
+def _tracker(parsed: Namespace, place: int) -> list[str]:
+    boresight = _of_tracker(parsed.boresight or ["z"], place)
+    z_axis = _axis("--boresight", boresight)
+    x_axis = _axis("--boresight", ACROSS.get(boresight.lstrip("+-").lower(), ""), z_axis)
+    sigma = _number("--sigma", _of_tracker(parsed.sigma, place))
+    limit = _number("--limit", _of_tracker(parsed.limit, place))
+    return [
+        "[[trackers]]",
+        _line(f"x_axis_body = {x_axis}", "the tracker's X axis in body components: check it"),
+        _line(f"z_axis_body = {z_axis}", "the boresight; the tracker's Y axis follows"),
+        _field(_of_tracker(parsed.field, place)),
+        _line(f"sigma_arcsec = {sigma}", "one sigma of a position along each axis"),
+        _line(f"limit_mag = {limit}", "the faintest star that the tracker sees"),
+    ]
+
+
+def _of_tracker(values: list[str], place: int) -> str:
+    """The value of a tracker; the last one holds for the trackers after it."""
+    return str(values[min(place, len(values) - 1)])
+
+
+def _field(text: str) -> str:
+    width, times, height = text.lower().partition("x")
+    if not times:
+        radius_deg = _number("--field", text, "8x8 (width and height), or a radius such as 4")
+        return _line(f"field_of_view_radius_deg = {radius_deg}", "from the boresight to the edge")
+    sides = [_number("--field", each, "WIDTHxHEIGHT, such as 8x8") for each in (width, height)]
+    return _line(f"field_of_view_deg = {sides}", "width along X, height along Y")
+
+
+def _axis(option: str, text: str, across: list[float] | None = None) -> list[float]:
+    """The body axis that a text names: x, -x, ..., or three numbers; or one across another."""
+    name = text.lstrip("+-").lower()
+    if name in AXES:
+        sign = -1.0 if text.startswith("-") else 1.0
+        return [sign * each + 0.0 for each in AXES[name]]
+    if across is not None:
+        return _perpendicular(across)
+    try:
+        first, second, third = (float(each) for each in text.replace(",", " ").split())
+        norm = (first**2 + second**2 + third**2) ** 0.5
+        return [round(each / norm, 9) + 0.0 for each in (first, second, third)]
+    except (ValueError, ZeroDivisionError):
+        message = "must be x, -x, y, -y, z, -z, or three numbers such as 0.6,0,0.8"
+        raise BadInput(Fault(option, message, shown_value(text))) from None
+
+
+def _perpendicular(axis: list[float]) -> list[float]:
+    """The unit vector across an axis that lies nearest to the body axis farthest from it."""
+    k = min(range(3), key=lambda place: abs(axis[place]))
+    aside = [(1.0 if place == k else 0.0) - axis[k] * axis[place] for place in range(3)]
+    norm = sum(each**2 for each in aside) ** 0.5
+    return [round(each / norm, 9) + 0.0 for each in aside]
+
+
+def _number(option: str, text: str, example: str = "a number above 0, such as 5") -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    # A limiting magnitude may be below zero; the check of the mission bounds every value.
+    if number == 0.0:
+        raise BadInput(Fault(option, f"must be {example}", shown_value(text)))
+    return number
+
+
+def _line(setting: str, comment: str) -> str:
+    return f"{setting:<36}  # {comment}"

@@ -1,7 +1,8 @@
 """The check of a mission file for a terminal, as JSON and as a picture."""
 
+import sys
 import textwrap
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,10 +19,11 @@ from service.advice.mission_check import (
 from service.advice.zone_census import ZoneCensus, axes_deg, zone_censuses
 from service.errors import BadInput, Fault, shown_value
 from service.sky.catalog.run_catalog import RunCatalog, build_run_catalog
-from service.times import FIRST_YEAR, LAST_YEAR, utc_now
+from service.times import FIRST_YEAR, LAST_YEAR, parse_utc, utc_now
 
 if TYPE_CHECKING:
     from service.missions.mission import Mission
+    from service.simulate.expected import Expected
     from service.sky.catalog.star_catalog import Catalog
 
 WIDTH = 96
@@ -39,6 +41,7 @@ class MissionReport:
     views: list[TrackerView]
     zones: list[ZoneCensus]
     findings: list[Finding]
+    expected: "list[Expected]" = field(default_factory=list)
 
 
 def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> MissionReport:
@@ -54,6 +57,23 @@ def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> Mis
     faintest_mag = float(np.percentile(catalog.magnitude_v_mag, FAINTEST_SHARE))
     found = findings(mission, faintest_mag, views, zones)
     return MissionReport(mission, run_catalog, views, zones, found)
+
+
+def with_expectation(report: MissionReport, catalog: "Catalog") -> MissionReport:
+    """The report with outcomes of simulated views; as it is where something is wrong."""
+    from service.acquire.kernel_build import KernelBuild
+    from service.simulate.expected import expected_outcomes
+    from service.sky.cache import LruCache
+    from service.sky.model import SkyModel
+
+    if not report.zones:
+        return report
+    if KernelBuild().is_needed:
+        text = "the first start on a machine compiles for one to two minutes"
+        print(text, file=sys.stderr, flush=True)
+    sky = SkyModel(catalog, LruCache(256 << 20))
+    moment = parse_utc(f"{report.run_catalog.epoch_year:.0f}-03-01T00:00:00Z")
+    return replace(report, expected=expected_outcomes(report.mission, sky, moment))
 
 
 def epoch_of(epoch: float | None) -> float:
@@ -93,6 +113,15 @@ def report_json(report: MissionReport) -> dict[str, Any]:
             }
             for each in report.zones
         ],
+        "expected": [
+            {
+                "sky": each.sky,
+                "views": each.views,
+                "attitudes": each.attitudes,
+                "stars": each.stars,
+            }
+            for each in report.expected
+        ],
     }
 
 
@@ -113,6 +142,7 @@ def report_text(report: MissionReport) -> str:
         )
     if not report.findings:
         lines.append("ok        nothing is wrong, nothing is unusual")
+    lines += ["", *_sentences(report)]
     lines += ["", f"{'over the whole sky':<44}{'least':>10}{'median':>10}{'most':>10}"]
     for view in report.views:
         lines.append(_row(f"stars in the view of {view.tracker}", view.stars))
@@ -125,6 +155,43 @@ def report_text(report: MissionReport) -> str:
     for zone in report.zones:
         lines += ["", *_map(zone)]
     return "\n".join(lines)
+
+
+def _sentences(report: MissionReport) -> list[str]:
+    """What the mission can do, in sentences."""
+    mission, zone = report.mission, report.mission.zone
+    lines = [
+        f"{view.tracker} sees {FEW_STARS} stars or more in {100.0 * (1.0 - view.few_share):.0f} % "
+        f"of the sky; {view.stars.median} in a usual view."
+        for view in report.views
+    ]
+    field_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
+    error = f"{mission.presumed_error_deg:.3g} deg"
+    if not mission.knows_attitude:
+        lines.append("The mission is lost in space: each batch is sought in the whole sky.")
+    elif zone.kind == "band":
+        lines.append(
+            f"The band is {zone.half_width_deg:g} deg wide to either side: the field of view of "
+            f"{field_deg:g} deg and an error of the Sun-pointed axis of {error}."
+        )
+    else:
+        lines.append(
+            f"The zone of {zone.radius_deg:g} deg holds the field of view of {field_deg:g} deg and "
+            f"an a priori error of {error} about each axis."
+        )
+    lines += [
+        f"Expected in {each.sky} sky ({_LATITUDES[each.sky]} deg from the plane of the Milky Way; "
+        f"{each.views} simulated views): {100.0 * each.share('unique'):.1f} % of the stars unique, "
+        f"{100.0 * each.share('ambiguous'):.1f} % ambiguous, "
+        f"{100.0 * each.share('unmatched'):.1f} % unmatched, "
+        f"{100.0 * each.share('wrong'):.2f} % wrong; a good attitude in "
+        f"{100.0 * each.attitudes / each.views:.0f} % of the views."
+        for each in report.expected
+    ]
+    return [part for line in lines for part in textwrap.wrap(line, WIDTH)]
+
+
+_LATITUDES = {"clear": "more than 30", "dense": "less than 10"}
 
 
 def _row(title: str, of: Any) -> str:

@@ -155,7 +155,7 @@ def _grid_deg(given: Given) -> float | None:
 
 
 def _limit_mag(given: Given) -> float:
-    return max(_number(each["limit_mag"]) for each in given.trackers())
+    return max(_number(each["limit_mag"]) for each in given.trackers() if "limit_mag" in each)
 
 
 def _merge_arcsec(given: Given) -> float | None:
@@ -444,8 +444,6 @@ def needs(table: Mapping[str, Any]) -> Iterator[str]:
                 f"trackers.{place}.field_of_view_deg: is required, such as [8.0, 8.0] (width and "
                 "height); or field_of_view_radius_deg, or a table [trackers.camera]"
             )
-        if "limit_mag" not in tracker and "magnitude_limit_mag" not in table.get("catalog", {}):
-            yield (
-                f"trackers.{place}.limit_mag: is required, such as 6.5: the faintest star that "
-                "the tracker sees"
-            )
+    limited = [each for each in trackers if isinstance(each, dict) and "limit_mag" in each]
+    if not limited and "magnitude_limit_mag" not in table.get("catalog", {}):
+        yield "trackers.0.limit_mag: is required, such as 6.5: the faintest star that it sees"

@@ -95,7 +95,7 @@ def plain_message(fault: PydanticFault) -> str:
         text = words(fault.get("ctx", {}))
     key = next((part for part in reversed(fault["loc"]) if isinstance(part, str)), None)
     # Messages of our own say what is right; for an entry of a list the whole list is the example.
-    if fault["type"] in ("value_error", "literal_error", "extra_forbidden") or key not in EXAMPLES:
+    if fault["type"] in _WITHOUT_EXAMPLE or key not in EXAMPLES or "options" in fault["loc"]:
         return text
     return f"{text}, such as {json.dumps(EXAMPLES[key])}"
 
@@ -171,6 +171,9 @@ def _of_lists(faults: Sequence[PydanticFault]) -> Iterator[PydanticFault]:
                 "input": held,
                 "ctx": {"length": lacking[location[:-1]], "actual_length": len(held)},
             }
+
+
+_WITHOUT_EXAMPLE = ("value_error", "literal_error", "extra_forbidden", "bool_type", "bool_parsing")
 
 
 def _entries(context: Mapping[str, Any], key: str, bound: str) -> str:

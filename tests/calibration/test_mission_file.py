@@ -7,7 +7,7 @@ from service.calibration.estimate import calibrate
 from service.calibration.linearise import Model
 from service.calibration.mission_file import calibrated_mission_text, tracker_lines
 from service.errors import BadConfiguration
-from service.missions.mission import SHIPPED_FOLDER, parse_mission
+from service.missions.mission import parse_mission
 from service.observations.focal_plane import tracker_vectors
 from tests.calibration.drawn import (
     MISALIGNED,
@@ -19,6 +19,7 @@ from tests.calibration.drawn import (
     field,
     true_angles,
 )
+from tests.missions.stated_files import STATED_FOLDER
 
 PRESENT = """
 [trackers.calibration]   # of the ground test
@@ -38,7 +39,7 @@ magnitude_sigma_mag = 0.1
 
 
 def mission_text(calibrations=("", "")):
-    head, _, _ = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8").partition("[[trackers]]")
+    head, _, _ = (STATED_FOLDER / "xte.toml").read_text(encoding="utf-8").partition("[[trackers]]")
     own = [
         TRACKER.format(
             name=each.name,

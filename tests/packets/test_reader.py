@@ -252,7 +252,7 @@ VALUES = [
     ({"a_priori": {"quaternion": [0.0, 0.0, 0.0, 0.9]}}, "Q1, Q2, Q3, Q4", "norm 1"),
     ({"body_rates_deg_per_s": [0.0, float("nan"), 0.0]}, "RATE_Y", "finite"),
     ({"body_rates_deg_per_s": [0.0, 0.0, 400.0]}, "RATE", "at most 360"),
-    ({"batch": ""}, "ST_BATCH", "at least 1 character"),
+    ({"batch": ""}, "ST_BATCH", "must not be empty"),
 ]
 
 

@@ -28,7 +28,7 @@ def add(commands: Any) -> None:
         "acquire mission check missions/mine.toml",
     )
     parser = arguments.add_command(group, "check", check, notes=NOTES)
-    parser.add_argument("file", type=Path, metavar="FILE.toml")
+    parser.add_argument("file", type=Path, metavar="FILE.toml", help=arguments.FILE_OR_NAME)
     parser.add_argument(
         "--epoch", type=float, metavar="YEAR", help="of the run catalog; default: this year"
     )
@@ -37,8 +37,59 @@ def add(commands: Any) -> None:
     )
     arguments.add_json(parser, "findings and counts")
     add_estimate(group)
+    _add_new(group)
     parser = arguments.add_command(group, "show", show)
     parser.add_argument("mission", metavar="MISSION", help=arguments.FILE_OR_NAME)
+
+
+def _add_new(group: Any) -> None:
+    parser = arguments.add_command(group, "new", new)
+    parser.add_argument("name", nargs="?", metavar="NAME", help="name of the spacecraft")
+    for flag, metavar, text in (
+        ("field", "FIELD", "field of view in degrees: WIDTHxHEIGHT, or the radius of a round one"),
+        ("sigma", "ARCSEC", "error of a star's position along each axis, one sigma"),
+        ("limit", "MAG", "the faintest star that the tracker sees"),
+        ("boresight", "AXIS", "body axis of the boresight: x, -x, ..., or X,Y,Z; default z"),
+    ):
+        help_text = f"{text}; once for each tracker"
+        parser.add_argument(f"--{flag}", action="append", metavar=metavar, help=help_text)
+    parser.add_argument(
+        "--a-priori-error",
+        metavar="DEG",
+        help="largest error of the a priori attitude about each axis; without it, and without "
+        "--sun-axis, the mission is lost in space",
+    )
+    parser.add_argument(
+        "--sun-axis", metavar="AXIS", help="body axis on the Sun, if only that direction is known"
+    )
+    parser.add_argument("--identifier", metavar="NAME", help="default: verified")
+
+
+def new(parsed: Namespace) -> int:
+    """Print a mission file of some ten lines, with comments; without a name on a terminal, ask for
+    its values.
+
+    acquire mission new MYCUBE --field 8x8 --sigma 5 --limit 6.5 --a-priori-error 0.5 > my.toml
+    acquire mission new > my.toml
+    acquire mission new TWO --field 8x8 --sigma 5 --limit 6.5 --boresight z --boresight=-x > 2.toml
+    acquire mission new SUNNY --field 4 --sigma 3 --limit 8 --boresight z --sun-axis x > sunny.toml
+    """
+    import sys
+
+    from service.cli.mission_files import asked, new_text
+    from service.missions.mission import parse_mission
+
+    if parsed.name is None and sys.stdin.isatty():
+        parsed = asked(parsed)
+    text = new_text(parsed)
+    mission = parse_mission(text, "the new mission")
+    print(text, end="")
+    print(
+        f"next: acquire mission check FILE.toml (the file of {mission.name}); "
+        "missions are looked for in ./missions/*.toml",
+        file=sys.stderr,
+    )
+    return 0
 
 
 def show(parsed: Namespace) -> int:
@@ -56,19 +107,27 @@ def show(parsed: Namespace) -> int:
 
 
 def check(parsed: Namespace) -> int:
-    """Tell what is wrong with a mission file and what is unusual, and draw its zones with the
-    number of their stars and pairs.
+    """Tell what is wrong with a mission file and what is unusual, what the mission can expect in
+    clear and in dense sky, and draw its zones with the number of their stars and pairs.
 
     acquire mission check mine.toml
     acquire mission check mine.toml --picture zones.svg
     acquire mission check mine.toml --epoch 2030 --json
     """
     from service.cli.charts import zones_picture
-    from service.cli.mission_report import examined, refusals, report_json, report_text
+    from service.cli.mission_report import (
+        examined,
+        refusals,
+        report_json,
+        report_text,
+        with_expectation,
+    )
     from service.missions.mission import read_mission
     from service.settings import Settings
     from service.sky.catalog.star_catalog import open_catalog
 
+    if parsed.file.suffix != ".toml" and not parsed.file.exists():
+        parsed.file = arguments.mission_and_file(str(parsed.file))[1]
     # A file that is not there is no mission file at all.
     parsed.file.open("rb").close()
     try:
@@ -82,7 +141,7 @@ def check(parsed: Namespace) -> int:
                 print(f"wrong     {each['key']}: {each['text']}")
         return 1
     catalog = open_catalog(Settings.from_environment().catalog)
-    report = examined(mission, catalog, parsed.epoch)
+    report = with_expectation(examined(mission, catalog, parsed.epoch), catalog)
     if parsed.picture is not None and report.zones:
         parsed.picture.write_text(zones_picture(report), encoding="utf-8")
     if parsed.json:
@@ -91,6 +150,11 @@ def check(parsed: Namespace) -> int:
         print(report_text(report))
         if parsed.picture is not None and report.zones:
             print(f"picture: {parsed.picture}")
+        if report.zones:
+            print(
+                f"next: acquire simulate telemetry --spacecraft {parsed.file} --batches 100 "
+                "--nominal pass.ndjson"
+            )
     return 1 if any(each.level == "wrong" for each in report.findings) else 0
 
 

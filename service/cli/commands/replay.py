@@ -195,7 +195,17 @@ def run(parsed: Namespace) -> int:
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
     _print_counts(run, summary, sources, parsed.json)
+    if not parsed.json and summary.batches:
+        print(f"{'next':<20}{_next_step(parsed, run)}")
     return 1 if summary.refused else 0
+
+
+def _next_step(parsed: Namespace, run: str) -> str:
+    """The address of the run's page in the console, and what has to run for it."""
+    page = f"{service_url(parsed)}/?run={run}"
+    if not parsed.in_process:
+        return page
+    return f"acquire serve --database {settings_of(parsed).database}, then open {page}"
 
 
 def _print_counts(

@@ -170,47 +170,57 @@ def _add_telemetry(group: Any) -> None:
         "both kinds (mixed), or none; default quaternion, or none for a mission that is lost in "
         "space",
     )
-    parser.add_argument(
-        "--a-priori-error",
-        type=arguments.positive,
-        metavar="DEG",
-        help="largest error of the a priori attitude about each axis, in bands of the pole; "
-        "default: the mission's",
-    )
-    parser.add_argument(
-        "--noise",
-        type=arguments.positive,
-        metavar="ARCSEC",
-        help="sigma of positions along each tangent axis; default: that of each tracker",
-    )
-    parser.add_argument(
-        "--false-stars",
-        type=int,
-        default=0,
-        metavar="N",
-        help="false stars in place of real ones, per tracker and batch; default 0",
-    )
-    parser.add_argument(
-        "--missing",
-        type=float,
-        default=0.0,
-        metavar="SHARE",
-        help="share of the stars in the field that are not reported, from 0 to below 1; default 0",
-    )
-    parser.add_argument(
+    _add_errors(parser)
+    more = parser.add_argument_group("more options")
+    more.add_argument(
         "--angles",
         type=float,
         default=0.25,
         metavar="SHARE",
         help="share of stars sent as h_deg, v_deg; default 0.25",
     )
-    parser.add_argument(
+    more.add_argument(
         "--aberration",
         default="to_correct",
         metavar="WORD[=SHARE],...",
         help="to_correct, applied_upstream, ignore; default to_correct",
     )
     _add_gyro(parser)
+    _add_periods(parser)
+
+
+def _add_errors(parser: Any) -> None:
+    errors = parser.add_argument_group("errors of every batch")
+    errors.add_argument(
+        "--a-priori-error",
+        type=arguments.positive,
+        metavar="DEG",
+        help="largest error of the a priori attitude about each axis, in bands of the pole; "
+        "default: the mission's",
+    )
+    errors.add_argument(
+        "--noise",
+        type=arguments.positive,
+        metavar="ARCSEC",
+        help="sigma of positions along each tangent axis; default: that of each tracker",
+    )
+    errors.add_argument(
+        "--false-stars",
+        type=int,
+        default=0,
+        metavar="N",
+        help="false stars in place of real ones, per tracker and batch; default 0",
+    )
+    errors.add_argument(
+        "--missing",
+        type=float,
+        default=0.0,
+        metavar="SHARE",
+        help="share of the stars in the field that are not reported, from 0 to below 1; default 0",
+    )
+
+
+def _add_periods(parser: Any) -> None:
     serious = parser.add_argument_group(
         "periods with errors",
         "share of the pass with each error, from 0 to 1, and its size",
