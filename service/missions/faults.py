@@ -85,6 +85,10 @@ FORMS: dict[str, str] = {
 """The patterns of names, in words."""
 
 
+MOST_COMPARED = 20
+"""Unknown keys of one table that are compared with its missing ones."""
+
+
 def plain_message(fault: PydanticFault) -> str:
     """What is expected of a value, without the words of pydantic, and an example of its key."""
     words = _WORDS.get(fault["type"])
@@ -103,18 +107,22 @@ def plain_message(fault: PydanticFault) -> str:
 def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
     """The faults that do not follow from others: unknown keys, wrong values, missing keys."""
     joined = [*_of_lists(faults)]
-    unknown = [fault["loc"] for fault in joined if fault["type"] == "extra_forbidden"]
+    # A client may send any number of unknown keys: the time is linear in it.
+    wholes: set[Location] = set()
+    unknown: dict[Location, list[Any]] = {}
+    for fault in joined:
+        location = fault["loc"]
+        wholes.update(location[:length] for length in range(len(location)))
+        if fault["type"] == "extra_forbidden":
+            names = unknown.setdefault(location[:-1], [])
+            names += [location[-1]] if len(names) < MOST_COMPARED else []
     kept = []
     for fault in joined:
         location = fault["loc"]
-        is_whole = any(
-            len(each["loc"]) > len(location) and each["loc"][: len(location)] == location
-            for each in joined
-        )
         is_misspelt = fault["type"] == "missing" and any(
-            each[:-1] == location[:-1] and nearest(each[-1], [location[-1]]) for each in unknown
+            nearest(each, [location[-1]]) for each in unknown.get(location[:-1], ())
         )
-        if not is_whole and not is_misspelt:
+        if location not in wholes and not is_misspelt:
             kept.append(fault)
     return sorted(kept, key=lambda fault: _RANK.get(fault["type"], 1))
 

@@ -269,6 +269,37 @@ def test_a_sites_numbers_come_back_exactly(folder, rows):
         np.testing.assert_array_equal(getattr(imported, name), getattr(loaded, name))
 
 
+def test_exports_of_gaia_and_of_hipparcos_are_the_same_stars(tmp_path):
+    """Each star where erfa carries it to from J2000.0: near a pole, fast, and at rest."""
+    known = [
+        ("POLARIS", 37.9545, 89.2641, 44.48, -11.85),
+        ("BARNARD", 269.4521, 4.6934, -798.58, 10328.12),
+        ("ALPHA CEN", 219.9021, -60.8340, -3679.25, 473.67),
+        ("STILL", 10.0, -20.0, 0.0, 0.0),
+    ]
+    for epoch in (2016.0, 1991.25):
+        rows, headed = [], [f"{HEADER},pm_ra_mas_per_year,pm_dec_mas_per_year,epoch"]
+        for name, ra_deg, dec_deg, pm_ra, pm_dec in known:
+            mas, dec = np.radians(1.0 / 3.6e6), np.radians(dec_deg)
+            moved_star = erfa.starpm(
+                *(np.radians(ra_deg), dec, pm_ra * mas / np.cos(dec), pm_dec * mas),
+                *(0.5, 0.0, 2451545.0, 0.0, 2451545.0, (epoch - 2000.0) * 365.25),
+            )
+            ra, then_dec, motion_ra, motion_dec = moved_star[:4]
+            motion = f"{motion_ra * np.cos(then_dec) / mas:.6f},{motion_dec / mas:.6f}"
+            rows.append(f"{name},{np.degrees(ra):.10f},{np.degrees(then_dec):.10f},5,{motion}")
+            headed.append(f"{rows[-1]},{epoch}")
+        (tmp_path / "option.csv").write_text("\n".join([headed[0].removesuffix(",epoch"), *rows]))
+        (tmp_path / "column.csv").write_text("\n".join(headed))
+        by_option = import_csv(tmp_path / "option.csv", epoch)
+        for catalog in (by_option, import_csv(tmp_path / "column.csv")):
+            for name, ra_deg, dec_deg, *_ in known:
+                row = catalog.row_of(name)
+                true = from_ra_dec(ra_deg, dec_deg)
+                off_arcsec = 3600.0 * angle_between_deg(catalog.direction[row], true)
+                assert off_arcsec < 0.05
+
+
 def test_a_site_catalog_is_sorted_and_finds_its_own_neighbours(tmp_path):
     """Stars are sorted by magnitude, ties in the order of the file, neighbours among themselves."""
     path = tmp_path / "mine.csv"

@@ -40,6 +40,13 @@ def add(commands: Any) -> None:
     parser.add_argument(
         "--format", choices=("csv", "sky2000"), help="default: recognised from the first bytes"
     )
+    parser.add_argument(
+        "--epoch",
+        type=float,
+        metavar="YEAR",
+        help="Julian year of the positions of a CSV file without a column epoch, such as 2016.0 "
+        "(Gaia) or 1991.25 (Hipparcos); default 2000.0",
+    )
     for function in (export, rejected):
         parser = add_command(group, function.__name__, function)
         parser.add_argument("--spacecraft", required=True, metavar="NAME", help=MISSION)
@@ -80,22 +87,29 @@ def import_catalog(parsed: Namespace) -> int:
     or fixed-width records of SKYMAP's SKY2000 (CDS V/109), whose numbers become the stars' ids.
 
     acquire catalog import skymap.csv
+    acquire catalog import gaia.csv --epoch 2016.0
     acquire catalog import sky2kv4.dat.gz skymap.npz
     ACQUIRE_CATALOG=skymap.npz acquire serve
     """
     from tqdm import tqdm
 
+    from service.sky.catalog.csv_file import FIRST_EPOCH, LAST_EPOCH
     from service.sky.catalog.star_catalog import catalog_format, import_csv, import_sky2000, save
 
     # Of night.dat.gz the name is night.
     name = parsed.file.name.removesuffix(".gz").rpartition(".")[0] or parsed.file.name
     output = parsed.output or parsed.file.with_name(f"{name}.npz")
     left_out: tuple[str, ...] = ()
+    if parsed.epoch is not None and not FIRST_EPOCH <= parsed.epoch <= LAST_EPOCH:
+        message = f"must be from {FIRST_EPOCH:g} to {LAST_EPOCH:g}, such as 2016.0"
+        raise BadInput(Fault("--epoch", message, shown_value(parsed.epoch)))
     if (parsed.format or catalog_format(parsed.file)) == "sky2000":
         with tqdm(unit=" stars", desc="reading", disable=None, leave=False) as bar:
             catalog, left_out = import_sky2000(parsed.file, bar.update)
     else:
-        catalog = import_csv(parsed.file)
+        epoch_year = 2000.0 if parsed.epoch is None else parsed.epoch
+        catalog = import_csv(parsed.file, epoch_year)
+        print(f"epoch of positions: {epoch_year}, unless a column epoch says another")
     save(catalog, output)
     print(f"{output}: {len(catalog)} stars")
     if left_out:

@@ -15,6 +15,8 @@ from service.errors import BadFile, Fault, shown_value
 
 FAULTS_SHOWN = 20
 MAX_ID_LENGTH = 64
+FIRST_EPOCH, LAST_EPOCH = 1800.0, 2100.0
+"""Julian years between which the epoch of a position may lie."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,7 @@ REQUIRED: Mapping[str, _NumberColumn] = {
 OPTIONAL: Mapping[str, _NumberColumn] = {
     "pm_ra_mas_per_year": _NumberColumn("pm_ra_mas_per_year", -20_000.0, 20_000.0, 0.0),
     "pm_dec_mas_per_year": _NumberColumn("pm_dec_mas_per_year", -20_000.0, 20_000.0, 0.0),
+    "epoch": _NumberColumn("epoch_year", FIRST_EPOCH, LAST_EPOCH, math.nan),
     "parallax_mas": _NumberColumn("parallax_mas", -1000.0, 1000.0, math.nan),
     "color_bv_mag": _NumberColumn("color_bv_mag", -5.0, 10.0, math.nan),
     "variability_mag": _NumberColumn("variability_mag", 0.0, 30.0, math.nan),
@@ -51,7 +54,8 @@ _ALL = {**REQUIRED, **OPTIONAL}
 def read_csv_catalog(path: Path) -> dict[str, npt.NDArray[Any]]:
     """The columns of a CSV catalog, by their names in a catalog, in the order of the file.
 
-    `ra_deg` is in [0, 360), 360 itself being read as 0.  Raises BadFile with
+    `ra_deg` is in [0, 360), 360 itself being read as 0.  `epoch_year` is the Julian year of a
+    star's position, NaN where the file does not say.  Raises BadFile with
     up to FAULTS_SHOWN faults, each with line, column and value.
     """
     lines = _lines(path)

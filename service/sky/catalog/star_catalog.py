@@ -22,9 +22,18 @@ from service.sky.catalog import sky2000
 from service.sky.catalog.coding import COLUMNS, LABEL, file_digest, pack, unpack
 from service.sky.catalog.neighbours import nearest_neighbours
 from service.sky.files import Content, kept
-from service.vectors import ARCSEC_PER_RADIAN, Vector, from_ra_dec, read_only, unit
+from service.times import J2000_YEAR
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Vector,
+    from_ra_dec,
+    read_only,
+    to_ra_dec,
+    unit,
+)
 
 CatalogFormat = Literal["csv", "sky2000"]
+POSITION_AND_MOTION = ("ra_deg", "dec_deg", "pm_ra_mas_per_year", "pm_dec_mas_per_year")
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,16 +148,26 @@ def open_catalog(file: Path | None) -> Catalog:
         raise BadConfiguration(f"ACQUIRE_CATALOG: {error}") from None
 
 
-def import_csv(path: Path) -> Catalog:
+def import_csv(path: Path, epoch_year: float = J2000_YEAR) -> Catalog:
     """A site's own catalog from a CSV file with a header.
 
     Columns `id`, `ra_deg`, `dec_deg` and `magnitude` must be there; those of
-    `service.sky.catalog.csv_file.OPTIONAL` may be.  Positions are ICRS at J2000.0.
-    Stars of equal magnitude keep the order of the file.  Neighbours are found
-    within the catalog itself.  Raises BadFile naming line, column and value of
-    up to twenty faults.
+    `service.sky.catalog.csv_file.OPTIONAL` may be.  Positions are ICRS at the Julian year of
+    the column `epoch`, without one at `epoch_year`; proper motion carries them to J2000.0.
+    Proper motion in right ascension is times cos(declination), as in Hipparcos and Gaia.
+    Stars of equal magnitude keep the order of the file.  Neighbours are found within the
+    catalog itself.  Raises BadFile naming line, column and value of up to twenty faults.
     """
-    return _of_a_site(path, catalog_csv.read_csv_catalog(path))
+    columns = catalog_csv.read_csv_catalog(path)
+    epoch = columns.pop("epoch_year")
+    epoch = np.where(np.isnan(epoch), epoch_year, epoch)
+    # Positions of J2000.0 stay as they are, to the last bit.
+    for year in np.unique(epoch[epoch != J2000_YEAR]).tolist():
+        rows = np.flatnonzero(epoch == year)
+        ra, dec, pm_ra, pm_dec = (columns[name][rows] for name in POSITION_AND_MOTION)
+        ra_deg, dec_deg = to_ra_dec(moved(ra, dec, pm_ra, pm_dec, J2000_YEAR - year))
+        columns["ra_deg"][rows], columns["dec_deg"][rows] = ra_deg, dec_deg
+    return _of_a_site(path, columns)
 
 
 def import_sky2000(
