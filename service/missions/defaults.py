@@ -18,6 +18,7 @@ from service.missions.camera import (
     field_of_camera_deg,
     with_camera_defaults,
 )
+from service.vectors import Vector
 
 MARGIN_DEG = 0.1
 """Room at the edge of a zone for aberration, and for stars just outside of the field of view."""
@@ -121,7 +122,7 @@ def _zone_radius_deg(given: Given) -> float | None:
         return None
     error_deg, reach_deg = given.error_deg(), 0.0
     for tracker in given.trackers():
-        boresight = np.array([_number(each) for each in tracker["z_axis_body"]])
+        boresight = _vector(tracker["z_axis_body"])
         # The errors about the axes add; the largest displacement is at a corner of their cube.
         shift = max(float(np.linalg.norm(np.cross(each, boresight))) for each in _CORNERS)
         reach_deg = max(
@@ -346,9 +347,7 @@ def _axes(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> dict[st
     if len(missing) != 1:
         return {}
     k = AXES.index(missing[0])
-    first, second = (
-        np.array([_number(each) for each in tracker[AXES[(k + step) % 3]]]) for step in (1, 2)
-    )
+    first, second = (_vector(tracker[AXES[(k + step) % 3]]) for step in (1, 2))
     # A zero without a sign: the digest of the mission is of its text.
     third = np.cross(first, second) + 0.0
     return {missing[0]: third.tolist()}
@@ -392,8 +391,11 @@ def _coelevation(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> 
 
 def _from_sun_deg(given: Given, tracker: Mapping[str, Any]) -> float:
     axis, boresight = (
-        np.array([_number(each) for each in vector])
-        for vector in (given.sun_axis() or given.table["zone"]["axis_body"], tracker["z_axis_body"])
+        _vector(components)
+        for components in (
+            given.sun_axis() or given.table["zone"]["axis_body"],
+            tracker["z_axis_body"],
+        )
     )
     angle_deg = math.degrees(
         math.atan2(np.linalg.norm(np.cross(axis, boresight)), float(axis @ boresight))
@@ -406,6 +408,12 @@ def _number(value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError("no number")
     return float(value)
+
+
+def _vector(value: Any) -> Vector:
+    """Three finite numbers; raises `ValueError` for anything else."""
+    first, second, third = (_number(each) for each in value)
+    return np.array([first, second, third])
 
 
 def _positive(value: Any) -> float:
@@ -436,14 +444,15 @@ def needs(table: Mapping[str, Any]) -> Iterator[str]:
     if not trackers:
         yield "trackers: are required: a table [[trackers]] for each star tracker"
         return
-    for place, tracker in enumerate(trackers if isinstance(trackers, list) else []):
-        if not isinstance(tracker, dict):
-            continue
+    if not isinstance(trackers, list) or not all(isinstance(each, dict) for each in trackers):
+        return
+    for place, tracker in enumerate(trackers):
         if not {"field_of_view_deg", "field_of_view_radius_deg", "camera"} & tracker.keys():
             yield (
                 f"trackers.{place}.field_of_view_deg: is required, such as [8.0, 8.0] (width and "
                 "height); or field_of_view_radius_deg, or a table [trackers.camera]"
             )
-    limited = [each for each in trackers if isinstance(each, dict) and "limit_mag" in each]
-    if not limited and "magnitude_limit_mag" not in table.get("catalog", {}):
+    catalog = table.get("catalog", {})
+    is_limited = any("limit_mag" in each for each in trackers)
+    if not is_limited and isinstance(catalog, dict) and "magnitude_limit_mag" not in catalog:
         yield "trackers.0.limit_mag: is required, such as 6.5: the faintest star that it sees"

@@ -433,16 +433,9 @@ def parse_mission(text: str, file: str) -> Mission:
         faults = of_the_form_given(
             causes(error.errors()), lambda fault: dotted_key(Mission, fault["loc"])
         )
-    waiting = [fault for fault in faults if _is_waiting(fault, whole)]
-    lines = [
-        f"{file}: {_key_and_message(fault)} (got {shown_value(fault['input'])})"
-        if fault["type"] != "missing"
-        else f"{file}: {_key_and_message(fault)}"
-        for fault in faults
-        if fault not in waiting
-    ]
-    lines += [f"{file}: {each}" for each in needs(table)]
-    raise BadConfiguration("\n".join(lines))
+    found = [_described(fault) for fault in faults if not _is_waiting(fault, whole)]
+    lines = [*found, *needs(table)] or [_described(fault) for fault in faults]
+    raise BadConfiguration("\n".join(f"{file}: {each}" for each in lines))
 
 
 def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
@@ -452,8 +445,9 @@ def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
     return fault["type"] == "missing" and (any(within) or key.endswith("field_of_view_radius_deg"))
 
 
-def _key_and_message(fault: PydanticFault) -> str:
-    return f"{dotted_key(Mission, fault['loc'])}: {explained(Mission, fault)}"
+def _described(fault: PydanticFault) -> str:
+    text = f"{dotted_key(Mission, fault['loc'])}: {explained(Mission, fault)}"
+    return text if fault["type"] == "missing" else f"{text} (got {shown_value(fault['input'])})"
 
 
 def read_mission(path: Path) -> Mission:
