@@ -46,7 +46,11 @@ def covariance(rows):
 REFUSED = {
     "norm": (told(quaternion=[0.0, 0.0, 0.0, 1.0011]), "measurement.quaternion", "1.0011"),
     "nan": (told(quaternion=[0.0, float("nan"), 0.0, 1.0]), "measurement.quaternion.1", "nan"),
-    "three": (told(quaternion=[0.0, 0.0, 1.0]), "measurement.quaternion.3", "required"),
+    "three": (
+        told(quaternion=[0.0, 0.0, 1.0]),
+        "measurement.quaternion",
+        "must have 4 entries, not 3",
+    ),
     "no sigma": (told(sigma_arcsec=...), "measurement", "either sigma_arcsec"),
     "both": (told(covariance_arcsec2=COVARIANCE), "measurement", "either sigma_arcsec"),
     "zero": (told(sigma_arcsec=[6.0, 0.0, 6.0]), "measurement.sigma_arcsec.1", "0.001"),

@@ -34,7 +34,7 @@ WRONG = {
     "10,000 stars": (STARS, [A_STAR] * 10_000, STARS, "vector"),
     "a zero vector": (VECTOR, [0, 0, 0], VECTOR, "0"),
     "a vector of norm 2": (VECTOR, [0, 0, 2], VECTOR, "2"),
-    "a vector of two": (VECTOR, [0, 1], f"{VECTOR}.2", None),
+    "a vector of two": (VECTOR, [0, 1], VECTOR, "0, 1"),
     "NaN": (VECTOR, [float("nan"), 0, 1], f"{VECTOR}.0", "nan"),
     "an infinity": (VECTOR, [float("-inf"), 0, 1], f"{VECTOR}.0", "-inf"),
     "a number in quotes": (VECTOR, ["0", 0, 1], f"{VECTOR}.0", "0"),
