@@ -1,4 +1,4 @@
-"""Where the data that travels with the code is found.
+"""Paths of the data that travel with the code.
 
 In a checkout the star catalog and the migrations stand beside the package; in
 an installed wheel they lie inside it, in `service/_shipped`.

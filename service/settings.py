@@ -155,7 +155,7 @@ class Settings:
 
     @property
     def spool_folder(self) -> Path:
-        """Where uploads are stored: `spool`, by default beside SQLite's file, or here."""
+        """Folder of uploads: `spool`, else beside SQLite's file or in the working folder."""
         if self.spool is not None:
             return self.spool
         scheme, _, file = self.database.partition(":///")

@@ -28,7 +28,7 @@ def links(title: str, picture: Path, file: Path) -> list[str]:
 
 
 class Folder:
-    """Where pictures are written, and which were."""
+    """A folder for pictures, and those written to it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -78,6 +78,30 @@ def test_no_folder_holds_too_many_modules(modules):
     assert {folder for folder, count in counts.items() if count > MAX_MODULES} <= FULL_FOLDERS
 
 
+NO_SUBJECT = re.compile(r"(Of|In (the )?place of|So (many|few|much|long|far)|That|Whether|Where)\b")
+
+
+def docstrings(text):
+    """The strings that describe modules, classes, functions, attributes and constants."""
+    for node in ast.walk(ast.parse(text)):
+        body = getattr(node, "body", None)
+        for statement in body if isinstance(body, list) else ():
+            match statement:
+                case ast.Expr(ast.Constant(str(text))):
+                    yield statement.lineno, text.strip()
+
+
+def test_a_docstring_says_what_a_thing_is_without_its_name(modules):
+    """One that begins with "Of a star" or "Whether it is" needs the name beside it."""
+    begun = [
+        f"{name_of(path)}:{line}: {text.splitlines()[0]}"
+        for path, source in modules.items()
+        for line, text in docstrings(source)
+        if NO_SUBJECT.match(text)
+    ]
+    assert begun == []
+
+
 def test_no_test_of_the_service_imports_a_benchmark():
     """What both use stands in `tests/reference` and `service/simulate`."""
     importing = re.compile(r"^\s*(from|import) benchmarks\b", re.MULTILINE)

@@ -25,7 +25,7 @@ from service.vectors import quaternion_from_matrix, rotate_about
 ORION = 84.0, -1.0
 """A field with many bright stars: right ascension and declination, in degrees."""
 BRIGHT_MAG = 4.0
-"""So few stars are enough for every kernel, and are soon built from."""
+"""Limit of the warm-up catalog: few stars compile every kernel, and are indexed fast."""
 BRIGHTEST_MAG = 3.0
 """And so few where every pair and every patch of the whole sky is to be indexed."""
 

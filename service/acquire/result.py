@@ -42,7 +42,7 @@ _COUNTED = [
 
 
 class Place(Struct, frozen=True, eq=False, gc=False):
-    """Where the stars of a tracker were searched for, and whether that zone was cached.
+    """The region in which the stars of a tracker were searched for; `cached` if its zone was.
 
     `stars` and `pairs` are those within the region, the paper's NCAP and NTOT; the zone, from the
     cache, may hold more.

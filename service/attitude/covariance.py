@@ -10,7 +10,7 @@ from service.compiled.jit import njit_no_refcount
 
 @njit_no_refcount
 def within(p, largest):  # type: ignore[no-untyped-def]
-    """Whether no axis of a covariance (3, 3) has more than the largest variance allowed.
+    """True if no axis of a covariance (3, 3) has more than the largest variance allowed.
 
     That is where I - P / largest is positive definite.
     """

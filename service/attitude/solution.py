@@ -23,7 +23,7 @@ WORST_AXIS_RAD = math.radians(WORST_AXIS_DEG)
 SUSPECT_TAIL = 0.001
 """A true solution's TASTE passes the bound that makes it suspect with this probability."""
 ODDS_OF_TWO = 100.0
-"""Of two trackers one is named only where the other alone fits so many times likelier."""
+"""Least likelihood ratio for which one of two trackers is named as the faulty one."""
 METHODS = ("triad", "quest")
 """By their rows in the quaternions of a fit."""
 

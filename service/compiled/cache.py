@@ -35,7 +35,7 @@ SOURCES = (
     "service/vectors.py",
     "studies/ptp_2015/rivals",
 )
-"""Where every module with compiled code lies, and all that these import: folders and files."""
+"""Folders and files that hold every module with compiled code, and all that these import."""
 
 
 def keep_kernels_apart() -> None:

@@ -218,7 +218,7 @@ class _BitcodeLibrary(JITCodeLibrary):
 
 
 class _WithoutEnvironment:
-    """Where machine code is made; none that an environment could be written to."""
+    """A code generator for code that is not made into machine code: no environment is set."""
 
     def __init__(self, codegen: Any) -> None:
         self._own = codegen

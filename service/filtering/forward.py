@@ -170,7 +170,7 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
 
 @njit_no_refcount
 def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-def]
-    """Whether a measurement that agrees with the state may end a doubt.
+    """True if a measurement that agrees with the state may end a doubt.
 
     It has to exclude the rival.  Of fewer rejected measurements than `confirmations`, it is
     enough if the rival lies within the state's own covariance by now: more of them are no

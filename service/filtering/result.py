@@ -158,7 +158,7 @@ class AttitudeHistory:
 
     @property
     def good(self) -> npt.NDArray[np.bool_]:
-        """Where the attitude (n,) is GOOD."""
+        """True for each sample (n,) whose attitude is GOOD."""
         return np.asarray(self.status == Status.GOOD)
 
 

@@ -345,7 +345,7 @@ def packed(samples: GradedSamples | MeasuredInnovations) -> bytes:
 
 
 def unpacked(data: bytes, samples: int) -> GradedSamples:
-    """So many samples that `packed` was given.
+    """Unpack `samples` samples, the reverse of `packed`.
 
     Raises `ValueError` for bytes that are damaged or hold another number of samples.
     """
@@ -353,7 +353,7 @@ def unpacked(data: bytes, samples: int) -> GradedSamples:
 
 
 def unpacked_innovations(data: bytes, measurements: int) -> MeasuredInnovations:
-    """So many measurements that `packed` was given; raises `ValueError` as `unpacked`."""
+    """Unpack `measurements` measurements; raises `ValueError` as `unpacked`."""
     return _unpacked(MeasuredInnovations, data, measurements)
 
 

@@ -96,7 +96,7 @@ class FitColumns(NamedTuple):
     figures: Any
 
     def is_good(self, row: int) -> bool:
-        """Whether a batch has an attitude that its residuals do not speak against."""
+        """True if a batch has an attitude that its residuals do not contradict."""
         matched = int(self.matched[row])
         return matched >= 2 and bool(self.figures[row, TASTE] <= taste_bound(2 * matched - 3))
 

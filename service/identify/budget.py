@@ -11,9 +11,9 @@ Batches of a few stars take some thousands, 250 real stars of one tracker 13 mil
 Hundreds of points with errors of minutes of arc that are no stars would take far more.
 """
 COMPARISONS_PER_UNIT = 7
-"""Of an observed with a candidate pair, in the pair tests."""
+"""Comparisons of one observed pair with one candidate pair that cost one unit of work."""
 NODES_PER_UNIT = 14
-"""Of the search for match groups."""
+"""Nodes of the search for match groups that cost one unit of work."""
 
 
 class WorkBudget:
@@ -22,7 +22,7 @@ class WorkBudget:
     def __init__(self, units: int = MAX_WORK, whole: "WorkBudget | None" = None) -> None:
         self.left = units
         self.was_hit = False
-        """Whether any part of it was used up."""
+        """True once any part of the budget was used up."""
         self._whole = whole
 
     def share(self, part: int, of: int) -> "WorkBudget":

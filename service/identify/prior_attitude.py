@@ -51,7 +51,7 @@ class PriorAttitude(Struct, frozen=True, eq=False, gc=False):
     predicted: PredictedPrior | None = None
     """What the attitude was predicted with, if it was: its zones are caps about each boresight."""
     pole_body: Vector | None = None
-    """Where in the body the pole was measured to be; None: along the zone's body axis."""
+    """The measured direction of the pole in the body; None: along the zone's body axis."""
 
     def axis_body(self, mission: Mission) -> Vector:
         """The body axis (3,) that lies along `axis`."""

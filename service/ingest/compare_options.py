@@ -105,7 +105,7 @@ class ComparisonTally:
     changed: list[records.BatchChange] = field(default_factory=list)
     changed_batches: int = 0
     counted: list[tuple[int, dict[str, int], dict[str, int]]] = field(default_factory=list)
-    """Of each batch its time in nanoseconds of TAI, and the stars by outcome on both sides."""
+    """For each batch: its time in nanoseconds of TAI, and the stars by outcome on both sides."""
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
         """Take one batch's two results."""

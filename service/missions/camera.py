@@ -31,7 +31,7 @@ TWO_EACH_WAY: tuple[Wire, ...] = (
     (0.0, -0.25, 0.1), (0.0, 0.25, 0.1), (90.0, -0.25, 0.1), (90.0, 0.25, 0.1),
 )  # fmt: skip
 MOST_COVERED = 0.6
-"""Of the aperture: the wires may cover no more, counted one by one."""
+"""Largest share of the aperture that wires may cover, counted one by one."""
 MOST_SAMPLED_SIGMA_PX = 5.0
 
 WIDEST_BAND = 2.0
@@ -43,7 +43,7 @@ MOST_STARS = 250
 _ROUNDS = 50
 _NEAR_ENOUGH = 1e-12
 UNKNOWN_FIELD_DEG = 40.0
-"""Of a camera whose file tells neither field of view nor focal length: room for most lenses."""
+"""Field of view assumed if a file states neither that nor a focal length: room for most lenses."""
 UNKNOWN_LIMIT_MAG = 7.0
 ROOM = 1.3
 """By so much a field that is told roughly may be wider."""
@@ -85,7 +85,7 @@ class Camera(Strict):
     focal_length_px: float = Field(ge=10, le=1e7)
     center_u_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
     center_v_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
-    """Where the boresight meets the sensor."""
+    """The point where the boresight meets the sensor."""
     u_terms: Terms = ()
     v_terms: Terms = ()
     """Distortion, [i, j, c]: from the plane as measured to the true one."""
@@ -97,9 +97,9 @@ class Camera(Strict):
     saturation_counts: float = Field(gt=0, le=1e9)
     """A pixel at or above this is full."""
     exposure_s: float = Field(gt=0, le=3600)
-    """Of a frame that does not say otherwise."""
+    """Exposure of a frame that does not state its own."""
     psf_sigma_px: float = Field(ge=0.3, le=20)
-    """Of a star's image along each axis, before the pixel integrates it.
+    """Width of a star's image along each axis, before the pixel integrates it.
 
     Of the images of an aperture: of the Gaussian that is as wide at half of its height as the
     image of the aperture without its wires."""
@@ -109,7 +109,7 @@ class Camera(Strict):
     wires: tuple[Wire, ...] = Field(
         default=TWO_EACH_WAY, max_length=32, exclude_if=TWO_EACH_WAY.__eq__
     )
-    """Of the cross."""
+    """Wires of the mesh that draws the cross."""
     band_nm: tuple[Wavelength, Wavelength] | None = Field(default=None, exclude_if=is_missing)
     """The wavelengths between which the detector sees light; None: light of one colour.
 
@@ -181,7 +181,7 @@ class Camera(Strict):
         return unit(np.stack([x + bent_x, y + bent_y, np.ones_like(x)], axis=-1))
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
-        """Where (u, v) directions (n, 3) fall; NaN for what the sensor cannot see by far."""
+        """Coordinates (u, v) of directions (n, 3); NaN for directions far outside the sensor."""
         with np.errstate(divide="ignore", invalid="ignore"):
             ahead = directions[..., 2] > 0.0
             true_x = np.where(ahead, directions[..., 0] / directions[..., 2], np.nan)

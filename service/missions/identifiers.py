@@ -47,7 +47,7 @@ class IdentifierEntry:
 
     @property
     def searches_zone(self) -> bool:
-        """Whether it searches the zone about an a priori attitude, and nothing else."""
+        """True if the identifier searches only the zone about an a priori attitude."""
         return self.uses_prior and not self.needs_guide
 
 

@@ -16,17 +16,17 @@ from service.times import Utc, parse_utc
 from service.vectors import Matrix, read_only
 
 LARGEST_RATE_DEG_PER_S = 10.0
-"""Where a mission names no other: star trackers do not follow faster motion."""
+"""Default of a mission: star trackers do not follow faster motion."""
 FIRST_BIAS_RAD_S = 5e-5
 """One sigma of a gyro's bias when nothing is known of it: 10 deg/h."""
 RATE_WALK_RAD_S1_5 = 3e-4
-"""Where a mission names no other: within minutes a body may begin or end a slew."""
+"""Default of a mission: within minutes a body may begin or end a slew."""
 RATE_RAD_S = 2e-3
 """One sigma of the rate of a body when nothing is known of it: 0.1 deg/s."""
 FLOOR_DEG, CEILING_DEG = 0.1, 3.0
 MAX_AGE_S = 3600.0
 BODY_RATE_SIGMA_DEG_PER_S = 0.001
-"""Of the rates that batches carry, where a mission names no other."""
+"""Default sigma of the rates that batches carry."""
 AXIS_LENGTH_TOLERANCE, LEAST_VOLUME = 1e-3, 0.1
 
 AxisName = Literal["X", "Y", "Z", "-X", "-Y", "-Z"]
@@ -121,7 +121,7 @@ class Flip(Strict):
         return self
 
     def lies_between(self, first: Utc, last: Utc) -> bool:
-        """Whether it is under way at some time from `first` to `last`."""
+        """True if the period overlaps that from `first` to `last`."""
         start_ns, end_ns = self._span_ns
         return first.tai_ns < end_ns and start_ns < last.tai_ns
 

@@ -107,14 +107,14 @@ class PacketTracker(Strict):
     h: SlotNames | None = None
     v: SlotNames | None = None
     angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "deg"
-    """Of h and v after the calibration that the XTCE file describes."""
+    """Unit of h and v after the calibration that the XTCE file describes."""
     vector: tuple[SlotNames, SlotNames, SlotNames] | None = None
-    """In place of h and v: unit vectors in tracker axes."""
+    """Parameters of unit vectors in tracker axes, instead of h and v."""
     magnitude: SlotNames | None = None
     time_offset_s: SlotNames | None = None
     sigma_arcsec: SlotNames | None = None
     count: ParameterName | None = None
-    """So many slots, from the first, hold a star."""
+    """Parameter with the number of slots, from the first, that hold a star."""
     valid: SlotNames | None = None
     """A slot holds a star where this is not zero."""
     valid_labels: ValidLabels = _no_labels
@@ -146,11 +146,11 @@ class PacketPrior(Strict):
     direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
     frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
     time: PacketTime | None = None
-    """Of an attitude with a time of its own; by default the time of its packet."""
+    """Time of an attitude that has its own; by default the time of its packet."""
     max_age_s: float = Field(default=10.0, gt=0, le=86400)
     """An attitude of another packet serves stars that are at most so far from it in time."""
     sun_pointed: bool = False
-    """In place of a quaternion: the mission's pole is always at the Sun, its roll unknown."""
+    """Instead of a quaternion: the mission's pole is always at the Sun, its roll unknown."""
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -177,15 +177,15 @@ class PacketMeasurement(Strict):
     covariance: Upper | None = None
     """Parameters of the covariance of that rotation, in place of the sigmas."""
     angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "arcsec"
-    """Of `sigma`; the unit of `covariance` is its square."""
+    """Unit of `sigma`; the unit of `covariance` is its square."""
     sigma_arcsec: tuple[SigmaArcsec, SigmaArcsec, SigmaArcsec] | None = None
-    """In place of parameters: the sigmas of every packet."""
+    """Sigmas of every packet, instead of parameters."""
     valid: ParameterName | None = None
     """The packet holds an attitude where this is not zero."""
     valid_labels: ValidLabels = _no_labels
     """The labels of an enumerated parameter, or texts, for which it holds one."""
     time: PacketTime | None = None
-    """Of an attitude with a time of its own; by default the time of its packet."""
+    """Time of an attitude that has its own; by default the time of its packet."""
 
     @model_validator(mode="after")
     def _one_accuracy(self) -> Self:
@@ -239,13 +239,13 @@ class PacketGyroBlocks(Strict):
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)
     """Angles farther apart give no rate."""
     time: PacketTime | None = None
-    """Of the first sample; by default the time of the packet."""
+    """Time of the first sample; by default the time of the packet."""
     step_s: float | None = Field(default=None, gt=0, le=3600)
     """From each sample of a packet to the next."""
     time_offset_s: SlotNames | None = None
-    """In place of a step: of each sample, seconds after the time."""
+    """Alternative to `step`: the offset of each sample from the time, in seconds."""
     count: ParameterName | None = None
-    """So many samples, from the first, are in the packet."""
+    """Parameter with the number of samples, from the first, that are in the packet."""
     block_s: float = Field(default=600.0, ge=1, le=86400)
     """A block ends where so many seconds of TAI begin, so that the same samples make the same
     blocks, whichever file they are read from."""
@@ -294,11 +294,11 @@ class Packets(Strict):
     sequence_flags: Literal["segments", "groups"] = Field(
         default="segments", exclude_if=lambda meaning: meaning == "segments"
     )
-    """Whether they tell segments, which are joined, or group whole packets."""
+    """Meaning of sequence flags: segments, which are joined, or groups of whole packets."""
     segment_header_bytes: int = Field(
         default=0, ge=0, le=4096, exclude_if=lambda length: length == 0
     )
-    """Of the secondary header that segments after the first one repeat, and that is skipped."""
+    """Length of the secondary header that segments after the first repeat, and that is skipped."""
     apids: tuple[Annotated[int, Field(ge=0, le=2047)], ...] = ()
     """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
     time: PacketTime

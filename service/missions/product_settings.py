@@ -34,7 +34,7 @@ class ProductSettings(Strict):
 
     @property
     def names_gap(self) -> bool:
-        """Whether the mission file has the key `largest_gap_s`."""
+        """True if the mission file has the key `largest_gap_s`."""
         return "largest_gap_s" in self.model_fields_set
 
     @field_validator("sclk_kernel")

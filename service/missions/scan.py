@@ -19,7 +19,7 @@ from service.vectors import Matrix, read_only
 
 MOST_SAMPLES, MOST_WIRES, MOST_LINES = 1001, 16, 8192
 WIDEST_DEG = 89.0
-"""Of an angle from the boresight: its tangent is what a direction is made of."""
+"""Largest angle from the boresight: a direction is computed from its tangent."""
 
 
 def _odd(samples: int) -> int:
@@ -54,7 +54,7 @@ class CrossScan(_Detector):
 
     kind: Literal["cross"]
     samples: Annotated[int, Field(ge=3, le=MOST_SAMPLES), AfterValidator(_odd)]
-    """Of a line; the middle one is at the star's `h_deg`, `v_deg`."""
+    """Samples of a line; the middle one is at the star's `h_deg`, `v_deg`."""
     step_arcsec: float = Field(gt=0, le=3600)
     """From one sample to the next (T of the report)."""
 
@@ -69,9 +69,9 @@ class Sweep(Strict):
     start_deg: float = Field(gt=-89, lt=89)
     rate_deg_per_s: float = Field(gt=0, le=3600)
     duration_s: float = Field(gt=0, le=3600)
-    """Of either sweep; a later time is outside of the scan."""
+    """Duration of one sweep; a later time is outside of the scan."""
     time_unit_s: float = Field(default=1.0, gt=0, le=3600)
-    """Of the times in a batch: seconds for each unit of the tracker's clock."""
+    """Unit of the times in a batch: seconds for each unit of the tracker's clock."""
     time_sigma_s: float = Field(gt=0, le=3600)
     """One standard deviation of the time of one crossing."""
     wires_deg: Annotated[
@@ -95,7 +95,7 @@ class Sweep(Strict):
 
     @property
     def end_deg(self) -> float:
-        """Where the first wire is when a sweep ends."""
+        """Angle of the first wire when a sweep ends."""
         return self.start_deg + self.rate_deg_per_s * self.duration_s
 
 
@@ -133,7 +133,7 @@ Scan = Annotated[CrossScan | Sweep | Raster, Field(discriminator="kind")]
 
 
 class SunTracker(Strict):
-    """Where it looks in the body, and how its two signals grow with the sun's displacement.
+    """A sun tracker: its direction in the body, and its two signals by the Sun's displacement.
 
     A pair with the counts I+ and I- gives the signal (I+ - I-) / (I+ + I-); the first pair that
     of the displacement towards the tracker's +X, the second towards +Y.

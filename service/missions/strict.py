@@ -32,5 +32,5 @@ class Strict(BaseModel):
 
 
 def is_missing(table: object) -> bool:
-    """Whether a table was left out of the file: then it is no part of the mission's digest."""
+    """True if a table was left out of the file: it is then no part of the mission's digest."""
     return table is None

@@ -31,7 +31,7 @@ class PredictedPrior(QuaternionPrior, frozen=True, eq=False):
 
 
 class Tracking(Struct, frozen=True, eq=False):
-    """Of a batch that asks for the last attitude: what was predicted from, or why nothing was.
+    """Source of the prediction for a batch that asks for the last attitude, or why there is none.
 
     Without `result` and `reason` nothing was looked up yet.  The prediction itself is
     the batch's `a_priori`.
@@ -105,7 +105,7 @@ class TrackerStars(Struct, frozen=True, eq=False):
     time_offset_s: Vector
     sigma_arcsec: Vector
     readings: tuple[Readings | None, ...] = ()
-    """Of a scanning tracker, by star; or the one of a raster, whose stars are still to be found.
+    """Readings of a scanning tracker by star; or one raster, whose stars are not yet found.
 
     `service.observations.scans.reduce` makes angles of them.
     """

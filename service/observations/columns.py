@@ -65,7 +65,7 @@ class BatchColumns(Struct, frozen=True, eq=False, gc=False):
 
 
 def offsets_of(counts: Sequence[int]) -> Integers:
-    """Where each of some lists begins that stand one after another, and where the last ends."""
+    """First index of each of several concatenated lists, and the end of the last."""
     return np.array([0, *accumulate(counts)])
 
 

@@ -238,7 +238,7 @@ class SunPointedIn(Wire):
 
     sun_pointed: Literal[True]
     sun_counts: tuple[Count, Count, Count, Count] | None = None
-    """Of the mission's sun tracker: I+ and I- of the pair along its X, then along its Y."""
+    """Counts of the mission's sun tracker: I+ and I- of the pair along its X, then along its Y."""
     sun_vector: UnitVector | None = None
     position_km: Position | None = None
     frame: ReferenceFrame = "EME2000"
@@ -274,7 +274,7 @@ class PredictionIn(BaseModel):
     quaternion: tuple[Number, Number, Number, Number] | None = None
     """Inertial to body, scalar last."""
     covariance_arcsec2: PositiveDefinite | None = None
-    """Of the rotation about the body axes."""
+    """Covariance of the rotation about the body axes."""
     margin_deg: Annotated[Number, Field(gt=0, le=60)] | None = None
     """By which the zone reaches beyond the field of view."""
     result: Annotated[str, Field(max_length=26)] | None = None
@@ -457,7 +457,7 @@ class MeasurementIn(BaseModel):
     )
     """One sigma of the rotation about each of the same axes."""
     covariance_arcsec2: Annotated[PositiveDefinite, AfterValidator(_of_a_tracker)] | None = None
-    """Of the small rotation about the same axes, in place of the sigmas."""
+    """Covariance of the small rotation about the same axes, instead of the sigmas."""
     frame: ReferenceFrame = "EME2000"
 
     @model_validator(mode="after")

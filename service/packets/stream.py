@@ -121,7 +121,7 @@ class ApidCounts(Struct, kw_only=True):
     apid: int
     packets: int = 0
     described: bool = True
-    """Whether the XTCE file describes them."""
+    """True if the XTCE file describes packets of this APID."""
     gaps: int = 0
     """Places where the sequence count skips packets."""
     missing: int = 0

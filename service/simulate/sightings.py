@@ -74,7 +74,7 @@ class RealSky:
     component: Rows
     """Rows of the catalog, those of one star beside each other, in the run catalog's order."""
     first: Rows
-    """Where each star's components begin; one entry more than there are stars."""
+    """First row of each star's components, and the end of the last star's."""
     light: Vector
     """The light of each component, in the mission's instrument."""
     magnitude_mag: Vector

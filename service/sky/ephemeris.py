@@ -141,7 +141,7 @@ PLANETS = (
 
 @dataclass(frozen=True, eq=False)
 class PlanetPlace:
-    """Where a planet is seen: a unit vector (3,), ICRS, and the largest error of it."""
+    """Direction of a planet, a unit vector (3,), ICRS, and its largest error."""
 
     direction: Vector
     distance_au: float

@@ -26,7 +26,7 @@ MOST_BYTES = 1 << 30
 LINE = 64
 """Arrays begin with a line of the processor's caches."""
 _START = 2 * LINE
-"""Where the head begins: before it are the digest of all that follows, and the head's length."""
+"""Offset of the head, after the digest of all that follows and the length of the head."""
 _DIGEST = hashlib.sha256
 
 log = logging.getLogger(__name__)

@@ -53,7 +53,7 @@ class SkyModel:
     opens_files: bool = field(default=True, kw_only=True)
     """False: everything is built anew, as where what builds it is to be compiled."""
     waits: bool = field(default=True, kw_only=True)
-    """Whether it builds what is missing, or raises `NotAtHand` there."""
+    """True: the model builds what is missing; False: it raises `NotAtHand` instead."""
 
     def at_hand(self) -> "SkyModel":
         """The same sky for who must not wait: what takes long raises `NotAtHand`."""

@@ -45,7 +45,7 @@ _CLEAR = 1e-12
 
 
 class SearchRegion(Struct, frozen=True, eq=False, gc=False):
-    """Where to search: an exact axis (3,), inertial, and the bounds on the angle to it."""
+    """A region to search: an exact axis (3,), inertial, and the bounds on the angle to it."""
 
     kind: str
     axis: Vector
@@ -53,7 +53,7 @@ class SearchRegion(Struct, frozen=True, eq=False, gc=False):
     most_deg: float
 
     def reaches_past(self, boresight: Vector, radius_deg: float) -> bool:
-        """Whether a field of view about an inertial boresight goes beyond the bounds."""
+        """True if a field of view about an inertial boresight goes beyond the bounds."""
         angle = separation_deg(self.axis, boresight)
         return min(angle + radius_deg, 180.0) > self.most_deg or (
             self.least_deg > 0.0 and angle - radius_deg < self.least_deg
@@ -141,7 +141,7 @@ class Zone:
         )
 
     def serves_exactly(self, region: SearchRegion) -> bool:
-        """Whether the zone's stars are just those within a region."""
+        """True if the zone's stars are exactly those within a region."""
         own = self.region
         return own is region or (
             own.least_deg == region.least_deg

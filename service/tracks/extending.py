@@ -18,7 +18,7 @@ GATE = 16.0
 MOST_MISSED = 5
 """Batches in a row without a point, after which a motion is not followed on."""
 MOST_CHANCE = 0.2
-"""Where so many random points are expected within the gate, the next would be a guess."""
+"""Expected number of random points within the gate beyond which the next point would be a guess."""
 
 
 class Sightings(NamedTuple):

@@ -19,7 +19,7 @@ Angles = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class World:
-    """Where the zones of some tables lie, and how many make one experiment of the paper's size.
+    """Places of the zones of some tables, and the number that makes one experiment of the paper.
 
     A zone's axis is `axis_deg` (right ascension, declination), or the Sun's
     direction at one of `sun_dates`, or drawn over the sphere.

@@ -197,7 +197,7 @@ def most_telling(estimate: StateEstimate, rows: Array, variance: float) -> int:
 
 
 def best_order(rows: Array, variance: float, count: int, prior: Sequence[float] = PRIOR) -> Array:
-    """So many rows, each the one that tells most after those before; a row may come again."""
+    """Choose `count` rows, each the most informative after those before; a row may come again."""
     estimate, chosen = diffuse(prior), []
     for _ in range(count):
         chosen.append(most_telling(estimate, rows, variance))

@@ -175,6 +175,6 @@ class Advice(Record, frozen=True, kw_only=True):
     magnitudes: list[MagnitudeAdvice]
     alignment: list[AlignmentAdvice]
     innovations: list[InnovationAdvice]
-    """Of the period's days that `acquire smooth` recorded; empty without `[gyro]`."""
+    """Advice from the days that `acquire smooth` recorded; empty without `[gyro]`."""
     tried: list[Trial]
     changes: list[Change]

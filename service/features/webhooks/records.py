@@ -55,7 +55,7 @@ class Webhook(Record, frozen=True, kw_only=True):
     kinds: Annotated[list[EventKind] | None, doc("Only events of these kinds; null: of all.")]
     spacecraft: Annotated[list[str] | None, doc("Only events about these; null: about all.")]
     severity: SeverityName | None
-    """Of alarms only those that were at least as severe."""
+    """Least severity of the alarms that are sent; null: every alarm."""
     run: Annotated[str | None, doc("Only events of this run; null: of every run.")]
     enabled: bool
     state: WebhookStateName

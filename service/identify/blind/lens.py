@@ -20,11 +20,11 @@ CENTER_PRIOR = 0.03
 FREE_SCALE, SCALE_BEND, SCALE_CENTER = 4, 5, 7
 """Parameters fitted: rotation and focal length; with the distortion; with the centre too."""
 PARAMETERS = ("focal_px", "bend", "off_u", "off_v")
-"""Of a lens, in the order in which they are fitted."""
+"""Names of the parameters of a lens, in the order in which they are fitted."""
 _ROUNDS = 12
 _CONVERGED = 1e-8
 NEIGHBOURS = 3
-"""Of a star, whose residuals tell what errors they share."""
+"""Neighbours whose residuals estimate the correlated error of a star."""
 LEAST_RESIDUAL_PX = 0.05
 
 
@@ -51,7 +51,7 @@ class Lens:
 
     @property
     def center_px(self) -> tuple[float, float]:
-        """Where the optical axis meets the sensor; the first pixel's centre is (0, 0)."""
+        """The point where the optical axis meets the sensor; the first pixel's centre is (0, 0)."""
         return (
             0.5 * (self.width_px - 1) + self.off_u * self.radius_px,
             0.5 * (self.height_px - 1) + self.off_v * self.radius_px,
@@ -71,7 +71,7 @@ class Lens:
         return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
-        """Where directions (n, 3) fall; NaN for those behind or far outside the picture."""
+        """Pixels of directions (n, 3); NaN for those behind or far outside the picture."""
         with np.errstate(divide="ignore", invalid="ignore"):
             x = np.where(directions[:, 2] > 0.0, directions[:, 0] / directions[:, 2], np.nan)
             y = np.where(directions[:, 2] > 0.0, directions[:, 1] / directions[:, 2], np.nan)

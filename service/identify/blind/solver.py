@@ -32,7 +32,7 @@ ACCEPT_LOG_ODDS = 14.0
 SURE_LOG_ODDS = 30.0
 """The search ends at once."""
 STAGES = ((8, 0.02), (12, 0.02), (16, 0.025), (10, 0.05), (22, 0.025))
-"""Of how many of the likeliest points patterns are made, and how near a code must come."""
+"""For each stage: the number of likeliest points that make patterns, and the tolerance of codes."""
 NARROW_TAN = 0.25
 """Half diagonals up to this are looked at as if of one focal length: patterns keep their shape."""
 WIDE_STEP = 1.3
@@ -40,7 +40,7 @@ WIDE_STEP = 1.3
 VERIFIED_POINTS = 40
 COARSE_POINTS = 24
 COARSE_GATE = 0.02
-"""Of the half diagonal: within this a match counts before the lens is fitted."""
+"""Tolerance of a match before the lens is fitted, as a share of the half diagonal."""
 LIKELY_CHANCE = 0.1
 """Matches beside the pattern that chance gives more often than this are not looked at further."""
 MOST_HITS = 20_000
@@ -67,7 +67,7 @@ class FocalRange:
 
     @classmethod
     def of_fields(cls, side_px: int, field_deg: tuple[float, float]) -> "FocalRange":
-        """That of a range of fields of view along a side."""
+        """The focal lengths that belong to a range of fields of view along a side."""
         least, most = (focal_px_of(side_px, deg) for deg in field_deg[::-1])
         return cls(least, most)
 

@@ -1,4 +1,4 @@
-"""Whether the stars of the catalog stand where an attitude and a lens have them: the evidence."""
+"""The evidence for an attitude and a lens: catalog stars that stand where the two predict them."""
 
 import math
 from dataclasses import dataclass, field, replace

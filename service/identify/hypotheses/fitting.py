@@ -17,7 +17,7 @@ from service.identify.sighting import PRIOR_ROTATION
 from service.sky.geometry.directions import separation_rad
 
 LEAST_SINE2 = 4e-10
-"""Of the angle between the widest pair, four times its squared sine: 2 arcsec."""
+"""Least value of four times the squared sine of the angle between the widest pair: 2 arcsec."""
 
 
 @njit_inlined
@@ -106,7 +106,7 @@ def work_of_fit(n, matched):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _determinant(m):  # type: ignore[no-untyped-def]
-    """Of a symmetric (3, 3)."""
+    """The determinant of a symmetric matrix (3, 3)."""
     return (
         m[0, 0] * (m[1, 1] * m[2, 2] - m[1, 2] ** 2)
         - m[0, 1] * (m[0, 1] * m[2, 2] - m[1, 2] * m[0, 2])

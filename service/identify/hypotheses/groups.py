@@ -42,7 +42,7 @@ _UNMATCHED, _UNIQUE, _AMBIGUOUS = (int(outcome) for outcome in Outcome)
 
 
 def may_be_a_group(masks: Sequence[Mask]) -> bool:
-    """Whether any tracker has so many of these stars that they may have an attitude."""
+    """True if any tracker has enough of the masked stars for an attitude."""
     return any(int(mask.sum()) >= LEAST_GROUP for mask in masks)
 
 

@@ -13,14 +13,14 @@ from service.vectors import Vector
 FEW = 32
 """Hypotheses that are looked through one by one; of more there is a table by hash."""
 LEAST_GROUP = 3
-"""So many stars that one attitude leaves unexplained may have another attitude of their own."""
+"""Least number of unexplained stars for which a second attitude is searched."""
 RIVAL_PROBABILITY = 1e-3
 """A star at least this likely is named among the rivals of one that is not unique."""
 
 
 @njit_inlined
 def known(match, ledger, count):  # type: ignore[no-untyped-def]
-    """Whether the ledger, of so many hypotheses, holds this one."""
+    """True if the ledger, which has `count` hypotheses, holds this match."""
     if count <= FEW:
         for h in range(count):  # noqa: SIM110 - compiled, without a generator
             if _same(match, ledger, h):
@@ -37,7 +37,7 @@ def known(match, ledger, count):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _same(match, ledger, h):  # type: ignore[no-untyped-def]
-    """Whether hypothesis h of the ledger names the same stars."""
+    """True if hypothesis h of the ledger names the same stars as a match."""
     for k in range(len(match)):  # noqa: SIM110 - compiled, without a generator
         if ledger.match[h, k] != match[k]:
             return False
@@ -65,7 +65,7 @@ def _enter(ledger, h):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def is_part(match, whole):  # type: ignore[no-untyped-def]
-    """Whether every star of a match is the same in another."""
+    """True if every star of a match is the same in another match."""
     apart = 0
     for k in range(len(match)):
         apart += match[k] >= 0 and match[k] != whole[k]
@@ -74,7 +74,7 @@ def is_part(match, whole):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def leaves_a_group(match):  # type: ignore[no-untyped-def]
-    """Whether a match leaves so many stars unexplained that another attitude may explain them.
+    """True if a match leaves enough stars unexplained for another attitude to explain them.
 
     A reflection doubles every star, and a slew halves them: chance explains
     neither half, so that the first hypothesis beyond chance is not the only one.
@@ -130,7 +130,7 @@ def spent(progress, work):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def at_bound(progress):  # type: ignore[no-untyped-def]
-    """Whether the search has done all the work that it may."""
+    """True if the search has done all the work that its budget allows."""
     return progress.work >= progress.max_work
 
 

@@ -89,7 +89,7 @@ def _keep_best(match, value, ledger, progress):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _names(match, row):  # type: ignore[no-untyped-def]
-    """Whether a match has this zone star."""
+    """True if a match names a zone star."""
     for one in match:  # noqa: SIM110 - compiled, without a generator
         if one == row:
             return True
@@ -98,7 +98,7 @@ def _names(match, row):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _neighbours_are_rare(observed, stars):  # type: ignore[no-untyped-def]
-    """Whether chance hardly ever puts a star of the zone within the widest scale of noise.
+    """True if chance hardly ever puts a star of the zone within the widest scale of noise.
 
     Its probability is rho 2 pi s^2; where that is as rare as e^-6, the hypothesis
     without a star that sits well weighs less than about e^-8 of the one with it.
@@ -109,7 +109,7 @@ def _neighbours_are_rare(observed, stars):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True, inline="always")
 def _sits_well(observed, stars, match, k, scratch):  # type: ignore[no-untyped-def]
-    """Whether a star fits so well, in place and magnitude, that it can hardly be clutter."""
+    """True if a star fits so well, in place and magnitude, that it can hardly be clutter."""
     # False where there is no magnitude, as with any comparison with NaN.
     if abs(observed.magnitude[k] - stars.magnitude[match[k]]) > NEAR_MAG:
         return False

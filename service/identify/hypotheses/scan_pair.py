@@ -27,7 +27,7 @@ from service.identify.sighting import PRIOR_DIRECTION
 from service.sky.geometry.star_hashes import level_for, nearest, star_within_reach
 
 MAX_THIRDS = 8
-"""So many stars, those that a pair fixes best, are tried with it where all together do not fit."""
+"""Stars tried one by one with a pair if all together do not fit: those that the pair fixes best."""
 AGREEING_TILT_RAD = math.radians(3.0)
 """Pairs whose difference of angles to a presumed axis a tilt so small explains go first."""
 INITIAL_SLACK = 12.0
@@ -274,7 +274,7 @@ def _test(scratch, others, at):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _missing(voxels, test, u0, u1, u2, v0, v1, v2, w0, w1, w2):  # type: ignore[no-untyped-def]
-    """Whether, 0 or 1, no star can stand where a pair u, v with the product w predicts one."""
+    """1 if no star can stand where a pair u, v with the product w predicts one, else 0."""
     alpha, beta, gamma, level = test
     if level < 0:
         return 0

@@ -252,7 +252,7 @@ def with_magnitude(observed):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def within_bounds(row, stars):  # type: ignore[no-untyped-def]
-    """Whether a zone star lies within the exact bounds."""
+    """True if a zone star lies within the exact bounds."""
     if stars.polar[row] < 0.0:
         stars.polar[row] = separation_rad(stars.direction[row], stars.axis)
     return stars.least <= stars.polar[row] <= stars.most

@@ -52,7 +52,7 @@ And only where it leaves so few stars unexplained that no other attitude can
 explain them: see `leaves_a_group`.
 """
 LARGEST_LOG = 1e5
-"""In the place of an infinite log weight."""
+"""A finite stand-in for an infinite log weight."""
 CONVERGED_LOG = 10.0
 """Exhaustive, stop once all that was not seen is lighter than the best by this, in logarithms."""
 
@@ -167,7 +167,7 @@ def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _is_brighter(one, other):  # type: ignore[no-untyped-def]
-    """Whether one magnitude comes before another; NaN comes last."""
+    """True if one magnitude comes before another; NaN comes last."""
     return one < other or (math.isnan(other) and not math.isnan(one))
 
 

@@ -55,7 +55,7 @@ def decide(ledger, count):  # type: ignore[no-untyped-def]
 def star_probabilities(  # type: ignore[no-untyped-def]
     points, index, field, magnitude_gate, t, covariance, match, doubt
 ):
-    """Of every point its likeliest star, the probability of that and of no star, and the next star.
+    """For each point: its likeliest star, that one's probability, that of none, the second star.
 
     A point may be its match, the second star near its place, or clutter, which
     is as dense as the points left unexplained.  `doubt` is the probability that

@@ -29,7 +29,7 @@ AT_REST = np.zeros(3)
 COLOR_SIGMA_MAG = 0.3
 """What a magnitude is off by beside its noise: colour, and stars that vary."""
 FEW_MATCHES, LARGEST_SCATTER_MAG = 4, 1.0
-"""So few stars found without their magnitudes must have about the same offset of magnitude.
+"""Up to so many matches without magnitudes, their offsets of magnitude scatter by less.
 
 Otherwise chance gives three random points an attitude in 1 of 15,000 batches.  It is twice the
 noise of a tracker with poor photometry: half as much refuses real fields of four stars.
@@ -182,7 +182,7 @@ def _magnitude_offsets(result: LostInSpaceResult, magnitude_mag: Vector, index: 
 def _without_magnitudes(
     corrected: Sequence[CorrectedObservations],
 ) -> tuple[CorrectedObservations, ...]:
-    """Of every tracker: what one of them adds to its magnitudes, others may as well."""
+    """Corrected observations of all trackers; trackers may share a magnitude offset."""
     return tuple(
         # Locked, as those of a batch are: for others numba would compile every kernel anew.
         replace(each, magnitude_mag=read_only(np.full(len(each.magnitude_mag), math.nan)))

@@ -12,21 +12,21 @@ from service.sky.whole_sky.index import BRIGHTEST_MAG, BUCKET_RAD, STEP_MAG
 LEAST_PAIR_RAD = 0.006
 """A shorter pair fixes the turn about itself too poorly to predict anything."""
 TYPICAL_REACH_RAD = 0.07
-"""Where the other points of a field lie."""
+"""Typical distance of the other points of a field from a pair."""
 CHORD_OF_LONGEST = 0.999
 """The chord of 8 degrees over its arc, less a little."""
 CELL_RAD = 2.5e-3
 """What a bitmap's cell adds to the place of a star."""
 EXACT_COST = 2.0
-"""Of holding a candidate against the exact place of one more point, in candidates."""
+"""Cost of comparing a candidate with the exact place of one more point, in candidates."""
 PRIOR_COST = 40.0
-"""Of trying a pair at all, in candidates."""
+"""Fixed cost of trying a pair, in units of one candidate."""
 RANK_COST = 0.15
 """A pair of fainter points is less sure to be two stars of the index."""
 USE_COST = 3.0
 """Each failed try of a point makes it this much less attractive."""
 MOST_BEYOND = 0.9
-"""Of a point fainter than the limit.  None is given up: magnitudes may be off together."""
+"""Bound on the probability that a point is too faint; below 1: magnitudes may share an offset."""
 SURELY_WITHIN = 5.0
 """Sigmas by which a point is brighter than the limit, so that it is none from beyond."""
 NO_ROW = 1 << 16

@@ -54,7 +54,7 @@ LOG_MISSING = np.array(
 CROWDED = 2.3
 """Some of the points may lie closer together than all, and their attitude be so much less known."""
 ALWAYS_ENOUGH = 4
-"""So many matched points are never ruled out beforehand."""
+"""Number of matched points from which a candidate is never ruled out beforehand."""
 _LOG_2PI = math.log(2.0 * math.pi)
 _LOG_ROTATIONS = math.log(8.0 * math.pi**2)
 
@@ -139,14 +139,14 @@ def log_labels(points, matched):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def log_any_share(matched, expected):  # type: ignore[no-untyped-def]
-    """That just these of the stars are seen, where any share is as likely as any other."""
+    """Log probability of the set of stars that are seen, if every share seen is equally likely."""
     expected = min(expected, len(LOG_FACTORIAL) - 2)
     return LOG_FACTORIAL[matched] + LOG_FACTORIAL[expected - matched] - LOG_FACTORIAL[expected + 1]
 
 
 @njit(nogil=True)
 def log_missing(brighter_by_sigma):  # type: ignore[no-untyped-def]
-    """That a star brighter than the limit by so many sigmas is not seen in a complete field."""
+    """Log probability that a star this much brighter than the limit is missing."""
     at = int((brighter_by_sigma + MISSING_REACH) * MISSING_STEPS + 0.5)
     return LOG_MISSING[min(max(at, 0), len(LOG_MISSING) - 1)]
 

@@ -41,14 +41,14 @@ from service.identify.lost_in_space.workspace import (
 from service.sky.whole_sky.index import BITMAP_RADII_RAD
 
 FIRST_POINTS = 7
-"""Of many points pairs are made of the brightest first, later of `MOST_POINTS`."""
+"""Brightest points that make the first pairs of a field of many; later pairs take `MOST_POINTS`."""
 FIRST_TRIES = 3
 """Pairs tried for being cheap, before those that every attitude must have one of."""
 NARROW_GATE, NARROW_MAG = 2.8, 0.75
 """First tries look less far: sigmas of a separation, and a share of the gate of magnitudes.
 One in fifty true pairs is missed for half the work.  Of few points all is tried again in full."""
 FEW_POINTS, MOST_FIRST = 6, 4
-"""Of so few points a candidate is first held against all others; of more against three."""
+"""Up to `FEW_POINTS` points, a candidate is first compared with all others; beyond, with three."""
 PREFILTERED_IN_TURN = 6
 """Points of which three at a time are the first that a candidate is held against.
 Later all are: the most telling are bright, and the bright ones may all be no stars."""

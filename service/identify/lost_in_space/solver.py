@@ -59,7 +59,7 @@ class FieldOfView:
 
     radius_deg: float
     half_width_deg: float | None = None
-    """Of a square field; `radius_deg` is then that of its corners."""
+    """Half the side of a square field, to whose corners `radius_deg` goes; None: a round one."""
     limit_mag: float = math.nan
     magnitude_sigma_mag: float = 0.5
 
@@ -100,7 +100,7 @@ class LostInSpaceResult(NamedTuple):
     star: Rows
     """(n,) rows of the index, -1 for a point that no star explains."""
     log_odds: float
-    """Of the attitude against all other explanations."""
+    """Natural logarithm of the odds of the attitude against all other explanations."""
     matched: int
     work: int
     """Candidates looked at."""
@@ -119,7 +119,7 @@ class LostInSpaceResult(NamedTuple):
 
 
 class StarChances(NamedTuple):
-    """Of every point the likeliest star (-1: none), its probability, that of none, the next."""
+    """For each point: likeliest star (-1: none), its probability, that of none, second star."""
 
     star: Rows
     probability: Vector

@@ -163,7 +163,7 @@ class PointPairs(NamedTuple):
 
 
 class Prefilter(NamedTuple):
-    """Of one pair of points what the others are looked for with.
+    """Arrays with which one pair of points predicts the places of the other points.
 
     For every point the `coefficients` (n, 3) of its place and its `gate` (n,); `order`
     (n,): the most telling first, by `cost` (n,).  By rank in that order: the

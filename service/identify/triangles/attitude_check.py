@@ -28,9 +28,9 @@ FIRST_GATE = 2.0
 ALLOWED_CHANCE = 1e-4
 """How often chance may be expected to do as well, anywhere in the sky; see `log_chance`."""
 LEAST_SHARE = 0.3
-"""Of the observed stars so many must be matched."""
+"""Least share of the observed stars that must be matched."""
 LEAST_WIDTH_SIGMAS = 8.0
-"""Of the stars' scatter about a line: in a straight row nothing tells a sky from its mirror."""
+"""Least scatter of stars about a line, in sigmas: in a row they do not exclude a mirrored sky."""
 LEAST_ODDS = 1e3
 """The best attitude must be so many times less likely by chance than the best other one."""
 CERTAIN_CHANCE = 1e-12
@@ -123,7 +123,7 @@ def check_attitude(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _is_same(match, other):  # type: ignore[no-untyped-def]
-    """Whether two attitudes name the same stars: half of those that either names, or more."""
+    """True if two attitudes share at least half of the stars that either names."""
     same = named = 0
     for k in range(len(match)):
         if match[k] >= 0 or other[k] >= 0:
@@ -163,7 +163,7 @@ def _group(observed, stars, speed, pair_image, pair_star, seed, members):  # typ
 
 @njit(nogil=True)
 def _agree(observed, stars, speed, i, j, a, b):  # type: ignore[no-untyped-def]
-    """Whether observed stars i and j are as far apart as catalog stars a and b; by chords."""
+    """True if observed stars i and j are as far apart as catalog stars a and b; by chords."""
     if i == j or a == b:
         return False
     apart2 = should2 = 0.0
@@ -254,7 +254,7 @@ def _lay(observed, stars, t, gate, match, rival):  # type: ignore[no-untyped-def
 
 @njit(nogil=True)
 def _is_right_handed(observed, match, t, references):  # type: ignore[no-untyped-def]
-    """Whether every matched star lies where the attitude has it, and their shape tells a mirror.
+    """True if matched stars lie where the attitude predicts, and their shape excludes a mirror.
 
     Their scatter about the best line through them must be wider than the noise.
     """

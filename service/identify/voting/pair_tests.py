@@ -26,7 +26,7 @@ _SINGLE = 1e-6
 _ROUNDING = 1e-14
 
 REJECTED = 2
-"""In the place of an order: a test rejects the candidate."""
+"""The value returned instead of an order if a test rejects the candidate."""
 
 
 class Rulebook(NamedTuple):
@@ -257,7 +257,7 @@ def _order_by_cross_product(pair, a, b, cross_square, order):  # type: ignore[no
 
 @njit_inlined
 def _order_by_rotation(sighted, bounds, tolerance, pair, star, a, b, order):  # type: ignore[no-untyped-def]
-    """Of both orders, where nothing told one, the one that turns the field little."""
+    """Choose the order of a pair that rotates the field little, if no earlier test chose one."""
     first, second = sighted.direction[pair.i], sighted.direction[pair.j]
     boresight, axis, is_band = sighted.boresight, bounds.axis, bounds.is_band
     along, against = order >= 0, order <= 0
@@ -295,7 +295,7 @@ def _count_up(ballots, i, row):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def tallies_of(found, first, last):  # type: ignore[no-untyped-def]
-    """Where the tallies of the stars from `first` to before `last` stand in `IdentifiedColumns`."""
+    """Rows of `IdentifiedColumns` with the tallies of the stars from `first` to before `last`."""
     return Tallies(
         outcome=found.outcome[first:last],
         star=found.star[first:last],

@@ -1,4 +1,4 @@
-"""Where a star stands on the sensor, by any of four methods that give the same record.
+"""The position of a star on the sensor, by any of four methods that give the same record.
 
 | method | what it is | report |
 |---|---|---|

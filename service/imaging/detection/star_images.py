@@ -156,7 +156,7 @@ class TrailPsf:
 
     @property
     def fwhm_px(self) -> float:
-        """That of the still image with the trail's length, as standard deviations add."""
+        """The widths of the still image and of the trail, added in quadrature."""
         # An even stretch of length l has the variance l^2 / 12.
         spread = math.hypot(self.trail_u_px, self.trail_v_px) / math.sqrt(12.0)
         return math.hypot(self.psf.fwhm_px, 2.0 * math.sqrt(2.0 * math.log(2.0)) * spread)

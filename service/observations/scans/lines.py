@@ -59,7 +59,7 @@ class ScanResult:
 
     @property
     def refused(self) -> bool:
-        """Whether the scan held too little light to have a variance at all (7.30)."""
+        """True if the scan held too little light to have a variance (7.30)."""
         return math.isnan(self.displacement)
 
 

@@ -19,7 +19,7 @@ SAME_LIGHT_SIGMAS = 4.0
 SAME_LIGHT_SHARE = 0.02
 """Light differs by no more between columns and rows: each moment cuts off its own tails."""
 NOISE_SIGMAS = 2.0
-"""Of a difference of light that noise alone makes often enough."""
+"""Difference of light, in sigmas, that noise alone often makes."""
 
 
 class LinePlace(NamedTuple):

@@ -57,7 +57,7 @@ class RunCatalog:
     dec_deg: Vector
     """ICRS at the epoch.  These numbers are exported, and `direction` is computed from them."""
     motion: Vector
-    """Of the directions in a Julian year (N, 3), in radians; of merged stars the light's."""
+    """Change of the directions in a Julian year (N, 3), radians; the light's for merged stars."""
     parallax_rad: Vector
     """Zero where it is not known, or was measured below zero."""
     magnitude_mag: Vector
@@ -66,7 +66,7 @@ class RunCatalog:
     star_id: tuple[str, ...]
     rejected: tuple[Rejection, ...]
     digest: str
-    """Of the exported numbers and the epoch, "sha256:…"."""
+    """Digest of the exported numbers and the epoch, "sha256:…"."""
 
     def __len__(self) -> int:
         return len(self.star_id)

@@ -108,7 +108,7 @@ class Read:
 
 
 def is_sky2000(path: Path) -> bool:
-    """Whether a file begins as such a catalog does, compressed or not."""
+    """True if a file begins as a SKY2000 catalog does, compressed or not."""
     try:
         with _opened(path) as file:
             return file.read(len(DESIGNATION)) == DESIGNATION

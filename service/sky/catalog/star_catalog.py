@@ -48,7 +48,7 @@ class Catalog:
 
     name: str
     digest: str
-    """Of the bytes of the file that the catalog was read from, "sha256:…"."""
+    """Digest of the file that the catalog was read from, "sha256:…"."""
     ra_deg: Vector
     dec_deg: Vector
     pm_ra_mas_per_year: Vector

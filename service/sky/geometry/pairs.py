@@ -19,7 +19,7 @@ Indices = npt.NDArray[np.int32]
 
 PAIRS_PER_BIN = 4
 PARTS = 4
-"""Of a bin, into which pairs are counted to be sorted."""
+"""Parts of a bin, into which pairs are counted to be sorted."""
 MAX_IN_PART = 64
 MAX_CUBES = 64
 """Along an edge of the cube about the sphere."""

@@ -28,7 +28,7 @@ LINE = 64
 HEAD_WORDS = 64
 """The head of the block, three words an array."""
 FIRST, LAST, ROWS = 0, 1, 2
-"""Of each array in the head: its first byte, the one past its last, and its rows."""
+"""The words of an array in the head: its first byte, the byte after its last, and its rows."""
 
 StoreBytes = npt.NDArray[np.uint8]
 Form = tuple[str, Sequence[int]]
@@ -75,7 +75,7 @@ PATCHES = 24
 PATCH_RADIUS_RAD = math.sqrt(2.0) / PATCHES
 """From the middle of a patch to its corners, at most: that of the largest, at a face's middle."""
 BRIGHTEST_MAG, STEP_MAG = -2.0, 0.05
-"""Where the table of rows by magnitude begins, and its steps."""
+"""First magnitude of the table of rows by magnitude, and its steps."""
 MAX_STARS = 60_000
 """Rows are kept in 16 bits."""
 MAX_PAIRS = 1_500_000
@@ -270,7 +270,7 @@ def _column(store, head, at, dtype):  # type: ignore[no-untyped-def]
 def _patches(
     direction: Vector, radius_deg: float
 ) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.uint16]]:
-    """Of every patch of the sky the stars that a field of view with its boresight there holds."""
+    """For each patch of the sky: the stars of any field of view with its boresight there."""
     least = math.cos(min(math.radians(radius_deg) + PATCH_RADIUS_RAD, math.pi))
     middle = (np.arange(PATCHES) + 0.5) * 2.0 / PATCHES - 1.0
     start, rows = [0], []

@@ -23,9 +23,9 @@ The narrowest, the dearest to build, is looked at last."""
 DEEPEST_RANK = 8
 """A star of a level has fewer brighter ones than this in the cap about it."""
 COMPANIONS = 5
-"""Of each star's cap so many of the brightest make patterns with it."""
+"""Brightest stars of each star's cap that make patterns with it."""
 LEAST_WIDTH = 0.6
-"""Of a level's radius: narrower patterns belong to the level below."""
+"""Least width of a pattern, as a share of the level's radius; the level below has narrower ones."""
 _PAIRS = np.array(list(combinations(range(4), 2)))
 _OTHERS = np.array([[k for k in range(4) if k not in pair] for pair in _PAIRS.tolist()])
 

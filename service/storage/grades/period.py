@@ -38,7 +38,7 @@ from service.times import DAY_S, Utc, shifted
 PARTS = 600
 """The parts of a period, of each of which one sample is kept: as many as a chart shows."""
 MOST_BLOCKS = 48
-"""That are read of each grade: two days at 1 Hz.  Of a longer period they are spread evenly."""
+"""Blocks read for each grade: two days at 1 Hz; spread evenly over a longer period."""
 MOST_DAYS = 40
 _SEVERITY = {Status.NONE: 3, Status.LOST: 3, Status.DOUBTFUL: 2, Status.STARTING: 1}
 

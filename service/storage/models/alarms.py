@@ -30,7 +30,7 @@ class Limit(Record, frozen=True, kw_only=True):
     tracker: Annotated[str | None, doc("null: of the spacecraft as a whole.")] = None
     unit: str
     is_default: bool
-    """Whether this is the shipped limit; of a tracker, that of its spacecraft."""
+    """True if this is the shipped limit; for a tracker, if it is the limit of its spacecraft."""
     since: Annotated[Stamp | None, doc("null: it was never changed.")]
     who: str | None
     comment: str | None

@@ -37,7 +37,7 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     quaternion: ContinuousQuaternion
     covariance_arcsec2: Covariance
     rate_deg_per_s: Components | None
-    """Of the body relative to inertial, in body axes; null: unknown."""
+    """Rate of the body relative to inertial space, in body axes; null: unknown."""
     rate_origin: Literal["own", "derived", "estimated", "none"]
     """`own`: of the batch. `derived`: from the attitudes before and after. `estimated`: by the
     filter."""
@@ -56,7 +56,7 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     """What the filter knows of the motion: the rates of a gyro, or that the rate is constant but
     for a random walk. Absent if the grade is `raw`."""
     revision: int | UnsetType = UNSET
-    """Of the day's attitudes, from 1. Absent if the grade is `raw`."""
+    """Number of the revision of the day's attitudes, from 1. Absent if the grade is `raw`."""
     bias_deg_per_h: Components | UnsetType | None = UNSET
     """Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is `raw`."""
     bias_sigma_deg_per_h: Components | UnsetType = UNSET
@@ -101,7 +101,7 @@ class Innovation(Record, frozen=True, kw_only=True):
     innovation_sigma_arcsec: Components | None
     """One sigma of prediction and measurement together."""
     chi_square: float | None
-    """Of the innovation, with three degrees of freedom: 3 on average."""
+    """Chi-square of the innovation, with three degrees of freedom: 3 on average."""
     difference_arcsec: Components
     """From the smoothed attitude to the measured one, about the body axes."""
     difference_sigma_arcsec: Components

@@ -192,7 +192,7 @@ class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
 
     times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
     rates_rad_per_s: list[Components]
-    """Of each sample, as it was sent: about the three axes of the mission's gyro."""
+    """Rates of each sample, as they were sent: about the three axes of the mission's gyro."""
 
 
 Shares = list[float]

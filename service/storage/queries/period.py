@@ -85,7 +85,7 @@ class TrackerStarsOfPeriod:
     observed_mag: Vector
     catalog_mag: Vector
     region: SearchRegion | None
-    """Where the stars of the latest batch were searched for."""
+    """The region in which the stars of the latest batch were searched for."""
 
 
 @dataclass(frozen=True, eq=False)

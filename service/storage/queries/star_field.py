@@ -29,7 +29,7 @@ from service.vectors import Matrix, Vector, read_only
 MARGIN = 1.25
 """How far beyond the field of view stars are given, in fields of view."""
 WIDEST_DEG = 15.0
-"""Where stars of the answer lie far outside, the picture grows, but no further than this."""
+"""Largest extent of the picture, which grows if stars of the answer lie far outside."""
 EDGE_STEP_DEG = 0.5
 
 

@@ -10,7 +10,7 @@ from service.storage.sql.columns import CURRENT, Digest, Id, Moment, Name, RunNa
 from service.storage.sql.tables import runs
 
 INNOVATIONS = "innovations"
-"""In the place of a grade: the block has measurements, as they met the filter."""
+"""The value stored instead of a grade: the block has measurements, as they met the filter."""
 
 graded_days = sa.Table(
     "graded_days",

@@ -25,14 +25,14 @@ log = logging.getLogger(__name__)
 
 @router.serves("GET /livez", Returns("Alive.", media_type=TEXT))
 async def livez(app: AppDep) -> Response:
-    """Whether the process answers, and works on what is submitted."""
+    """Tell that the process answers and works on what is submitted."""
     app.submissions.require_alive()
     return PlainTextResponse("alive\n")
 
 
 @router.serves("GET /readyz", Returns("Ready.", media_type=TEXT), problems=(503,))
 async def readyz(request: Request, app: AppDep) -> Response:
-    """Whether the service is ready: catalog loaded, database reachable, last write succeeded."""
+    """Tell that the service is ready: catalog loaded, database reachable, last write succeeded."""
     state = request.app.state
     if getattr(state, "getting_ready", None) is None or state.getting_ready.done():
         # A thread apart from those of handlers, which may all be busy; one for all probes:

@@ -58,7 +58,7 @@ class ForgetIn(Wire):
 
 
 class _ReplayQuery(Query):
-    """Where the batches of a replay go, and what an archive of packets belongs to."""
+    """The run that a replay records into, and the spacecraft of an archive of packets."""
 
     run: Annotated[
         RunName, Field(description="The run for every batch, in place of the batch's own.")

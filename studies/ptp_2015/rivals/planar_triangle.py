@@ -25,7 +25,7 @@ from studies.ptp_2015.rivals.proposed import Proposed
 SIDE_MAX_DEG = 10.0
 """The longest side, that of the field of view."""
 BRIGHTEST = 20
-"""Of a field so many stars are made triangles of."""
+"""Brightest stars of a field that make triangles."""
 MAX_BASES, MAX_PIVOTS = 30, 40
 MAX_CANDIDATES = 100_000
 

@@ -127,7 +127,7 @@ def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _fits(field, i, j, a, b):  # type: ignore[no-untyped-def]
-    """Whether stars a and b are as far apart as observed i and j."""
+    """True if stars a and b are as far apart as observed i and j."""
     off = separation_rad(field.direction[i], field.direction[j]) - separation_rad(a, b)
     return abs(off) <= SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
 
@@ -174,7 +174,7 @@ def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ignore[no-untyped-def]
-    """Whether the fourth star confirms one candidate alone, which goes to `image` and `star`."""
+    """True if the fourth star confirms one candidate alone, written to `image` and `star`."""
     i, j, k, r = four
     direction = pairs.direction
     _chain(field, i, r, pairs, chains)

@@ -43,7 +43,7 @@ class Histogram:
     above: int
     median: float
     robust_spread: float
-    """That of a normal distribution with the same median absolute deviation."""
+    """Sigma of a normal distribution with the same median absolute deviation."""
     mean: float
     spread: float
     """The standard deviation; 1 where the sigmas are right."""

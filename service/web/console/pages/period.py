@@ -38,7 +38,7 @@ class TrackerCharts:
     "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
 )
 def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Where each tracker looked, how well its stars fit, and how the spacecraft turned."""
+    """Pointing of each tracker, fit of its stars, and rates of the spacecraft."""
     mission = context.app.context.mission(name)
     retired = context.app.context.retired.trackers.get(name, ())
     if query.tracker is not None and query.tracker not in retired:

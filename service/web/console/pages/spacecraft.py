@@ -77,7 +77,7 @@ class SpacecraftQuery(PageQuery):
     by: RankedName | None = None
     tracker: Key | None = None
     until: Literal["latest", "now"] = "latest"
-    """Where a range of live batches ends."""
+    """The end of a range of live batches: the latest batch, or now."""
     y: Vertical = "robust"
     beside: list[Annotated[str, Field(max_length=300)]] = Field(default_factory=list)
     """Other spacecraft in the same charts; one text may name several, with commas between them."""
