@@ -18,7 +18,7 @@ BENCH_ARGS ?=
 # Of `make mutants`: e.g. "--seed 2 --suite sitting"; --help says more
 MUTANTS_ARGS ?=
 # What comes to the database only after it was checked, or in a browser, is the same over both
-ALL_OVER_POSTGRESQL = tests/web \
+ALL_OVER_POSTGRESQL = tests/web tests/features \
 	$(addprefix --ignore tests/web/test_,bad_input.py any_input.py console_in_browser.py)
 # What asks the database in a way of its own.
 SITTING_OVER_POSTGRESQL = $(addprefix tests/web/test_,batches.py bulk.py events.py history.py \

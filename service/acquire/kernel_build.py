@@ -54,7 +54,7 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Identifiers that search the whole sky."""
     beside_batches: bool
-    """Whether it compiles what no batch needs: links of points, filter, pictures."""
+    """True if it compiles what no batch needs: links of points, filter, pictures."""
 
 
 class KernelBuild:

@@ -119,7 +119,7 @@ class IngestQueue:
         counts: "RecordedCounts",
         adoptions: Adoptions | None = None,
     ) -> None:
-        """Where services share a database, `adoptions` are followed before each group."""
+        """`adoptions`, of services that share a database, are followed before each group."""
         self._solver, self._store, self._pool = solver, store, pool
         self._counts = counts
         self._adoptions = adoptions if store.lock is not None else None

@@ -16,15 +16,15 @@ from service.imaging.frames.frame import CountArray
 from service.vectors import Vector
 
 LEVEL_SHARE = 0.94
-"""Of the largest count; compression rounds the flat tops of discs."""
+"""Level of a flat top, as a share of the largest count: compression rounds the tops of discs."""
 LEAST_PIXELS, LEAST_DISCS = 6, 8
 """The pixels of a disc, and the discs from which a picture counts as stretched: a camera cuts off
 a few bright stars."""
 MOST_DISCS = 300
 MOST_SHARE = 0.2
-"""Of all pixels; more is the sky itself."""
+"""Largest share of all pixels in flat tops; more is the sky itself."""
 MOST_RADIUS_SHARE = 0.03
-"""Of the shorter side; what is larger is no star."""
+"""Largest radius of a disc, as a share of the shorter side; a larger one is no star."""
 MOST_STRETCH = 2.5
 """The longer side of a disc over the width of a round one."""
 FLANK_PX = 3.0

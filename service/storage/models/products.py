@@ -77,7 +77,7 @@ class AttitudeAtMoment(Record, frozen=True, kw_only=True):
     method: Literal["nearest", "interpolated"]
     quaternion: ContinuousQuaternion
     covariance_arcsec2: Covariance
-    """Of the attitudes that were used, and of the motion. Between two batches their errors are
+    """Covariance due to the attitudes used and the motion. Between two batches their errors are
     independent; between filtered or smoothed samples it is the weighted mean."""
     motion_arcsec: float | None
     """The error that the motion adds. Nearest: the angle that the body turns until the moment.

@@ -23,7 +23,7 @@ class Proof(msgspec.Struct, kw_only=True):
     result: str
     """The id."""
     answer_sha256: str
-    """Of the answer, byte for byte as it was sent."""
+    """SHA-256 of the answer, byte for byte as it was sent."""
     content: str
     """BLAKE2b (32 bytes) of all that is kept of the result."""
     adopted: bool
@@ -37,7 +37,7 @@ class Proof(msgspec.Struct, kw_only=True):
     statement: str
     """The head's statement, whose `root` the path leads to."""
     signature: str | None
-    """Of the statement, by Ed25519."""
+    """Ed25519 signature of the statement."""
 
 
 def prove(connection: sa.Connection, id: str) -> Proof:
