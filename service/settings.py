@@ -148,7 +148,7 @@ class Settings:
 
     @property
     def mission_places_text(self) -> str:
-        """Where missions are looked for, in words."""
+        """The places where missions are looked for, in words."""
         own = "not set" if self.missions is None else str(self.missions)
         shipped = "the shipped missions" if self.ships_missions else "no shipped missions"
         return f"./{LOCAL_MISSIONS}/*.toml, ACQUIRE_MISSIONS ({own}), {shipped}"

@@ -32,7 +32,7 @@ def whole_text(mission: "Mission", path: Path) -> str:
 
 
 class _Origins:
-    """Where the values of a mission come from."""
+    """The origins of the values of a mission."""
 
     def __init__(self, given: Mapping[str, Any], derived: Mapping[str, str]) -> None:
         self._given, self._derived = given, derived

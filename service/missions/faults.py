@@ -267,7 +267,7 @@ def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[st
 
 
 def _after(models: Models, part: str | int) -> tuple[bool, Models]:
-    """Whether a part of a location is a key or an index, and the tables to which it leads."""
+    """True if a part of a location is a key, not an index; and the tables to which it leads."""
     fields = [each.model_fields[part] for each in models if part in each.model_fields]
     if fields:
         return True, [found for field in fields for found in _models_in(field.annotation)]

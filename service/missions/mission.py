@@ -102,7 +102,7 @@ class Tolerances(Strict):
     pole_difference_deg: float = Field(default=0.13, ge=0, le=180)  # BANTOL1
     pole_angle_deg: float = Field(default=7.2, ge=0, le=180)  # BANTOL2
     fov_rotation_deg: float = Field(default=10.0, ge=0, le=180)
-    """Of Van Bezooijen's test, which the paper leaves out and the missions have off."""
+    """Tolerance of Van Bezooijen's test, which the paper leaves out and the missions have off."""
 
 
 class Tests(Strict):
@@ -247,7 +247,7 @@ class Tracker(Strict):
     calibration: Calibration = Calibration()
     magnitudes: Magnitudes = Field(default=AS_MEASURED, exclude_if=AS_MEASURED.__eq__)
     camera: Camera | None = None
-    """Of a tracker that sends frames; the field of view reaches to its farthest corner."""
+    """The camera, of a tracker that sends frames; its farthest corner bounds the field of view."""
     scan: Scan | None = Field(default=None, exclude_if=is_missing)
 
     @model_validator(mode="after")

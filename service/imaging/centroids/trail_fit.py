@@ -45,7 +45,7 @@ class TrailImage:
 
     @property
     def fwhm_px(self) -> float:
-        """That of the still image with the trail's length, as standard deviations add."""
+        """The still image's width together with the trail's length, as standard deviations add."""
         spread = float(np.max(self.length_px)) / math.sqrt(12.0)
         return 2.0 * math.sqrt(2.0 * math.log(2.0)) * math.hypot(self.sigma_px, spread)
 
