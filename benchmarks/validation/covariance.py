@@ -18,6 +18,7 @@ from benchmarks.bounds import Bound, at_least, mean_as_expected, share_as_expect
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written
 from service.acquire import Acquisition, acquire
+from service.missions.defaults import completed
 from service.missions.mission import SHIPPED_FOLDER, Mission
 from service.observations.schema import submission_from_json
 from service.sky.cache import LruCache
@@ -47,7 +48,7 @@ class Passes:
     def __init__(self, name: str, sky: SkyModel, solver: str = "quest") -> None:
         self.solver = solver
         text = (SHIPPED_FOLDER / f"{name.lower()}.toml").read_text("utf-8")
-        self.toml: dict[str, Any] = tomllib.loads(text)
+        self.toml: dict[str, Any] = completed(tomllib.loads(text)).table
         self.mission = Mission.model_validate(self.toml)
         self.sky = sky
         run_catalog = sky.run_catalog(self.mission, parse_utc(MOMENT))

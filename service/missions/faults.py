@@ -73,6 +73,13 @@ EXAMPLES: dict[str, Any] = {
 }
 """A usual value for each key that a mission or a batch needs."""
 
+_UNSEEN = r"\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
+_SPACES = r"\x20\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000"
+VISIBLE_PATTERN = f"^[^{_UNSEEN}]+$"
+"""No character of control, of zero width or of the direction of text."""
+NAME_PATTERN = f"^[^{_UNSEEN}{_SPACES}](?:[^{_UNSEEN}]*[^{_UNSEEN}{_SPACES}])?$"
+"""`VISIBLE_PATTERN` without a space at either end."""
+
 FORMS: dict[str, str] = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$": (
         "must be 1 to 64 letters, digits and _ . - that begin with a letter or digit"
@@ -81,6 +88,10 @@ FORMS: dict[str, str] = {
         "must be letters, digits and _ . : - that begin with a letter or digit"
     ),
     r"^[^\x00-\x1f\x7f]+$": "must be text without control characters",
+    VISIBLE_PATTERN: "must be text without control characters and invisible characters",
+    NAME_PATTERN: (
+        "must be text without control characters, invisible characters and spaces at its ends"
+    ),
 }
 """The patterns of names, in words."""
 

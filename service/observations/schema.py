@@ -26,7 +26,7 @@ from pydantic import (
 )
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
-from service.missions.faults import causes, plain_message
+from service.missions.faults import NAME_PATTERN, causes, plain_message
 from service.missions.mission import GridStep, Identifier, SolverName
 from service.missions.scan import MOST_LINES, MOST_SAMPLES, MOST_WIRES
 from service.observations.batch import (
@@ -109,12 +109,6 @@ def is_time(text: str) -> str:
 
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
 """A name that is looked up: records of earlier versions have some that are no `Name`."""
-_UNSEEN = r"\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
-_SPACES = r"\x20\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000"
-VISIBLE_PATTERN = f"^[^{_UNSEEN}]+$"
-"""No character of control, of zero width or of the direction of text."""
-NAME_PATTERN = f"^[^{_UNSEEN}{_SPACES}](?:[^{_UNSEEN}]*[^{_UNSEEN}{_SPACES}])?$"
-"""`VISIBLE_PATTERN` without a space at either end."""
 Name = Annotated[str, Field(min_length=1, max_length=128, pattern=NAME_PATTERN)]
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")

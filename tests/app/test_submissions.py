@@ -75,12 +75,17 @@ def test_many_at_once_give_what_each_by_itself_gives(app, make):
     assert live == bulk
 
 
+MADE_LATER = ("record_facts", "record_heads")
+"""The chain of the record follows it in its own time."""
+
+
 def everything(app):
     """Every row of every table."""
     with app.store.reading() as connection:
         return {
             table.name: sorted(map(str, connection.execute(select(table))))
             for table in metadata.sorted_tables
+            if table.name not in MADE_LATER
         }
 
 

@@ -424,7 +424,9 @@ def test_many_stars_and_inaccurate_ones_may_take_long(make):
     stars = sent["observations"][0]["stars"]
     sent["observations"][0]["stars"] = [stars[0] | {"sigma_arcsec": 600.0}, *stars[1:]]
     assert may_take_long(submission_from_json(json.dumps(sent)).batch)
-    sent["observations"][0]["stars"] = stars * 50
+    sent["observations"][0]["stars"] = [
+        star | {"magnitude": star["magnitude"] + 0.001 * k} for k in range(50) for star in stars
+    ]
     assert may_take_long(submission_from_json(json.dumps(sent)).batch)
 
 

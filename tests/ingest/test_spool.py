@@ -70,7 +70,7 @@ def interrupted(opened, lines):
 
 
 def test_a_replay_goes_on_after_a_restart_where_it_was(opened, lines):
-    later, id, run = interrupted(opened, [b"{\n", *lines[:400]])
+    later, id, run = interrupted(opened, [b'{"cut\n', *lines[:400]])
     before = later.replays.get(id)
     # It will be continued: it has not ended.
     assert (before.state, before.finished) == ("waiting", None)

@@ -82,4 +82,4 @@ def test_the_largest_rate_of_the_mission_bounds_what_is_taken():
     block = block_from_model(GyroBlockIn.model_validate(body()), "XTE")
     with pytest.raises(BadBatch, match=r"0.000872665 rad/s \(0.05 deg/s\)"):
         # It is refused before the records are looked at.
-        Gyro(Context(None, missions, None, None)).begin(block)
+        Gyro(Context(None, missions, None, None)).record(block)

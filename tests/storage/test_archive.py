@@ -1,7 +1,9 @@
 """The archive: every batch is in the record or in the archive, byte for byte, whatever happens."""
 
+import errno
 import math
-import resource
+import os
+import stat
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -487,14 +489,22 @@ def test_what_a_running_command_writes_is_not_reported_as_left_over(filled, plac
     assert [each for each in verify_archive(place, {}) if "was not written to its end" in each]
 
 
-def test_a_full_disk_names_the_file_and_the_bytes_that_it_needs(filled, place):
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (600, hard))
-    try:
+def test_a_full_disk_names_the_file_and_the_bytes_that_it_needs(filled, place, monkeypatch):
+    # Not by RLIMIT_FSIZE: it is of the whole process, the files of the database among them.
+    sync, refused = os.fsync, []
+
+    def full_disk(descriptor):
+        status = os.fstat(descriptor)
+        if stat.S_ISREG(status.st_mode) and status.st_size > 600:
+            refused.append(status.st_size)
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        sync(descriptor)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(os, "fsync", full_disk)
         with pytest.raises(OSError, match=r"needs [0-9]+ bytes, and [0-9]+ are free") as full:
             archiving.archive(filled.store, place, LATER)
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert f"needs {refused[0]} bytes" in str(full.value)
     assert Path(full.value.filename).is_relative_to(place)
     assert not [each for each in place.rglob("*") if each.name.endswith((".part", ".parquet"))]
     assert archived_ids(filled.store) == set()

@@ -255,7 +255,7 @@ def leaves_in(app):
 
 def test_notes_and_webhooks_may_be_changed_by_the_service(opened, faults, key):
     with closing(opened(record_key=str(key[0]))) as app:
-        from service.storage import webhooks
+        from service.features.webhooks import records as webhooks
         from service.storage.recording import events
 
         app.projector.make_heads()

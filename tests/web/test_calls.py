@@ -86,6 +86,7 @@ def test_a_post_passes_from_top_to_bottom(tmp_path, sky, missions):
                 )
                 assert sent.status_code == 201, sent.text
 
+            wait_until(lambda: client.get("/readyz").status_code == 200)
             post("opens what it needs")
             app.store.progress.catch_up()
             calls.is_on = True

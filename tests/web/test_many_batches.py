@@ -76,7 +76,7 @@ def test_a_number_that_is_none_is_the_fault_of_its_batch_alone(client, batches, 
     answer = client.post(MANY, content=body.replace('"here"', text), headers=JSON)
     good, bad = answer.json()["items"]
     assert (good["status"], bad["status"]) == (201, 422)
-    assert bad["problem"]["errors"][0]["field"] == "body_rates_deg_per_s"
+    assert bad["problem"]["errors"][0]["field"] == "body_rates_deg_per_s.2"
 
 
 @pytest.mark.parametrize(

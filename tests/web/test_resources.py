@@ -149,7 +149,10 @@ def test_a_line_without_end_is_one_bad_line(client, drawn, run):
         ("?run=a/b", b"{}", NDJSON, 422, "run"),
         ("?run=a&speed=2", b"{}", NDJSON, 422, "speed"),
         ("?run=a", b"", NDJSON, 422, "body"),
-        ("?run=a", b"{}", {"Content-Type": "text/csv"}, 415, None),
+        ("?run=a", b"\x00\xff\xfe\nnot json\n", NDJSON, 422, "body"),
+        ("?run=a", b"{\n}\n", NDJSON, 422, "body"),
+        ("?run=a", b"{}", {"Content-Type": "text/csv"}, 422, "body"),
+        ("?run=a", b"{}", {"Content-Type": "text/plain"}, 415, None),
         ("?run=a", b"{}", NDJSON | {"Content-Encoding": "br"}, 415, None),
     ],
 )
@@ -159,8 +162,8 @@ def test_a_replay_that_cannot_begin_is_refused(client, query, content, headers, 
     assert field is None or answer.json()["errors"][0]["field"] == field
 
 
-def test_a_file_that_is_no_telemetry_is_refused_line_by_line(client, run):
-    content = b"\x00\xff\xfe\nnot json\n\xef\xbb\xbf{}\n[1, 2]\n"
+def test_lines_that_are_no_telemetry_are_refused_line_by_line(client, run):
+    content = b"{\x00\xff\xfe\nnot json\n\xef\xbb\xbf{}\n[1, 2]\n"
     answer = client.post(f"{API}/replays?run={run}", content=content, headers=NDJSON)
     state = ended(client, answer)
     assert [each["line"] for each in state["errors"]] == [1, 2, 3, 4]

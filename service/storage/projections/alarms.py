@@ -204,7 +204,7 @@ class LimitEvaluator:
             if sample is None:
                 continue
             window = self._windows[name]
-            latest_ns = window.samples[-1][0] if window.samples else 0
+            latest_ns = window.samples[-1][0] if window.samples else new.result["time_ns"]
             latest = self._latest_in_window(name, new.result, latest_ns)
             found = window.add(sample, limits, latest)
             if found and (found.severity is not None or self._active.has(name)):

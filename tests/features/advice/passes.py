@@ -10,6 +10,7 @@ from msgspec import structs
 from service.acquire import acquire
 from service.features.advice.advice import advise
 from service.features.advice.evidence import evidence_of, merged
+from service.missions.defaults import completed
 from service.missions.mission import SHIPPED_FOLDER, Mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
@@ -22,9 +23,9 @@ def mission_like(name="XTE", *, second_tracker=None, **changed):
     `second_tracker` adds one that looks along body Y, with these keys in place of its own.
     """
     text = (SHIPPED_FOLDER / f"{name.lower()}.toml").read_text(encoding="utf-8")
-    settings = tomllib.loads(text)
+    settings = completed(tomllib.loads(text)).table
     for table, values in changed.items():
-        settings[table] = settings[table] | values
+        settings[table] = settings.get(table, {}) | values
     if second_tracker is not None:
         axes = ("x_axis_body", "y_axis_body", "z_axis_body")
         turned = dict(zip(axes, ([0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]), strict=True))
