@@ -21,7 +21,7 @@ from benchmarks.bounds import at_most
 from benchmarks.report import Report
 
 MOST_SHARE = 0.2
-"""Of the processor time of all kernels, that of any one."""
+"""Largest share of one kernel in the processor time of all."""
 ROUNDS = 10_000_000
 CHILD = """
 import gc, json, os, sys, time

@@ -304,6 +304,7 @@ class IngestQueue:
         try:
             return self._store.writer.change(change)
         except Exception as error:
+            # A client whose key is not kept must send again: it gets the error, not the answer.
             return dict.fromkeys(repeats, error)
 
     def _begins(self, pending: PendingBatch) -> bool:
@@ -362,6 +363,7 @@ class IngestQueue:
         try:
             outcomes = self._store.writer.record(unsaved_results)
         except Exception as error:
+            # Nothing of the group is recorded: each of its clients gets the error.
             outcomes = [error] * len(group)
         self._counts.add(unsaved_results, outcomes)
         done: list[tuple[PendingBatch, Answer]] = []

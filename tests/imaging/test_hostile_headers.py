@@ -18,7 +18,7 @@ from tests.scale import size
 
 ABSURD = absurd_files(np.random.default_rng(4))
 MUTATIONS, IN_A_SITTING = 200_000, 60
-"""Of each file of `good_files`."""
+"""Mutations of each file of `good_files`."""
 MAX_GROWTH_MB = 120
 """Files of 48 x 64 pixels, and limits of a megapixel: a decoder at work takes some 40 MB."""
 

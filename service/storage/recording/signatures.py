@@ -1,4 +1,4 @@
-"""Who signed a change and why, from the body of its request in the audit list."""
+"""The author and the reason of a change, from the body of its request in the audit list."""
 
 import json
 from contextlib import suppress
