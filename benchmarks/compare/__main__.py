@@ -291,7 +291,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         missions, *databases = (folder / name for name in ("missions", "base", "here"))
         for each in (missions, *databases):
             each.mkdir()
-        write_twin(missions)
+        write_twin(missions, base)
         print(f"drawing the inputs with seed {parsed.seed}", flush=True)
         phases = phases_of(parsed.inputs, parsed.seed, missions)
         servers = [

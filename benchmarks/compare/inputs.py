@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 
 import numpy as np
 
-from service.missions.mission import SHIPPED_FOLDER, Mission, load_missions
+from service.missions.mission import Mission, load_missions
 from service.simulate.frames import FrameFormat, FrameSettings, draw_frames, frame_bytes
 from service.simulate.stretches import Pass, PriorKind, Trouble, Troubles
 from service.simulate.telemetry import draw_pass
@@ -59,9 +59,12 @@ class Phase:
     at_once: int = 1
 
 
-def write_twin(folder: Path) -> None:
-    """Write the mission file of `TWIN`."""
-    text = (SHIPPED_FOLDER / "xte.toml").read_text(encoding="utf-8")
+def write_twin(folder: Path, tree: Path) -> None:
+    """Write the mission file of `TWIN`: the XTE of a checkout, with a second tracker.
+
+    `tree` is the older checkout of those that read it: what may be left out later is given in it.
+    """
+    text = (tree / "service/missions/xte.toml").read_text(encoding="utf-8")
     text = text.replace('name = "XTE"', f'name = "{TWIN}"')
     own = text[text.index("[[trackers]]") :]
     own = own.replace("STARTRACKER_1", "STARTRACKER_2")

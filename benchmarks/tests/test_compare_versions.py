@@ -18,6 +18,7 @@ from benchmarks.compare.answers import (
 )
 from benchmarks.compare.inputs import Request, phases_of, write_twin
 from benchmarks.compare.interface import NOTHING, interface_differences
+from benchmarks.compare.servers import HERE
 
 ONE, TWO, THREE = (f"01KB{'0' * 21}{k}" for k in range(3))
 ANSWER = {
@@ -413,7 +414,7 @@ def test_a_parameter_that_must_be_given_is_no_addition():
 
 @pytest.mark.slow
 def test_the_same_seed_draws_the_same_inputs_and_every_name_once(tmp_path):
-    write_twin(tmp_path)
+    write_twin(tmp_path, HERE)
     one, again = (phases_of(60, 3, tmp_path) for _ in range(2))
     assert one == again
     names = [request.name for phase in one for request in phase.requests]
