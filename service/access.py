@@ -20,6 +20,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
+from service.contract.base import Id, Page, Record, Stamp, doc, list_record, page_record
 from service.errors import (
     BadInput,
     Busy,
@@ -32,7 +33,6 @@ from service.errors import (
     shown_value,
 )
 from service.missions.mission import Mission, mission_named
-from service.storage.models.base import Id, Page, Record, Stamp, doc, list_record, page_record
 from service.storage.recording.ids import Ulids
 from service.storage.recording.signatures import signed_in
 from service.storage.sql.columns import Row

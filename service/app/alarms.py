@@ -19,12 +19,12 @@ from service.alarms.quantities import (
     tracker_names,
 )
 from service.app.context import ALL_RUNS, Context, known_id
+from service.contract import alarms as records
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission, mission_named
 from service.storage.grades.period import rejected_samples
-from service.storage.models import alarms as records
-from service.storage.models.base import Page
 from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
 from service.storage.queries import alarms
 from service.storage.queries.alarms import TimeOut, alarm_spans, times_out

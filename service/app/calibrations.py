@@ -24,6 +24,8 @@ from service.app.calibration_estimates import (
 )
 from service.app.context import Context, known_id
 from service.app.results import COMPARE_SAMPLE, Comparisons, Stretch
+from service.contract.base import Page
+from service.contract.runs import Comparison
 from service.errors import AcquisitionError, Busy, NotFound, Stopping, WrongState, shown_value
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, load_missions, mission_named
@@ -35,8 +37,6 @@ from service.storage.calibrations import (
     CalibrationSummary,
     TrackerGeometry,
 )
-from service.storage.models.base import Page
-from service.storage.models.runs import Comparison
 from service.storage.recording import events
 from service.storage.recording.ids import Ulids
 from service.storage.recording.results import register

@@ -12,13 +12,13 @@ from sqlalchemy import Connection
 
 from service.access import Entry
 from service.alarms.quantities import limited_trackers
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
 from service.settings import Settings
 from service.sky.model import SkyModel
-from service.storage.models.base import Page
 from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 
 from service.access import Caller
 from service.app.context import Context, known_id
+from service.contract.pictures import Picture, picture_of
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import FrameLimits
@@ -19,7 +20,6 @@ from service.imaging.submit import FrameIn
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import FromLastIn, Submission, submission_from_json
-from service.storage.models.pictures import Picture, picture_of
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 from service.times import utc_now

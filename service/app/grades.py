@@ -16,6 +16,8 @@ from sqlalchemy import Connection, func, select
 
 from service.acquire.kernel_build import KernelBuild
 from service.app.context import Context, PageOfPeriod, checked_run_name
+from service.contract.base import Page
+from service.contract.products import DefinitiveJob, Innovation, LiveAttitude
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import LOOK_AHEAD_S, day_bounds, grade_day, window_of
@@ -25,8 +27,6 @@ from service.storage.grades import days as recorded_days
 from service.storage.grades import period
 from service.storage.grades.days import live_attitude
 from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
-from service.storage.models.base import Page
-from service.storage.models.products import DefinitiveJob, Innovation, LiveAttitude
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
 from service.storage.recording.ids import Ulids

@@ -13,6 +13,7 @@ from sqlalchemy import Connection
 
 from service.access import Caller, Entry
 from service.app.context import Context, checked_run_name, known_id
+from service.contract.runs import Replay, ReplayCounts, ReplayLines
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.ingest.bulk import Bulk, Check, RecordBlocks
 from service.ingest.memory import require_memory_for_replay
@@ -28,7 +29,6 @@ from service.observations.telemetry import (
     require_telemetry,
 )
 from service.packets.reader import PacketLines
-from service.storage.models.runs import Replay, ReplayCounts, ReplayLines
 from service.storage.queries import replays
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms

@@ -12,15 +12,15 @@ from msgspec import structs
 from service.access import Entry
 from service.acquire.choices import Choices, choices_of, refuse_idle_options
 from service.app.context import ALL_RUNS, Context, known_id
+from service.contract.answers import Answer, Neighbours, Result, Summary
+from service.contract.base import Page
+from service.contract.runs import Comparison
 from service.errors import Busy, NotFound
 from service.ingest.compare_options import ComparedSample, Pair, RunManyAgain, compare
 from service.ingest.solver_pool import mission_in_input
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import OptionsIn, submission_from_json
-from service.storage.models.answers import Answer, Neighbours, Result, Summary
-from service.storage.models.base import Page
-from service.storage.models.runs import Comparison
 from service.storage.queries import results
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import PeriodStars, period_stars, sample_period

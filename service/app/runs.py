@@ -9,12 +9,12 @@ from sqlalchemy import Connection
 
 from service.access import Entry
 from service.app.context import Context, checked_run_name
+from service.contract import runs
 from service.errors import BadBatch, Fault
 from service.ingest.reprocess import ReprocessPlan, ReprocessProgress, reprocess
 from service.ingest.solver_pool import Solver
 from service.ingest.worker_process import WorkerConfig
 from service.missions.mission import Mission, mission_named
-from service.storage.models import runs
 from service.storage.queries import fleet, histories
 from service.storage.queries.compare_runs import changed_batches, compare_runs, run_rates
 from service.storage.queries.pages import ResultFilter

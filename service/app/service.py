@@ -13,13 +13,13 @@ from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
+from service.contract.spacecraft import About, CatalogAbout, MissionAbout
 from service.errors import AcquisitionError, Busy
 from service.ingest.solver_pool import mission_in_input
 from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.models.spacecraft import About, CatalogAbout, MissionAbout
 from service.storage.projections.alarms import latest_inputs
 from service.storage.recording import events
 from service.storage.recording.events import Event

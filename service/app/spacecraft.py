@@ -13,6 +13,9 @@ from sqlalchemy import Connection
 
 from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
 from service.app.context import Context, PageOfPeriod, known_id
+from service.contract import spacecraft as records
+from service.contract.base import Page
+from service.contract.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.errors import AcquisitionError, BadBatch, Fault, shown_value
 from service.gyro import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
@@ -21,9 +24,6 @@ from service.missions.motion import largest_rate_deg_per_s
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
 from service.storage import gyro as blocks
-from service.storage.models import spacecraft as records
-from service.storage.models.base import Page
-from service.storage.models.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.storage.queries import fleet, histories, time_buckets, trends
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.trends import worst_batches

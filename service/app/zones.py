@@ -6,14 +6,14 @@ from functools import partial
 from service.acquire.prewarm import prewarm_zones
 from service.advice.zone_size import ZoneCost, ZoneSize, zone_cost, zone_size
 from service.app.context import Context
+from service.contract.answers import ZoneSummary
+from service.contract.spacecraft import CachedRunCatalog, CachedZone, ZoneCache
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission
 from service.observations.schema import APrioriIn, prior_of
 from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
-from service.storage.models.answers import ZoneSummary
-from service.storage.models.spacecraft import CachedRunCatalog, CachedZone, ZoneCache
 from service.storage.queries.alarms import latest_samples
 from service.storage.queries.pages import ResultFilter, latest_time
 from service.storage.recording.unsaved_result import LIVE

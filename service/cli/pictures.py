@@ -24,8 +24,8 @@ LEAST_MEGAPIXELS = 64
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
     """Solve every file and print its result; 1 where one was refused or has no attitude."""
     from service.acquire.picture import blind_sky, solve_picture
+    from service.contract.pictures import picture_of
     from service.sky.catalog.star_catalog import open_catalog
-    from service.storage.models.pictures import picture_of
 
     sky, solver = blind_sky(open_catalog(settings.catalog))
     read = picture_reader(parsed.dark, settings, parsed.image)

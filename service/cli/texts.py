@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 
 from service.app import calibration_estimates
+from service.contract.runs import RunComparison, RunTransition
 from service.ingest.reprocess import ReprocessProgress
-from service.storage.models.runs import RunComparison, RunTransition
 
 if TYPE_CHECKING:
     from service.app.calibration_estimates import CalibrationRun

@@ -21,9 +21,9 @@ from service.alarms.quantities import (
     predicted_rms_arcsec,
     residual_rms_arcsec,
 )
+from service.contract import runs as records
+from service.contract.answers import StarCounts
 from service.observations.batch import ObservationBatch
-from service.storage.models import runs as records
-from service.storage.models.answers import StarCounts
 from service.storage.queries.compare_runs import cell_width_s
 from service.storage.recording.answer import StarRow, star_rows
 from service.times import HOUR_S, unix_seconds, utc_of_unix

@@ -17,14 +17,14 @@ import msgspec
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
+from service.contract import runs as records
+from service.contract.base import FieldFault
+from service.contract.runs import Replay, ReplayStateName
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping, problem_of
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
 from service.observations.decompress import Line
 from service.packets.reader import PacketLines, PacketTotals
 from service.storage.gyro import Recorded
-from service.storage.models import runs as records
-from service.storage.models.base import FieldFault
-from service.storage.models.runs import Replay, ReplayStateName
 from service.storage.queries import replays
 from service.storage.recording import events
 from service.storage.recording.unsaved_result import Answered

@@ -8,8 +8,7 @@ import msgspec
 from pydantic import Field
 from sqlalchemy import Connection, Select, func, insert, select, update
 
-from service.errors import NotFound, shown_value
-from service.storage.models.base import (
+from service.contract.base import (
     Components,
     Count,
     Digest,
@@ -22,6 +21,7 @@ from service.storage.models.base import (
     doc,
     page_record,
 )
+from service.errors import NotFound, shown_value
 from service.storage.recording.ids import following_ulid
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import execute, rows_of

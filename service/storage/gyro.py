@@ -10,11 +10,11 @@ import numpy as np
 from sqlalchemy import ColumnElement, Connection, func, insert, select
 
 from service import gyro
+from service.contract.base import Page
+from service.contract.spacecraft import GyroBlockRow, GyroSamples
 from service.errors import AcquisitionError, BadBatch, Conflict, Fault, NotFound, shown_value
 from service.products.tables import Column, Table
 from service.products.tables import Page as TablePage
-from service.storage.models.base import Page
-from service.storage.models.spacecraft import GyroBlockRow, GyroSamples
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import gyro_blocks

@@ -23,10 +23,9 @@ from anyio.to_thread import run_sync
 from service.access import Caller
 from service.acquire.result import TrackingState
 from service.app.factory import App
-from service.errors import Busy, RateLimited, Unauthenticated
-from service.storage.models.alarms import Alarm, AnnotationChange, Limit
-from service.storage.models.answers import StarCounts
-from service.storage.models.base import (
+from service.contract.alarms import Alarm, AnnotationChange, Limit
+from service.contract.answers import StarCounts
+from service.contract.base import (
     Count,
     DescribedAs,
     Digest,
@@ -38,8 +37,9 @@ from service.storage.models.base import (
     Status,
     doc,
 )
-from service.storage.models.runs import ReplayProgress
-from service.storage.models.spacecraft import GyroBlockRow
+from service.contract.runs import ReplayProgress
+from service.contract.spacecraft import GyroBlockRow
+from service.errors import Busy, RateLimited, Unauthenticated
 from service.storage.recording.events import Event
 
 

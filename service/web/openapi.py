@@ -19,8 +19,8 @@ from pydantic.json_schema import GenerateJsonSchema, models_json_schema
 from starlette.responses import Response
 
 from service import __version__
+from service.contract.base import Record, component_name, described
 from service.products.formats import attitude_formats, table_formats
-from service.storage.models.base import Record, component_name, described
 from service.web.event_stream import EVENT_DATA
 from service.web.middleware import API
 from service.web.requests.access import POLICIES

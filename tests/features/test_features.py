@@ -152,7 +152,7 @@ def run(parsed):
 """,
     "dwell/routes.py": """
 from dwell.part import Dwell
-from service.storage.models.base import Record
+from service.contract.base import Record
 from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import AppDep, Policy, json_response
 from service.web.requests.query_parameters import SpacecraftPath

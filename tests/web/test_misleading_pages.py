@@ -11,8 +11,8 @@ from msgspec import structs
 
 from service.alarms import quantities
 from service.app.factory import open_app
+from service.contract.spacecraft import WindowCounts
 from service.observations.telemetry import read_lines
-from service.storage.models.spacecraft import WindowCounts
 from service.storage.queries.fleet import DayCounts, FleetRow, TrackerCounts
 from service.storage.queries.results import answer_from_json
 from service.times import parse_utc, shifted

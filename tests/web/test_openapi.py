@@ -7,8 +7,8 @@ import pytest
 from jsonschema import Draft202012Validator
 from sqlalchemy import select
 
+from service.contract.base import component_name
 from service.observations.schema import submission_from_json
-from service.storage.models.base import component_name
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml

@@ -16,7 +16,7 @@ from service.cli.arguments import progress_bar, settings_of, settings_of_existin
 if TYPE_CHECKING:
     from sqlalchemy import Connection
 
-    from service.storage.models.runs import Forgotten
+    from service.contract.runs import Forgotten
 
 
 MAX_PROBLEMS = 100

@@ -4,8 +4,8 @@ from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
 
+from service.contract.base import Components, Count, Digest, Moment, Record, doc
 from service.missions.mission import Identifier
-from service.storage.models.base import Components, Count, Digest, Moment, Record, doc
 
 Text = Annotated[str, doc("The finding as a sentence.")]
 Action = Annotated[

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterator
 
+from service.contract.answers import Answer
 from service.features.tracks.part import Tracks
-from service.storage.models.answers import Answer
 from service.storage.queries.period import PeriodStars
 from service.web.console.page import PageContext, Panel
 from service.web.console.pages.spacecraft import ShownPeriod

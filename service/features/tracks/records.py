@@ -7,13 +7,13 @@ from typing import Annotated, Any, ClassVar, Literal
 import numpy as np
 from sqlalchemy import Connection, Select, select
 
+from service.contract.answers import Answer
+from service.contract.base import Count, Id, Moment, Record, doc
 from service.errors import BadBatch, Fault
 from service.missions.mission import Mission, Tracker
 from service.observations.calibrate import correct
 from service.observations.decode import batch_from_canonical
 from service.observations.scans.reduce import reduced
-from service.storage.models.answers import Answer
-from service.storage.models.base import Count, Id, Moment, Record, doc
 from service.storage.queries.pages import PLACE, ResultFilter
 from service.storage.queries.results import answer_from_json, read_result, recorded_mission
 from service.storage.sql.columns import Row

@@ -7,6 +7,7 @@ from sqlalchemy import Connection
 from service.access import Access, Caller, Entry
 from service.app.context import Context, known_id
 from service.app.factory import App
+from service.contract.base import Page
 from service.errors import WrongState
 from service.features.webhooks import records as webhooks
 from service.features.webhooks.addresses import require_http_allowed, require_url
@@ -21,7 +22,6 @@ from service.features.webhooks.records import (
 from service.features.webhooks.sender import WebhookSender
 from service.ingest.solver_pool import mission_in_input
 from service.settings import networks
-from service.storage.models.base import Page
 from service.storage.recording.events import events_between, last_event
 from service.storage.recording.ids import Ulids
 from service.storage.sql.columns import Row

@@ -13,9 +13,8 @@ from pydantic import Field
 from sqlalchemy import Connection, case, delete, func, insert, select, tuple_, update
 
 from service import errors
-from service.errors import BadBatch, BadInput, NotFound, shown_value
-from service.storage.models.alarms import SeverityName
-from service.storage.models.base import (
+from service.contract.alarms import SeverityName
+from service.contract.base import (
     Count,
     Id,
     Page,
@@ -25,6 +24,7 @@ from service.storage.models.base import (
     list_record,
     page_record,
 )
+from service.errors import BadBatch, BadInput, NotFound, shown_value
 from service.storage.recording import chain
 from service.storage.recording.events import EventKind
 from service.storage.sql.columns import Row

@@ -8,11 +8,11 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access import Caller
+from service.contract.alarms import SeverityName
 from service.features.webhooks import records
 from service.features.webhooks.part import Webhooks
 from service.missions.faults import VISIBLE_PATTERN
 from service.observations.schema import Key, RunName, Wire
-from service.storage.models.alarms import SeverityName
 from service.storage.recording.events import EventKind
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests.access import (

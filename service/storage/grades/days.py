@@ -26,6 +26,8 @@ from sqlalchemy import (
     update,
 )
 
+from service.contract.base import Count, Digest, Id, Moment, Stamp, doc
+from service.contract.products import LiveAttitude
 from service.filtering.result import Status
 from service.grades.carried import Carried
 from service.grades.day import (
@@ -43,8 +45,6 @@ from service.grades.day import (
 from service.gyro import texts_of
 from service.products.attitudes import AttitudeRows
 from service.storage.grades.inputs import inside
-from service.storage.models.base import Count, Digest, Id, Moment, Stamp, doc
-from service.storage.models.products import LiveAttitude
 from service.storage.queries.pages import ResultFilter, covariance_of
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.columns import Row

@@ -11,6 +11,8 @@ from sqlalchemy import Connection, select, tuple_
 
 from service.alarms.limits import Point, Sample, preview_of
 from service.alarms.quantities import REJECTED
+from service.contract.base import Page
+from service.contract.products import Innovation
 from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers, Outcome, Status
 from service.grades.day import (
@@ -26,8 +28,6 @@ from service.gyro import texts_of
 from service.missions.mission import Mission
 from service.storage.grades.days import BLOCKS, PLACE, DayKey, GradedDayRow, block_conditions, shown
 from service.storage.grades.inputs import inside
-from service.storage.models.base import Page
-from service.storage.models.products import Innovation
 from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
 from service.storage.queries.alarms import limits_of
 from service.storage.queries.pages import ResultFilter

@@ -15,11 +15,11 @@ from service.alarms import quantities
 from service.alarms.limits import LimitSettings, Sample, Severity
 from service.alarms.quantities import QuantityName, quantity_named
 from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
+from service.contract import alarms as models
+from service.contract.alarms import Limit, LimitHistory
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.mission import Mission
-from service.storage.models import alarms as models
-from service.storage.models.alarms import Limit, LimitHistory
-from service.storage.models.base import Page
 from service.storage.queries.pages import ResultFilter, newest_first
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from sqlalchemy import Connection, Subquery, Table, and_, case, func, or_, select, tuple_
 
+from service.contract import runs as models
 from service.storage.archive.reading import Archive, parts_between, places
-from service.storage.models import runs as models
 from service.storage.queries import pages
 from service.storage.queries.time_buckets import Bucket, BucketFilter, Columns, read_buckets
 from service.storage.sql import tables

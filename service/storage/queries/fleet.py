@@ -10,10 +10,10 @@ import numpy as np
 from msgspec import structs
 from sqlalchemy import BigInteger, Connection, Select, bindparam, case, func, select
 
+from service.contract.alarms import Alarm, AlarmSummary
+from service.contract.answers import Summary
+from service.contract.spacecraft import Overview, OverviewRow, Sparkline, WindowCounts
 from service.missions.mission import Mission
-from service.storage.models.alarms import Alarm, AlarmSummary
-from service.storage.models.answers import Summary
-from service.storage.models.spacecraft import Overview, OverviewRow, Sparkline, WindowCounts
 from service.storage.queries import time_buckets
 from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state

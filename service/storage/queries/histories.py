@@ -11,11 +11,11 @@ from pydantic import ValidationError
 from sqlalchemy import Connection, Select, exists, func, select
 
 from service.acquire.result import METHOD
+from service.contract.base import Page
+from service.contract.runs import Run
+from service.contract.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.missions.mission import Mission
 from service.storage.archive.reading import Archive
-from service.storage.models.base import Page
-from service.storage.models.runs import Run
-from service.storage.models.spacecraft import AttitudeRow, MissionThen, SpacecraftRow
 from service.storage.queries import pages
 from service.storage.queries.pages import MOST_OPENED, Listing
 from service.storage.queries.results import summary_of, summary_query

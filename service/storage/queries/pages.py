@@ -14,9 +14,9 @@ from typing import Any, TypeVar
 
 from sqlalchemy import ColumnElement, Connection, RowMapping, Select, func, select, tuple_
 
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
 from service.storage.archive.reading import Archive, Block, PlacedPart, parts_between
-from service.storage.models.base import Page
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE
 from service.storage.sql.tables import batches, results

@@ -15,6 +15,7 @@ from sqlalchemy import BigInteger, Connection, Select, bindparam, select
 
 from service import vectors
 from service.acquire.choices import aberration_velocity
+from service.contract.answers import Answer, Star
 from service.identify.prior_attitude import PriorAttitude, search_region
 from service.missions.mission import Mission, Tracker
 from service.observations.batch import ObservationBatch
@@ -24,7 +25,6 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import apparent, sun_direction
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
-from service.storage.models.answers import Answer, Star
 from service.storage.queries.pages import PLACE, ResultFilter, newest_first
 from service.storage.queries.results import answer_from_json, recorded_mission
 from service.storage.queries.star_field import presumed_attitude

@@ -7,8 +7,8 @@ import msgspec
 from msgspec import structs
 from sqlalchemy import Connection, insert, select, update
 
+from service.contract import runs
 from service.errors import NotFound, WrongState, shown_value
-from service.storage.models import runs
 from service.storage.recording import events
 from service.storage.sql.tables import replays, rollups_daily
 

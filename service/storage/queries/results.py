@@ -11,14 +11,14 @@ from msgspec import UNSET
 from sqlalchemy import ColumnElement, Connection, Select, bindparam, func, or_, select
 
 from service.alarms.quantities import QUANTITIES, value_names
+from service.contract import answers
+from service.contract.answers import Answer
+from service.contract.base import Page
 from service.errors import BadBatch, Busy, Fault, NotFound, WrongState, shown_value
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import OptionsIn, submission_from_json
 from service.storage.archive.reading import Archive, PlacedPart, parts_with
-from service.storage.models import answers
-from service.storage.models.answers import Answer
-from service.storage.models.base import Page
 from service.storage.queries import pages
 from service.storage.queries.pages import (
     PLACE,

@@ -12,6 +12,7 @@ from msgspec import Struct
 
 from service import vectors
 from service.acquire.choices import aberration_velocity
+from service.contract.answers import Answer, Star, TrackerStars
 from service.errors import BadBatch, Fault
 from service.identify.prior_attitude import PriorAttitude, prior_attitude, search_region
 from service.missions.mission import Mission, Tracker
@@ -21,7 +22,6 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import apparent
 from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
-from service.storage.models.answers import Answer, Star, TrackerStars
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
 from service.vectors import Matrix, Vector, read_only

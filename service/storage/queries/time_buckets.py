@@ -23,8 +23,8 @@ from sqlalchemy import (
     select,
 )
 
+from service.contract.spacecraft import Rates
 from service.errors import BadInput, Fault
-from service.storage.models.spacecraft import Rates
 from service.storage.recording.result_metrics import OF_TRACKERS, SUMMED, SUMMED_OF_TRACKERS
 from service.storage.sql import tables
 from service.storage.sql.columns import Row

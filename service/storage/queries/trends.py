@@ -17,7 +17,7 @@ from service.alarms.quantities import (
     Rate,
     StarShare,
 )
-from service.storage.models.spacecraft import History, Numbers, RankedBatch, Series
+from service.contract.spacecraft import History, Numbers, RankedBatch, Series
 from service.storage.queries import time_buckets
 from service.storage.queries.pages import PLACE, ResultFilter, latest_time, newest_first
 from service.storage.queries.results import summary_fields, summary_query

@@ -9,10 +9,10 @@ from msgspec import UNSET, Struct, UnsetType, structs
 
 from service.acquire import Acquisition
 from service.acquire.result import RivalAttitude, TrackerResult
+from service.contract import answers
 from service.identify.identification import Outcome
 from service.observations.batch import PredictedPrior
 from service.sky.catalog.run_catalog import RunCatalog
-from service.storage.models import answers
 from service.vectors import ra_dec_of
 
 FRAME = "EME2000"

@@ -18,9 +18,9 @@ from sqlalchemy import URL, Connection, create_engine, delete, func, insert, or_
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.pool import NullPool
 
+from service.contract.alarms import Annotation, AnnotationChange
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
-from service.storage.models.alarms import Annotation, AnnotationChange
-from service.storage.models.base import Page
 from service.storage.recording import chain
 from service.storage.recording.ids import is_ulid
 from service.storage.sql.alarm_tables import annotations

@@ -26,11 +26,11 @@ from sqlalchemy import (
 from service.acquire import Acquisition
 from service.alarms.drift import alignment_offsets_arcsec, mean_stars, scale_offset_ppm
 from service.alarms.quantities import QUANTITIES, Measured, Quantity, Ratio, StarShare
+from service.contract.answers import Answer, Star
 from service.identify.identification import Integers
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations
 from service.sky.catalog.run_catalog import RunCatalog
-from service.storage.models.answers import Answer, Star
 from service.storage.recording.identity import digest_of_row
 from service.storage.sql import tables
 from service.storage.sql.columns import Row

@@ -6,7 +6,7 @@ from typing import Any
 
 from sqlalchemy import Connection, select
 
-from service.storage.models.answers import Signature
+from service.contract.answers import Signature
 from service.storage.sql.tables import audit
 
 REASONS = ("comment", "note", "text")

@@ -15,9 +15,9 @@ from msgspec import UNSET, Struct, structs
 from sqlalchemy import Connection
 
 from service.acquire import Acquisition
+from service.contract.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.observations.frame_record import FrameRecord
 from service.observations.schema import Submission
-from service.storage.models.answers import Answer, Attitude, FrameSummary, FrameTimings
 from service.storage.recording.answer import answer_of, rows_of_stars
 from service.storage.recording.chain import leaf_of
 from service.storage.recording.identity import digest_of_encoded, encoded_rows

@@ -15,8 +15,8 @@ from typing import Any
 from sqlalchemy import ColumnElement, Connection, Table, delete, exists, func, or_, select
 from sqlalchemy.exc import IntegrityError
 
+from service.contract.runs import Forgotten
 from service.errors import BadConfiguration, NotFound, shown_value
-from service.storage.models.runs import Forgotten
 from service.storage.projections import rollups
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row

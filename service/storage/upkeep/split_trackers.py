@@ -19,13 +19,13 @@ from typing import Any
 from sqlalchemy import Connection, Select, bindparam, select, tuple_, update
 from sqlalchemy import delete as deleted
 
+from service.contract.answers import Answer
 from service.errors import BadInput, Busy
 from service.missions.mission import Mission
 from service.observations.calibrate import correct
 from service.observations.schema import submission_from_json
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.model import SkyModel
-from service.storage.models.answers import Answer
 from service.storage.projections import rollups, seals
 from service.storage.queries.pages import PLACE, newest_first
 from service.storage.queries.results import answer_from_json, recorded_mission

@@ -10,9 +10,9 @@ from starlette.responses import Response
 from service.access import Caller
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName, limited_names
+from service.contract import alarms as models
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, Wire
-from service.storage.models import alarms as models
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (

@@ -8,13 +8,13 @@ from pydantic import Field, StrictBool
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.contract.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
+from service.contract.runs import Comparison
+from service.contract.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.errors import BadBatch, BadInput, Fault
 from service.gyro import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
-from service.storage.models.answers import Answer, BatchOutcome, BatchOutcomes, BatchPage, Result
-from service.storage.models.runs import Comparison
-from service.storage.models.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.storage.recording.unsaved_result import Answered
 from service.web.openapi import IDEMPOTENCY_KEY, LINK, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests import query_parameters as params

@@ -11,10 +11,10 @@ from service.access import Caller
 from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
 from service.calibration.linearise import LARGEST_DEGREE
+from service.contract.runs import Comparison
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, RunName, Wire
 from service.storage import calibrations as models
-from service.storage.models.runs import Comparison
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params

@@ -9,9 +9,9 @@ from pydantic import model_validator
 from starlette.requests import Request
 from starlette.responses import Response
 
+from service.contract import products
 from service.observations.schema import RunName, Wire
 from service.products import formats
-from service.storage.models import products
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, author, json_response, page_response

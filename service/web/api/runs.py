@@ -10,9 +10,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.replays import UploadForm, discard_upload
+from service.contract.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import BatchIn, Key, RunName, Wire
-from service.storage.models.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
 from service.web.requests import request_body

@@ -4,10 +4,10 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.spacecraft import batch_table, history_table
+from service.contract import spacecraft as models
+from service.contract.answers import Result
+from service.contract.spacecraft import About, Overview
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
-from service.storage.models import spacecraft as models
-from service.storage.models.answers import Result
-from service.storage.models.spacecraft import About, Overview
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, json_response, page_response

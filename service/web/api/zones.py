@@ -5,8 +5,8 @@ from typing import Annotated
 from pydantic import Field
 from starlette.responses import Response
 
+from service.contract.spacecraft import Dropped, ZoneCache, ZoneList
 from service.observations.schema import APrioriIn, Key, Wire
-from service.storage.models.spacecraft import Dropped, ZoneCache, ZoneList
 from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import AppDep, CallerDep, json_response
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter, Time

@@ -25,9 +25,9 @@ from service import __version__, logs
 from service.access import Caller
 from service.alarms.limits import Severity
 from service.app.factory import App
+from service.contract.alarms import Alarm
 from service.errors import AcquisitionError, BadInput, Busy, problem_of, problem_of_faults
 from service.feature import feature_folders, feature_modules
-from service.storage.models.alarms import Alarm
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, parse_utc
 from service.web.console.formatting import FILTERS, completed_utc, present

@@ -24,8 +24,8 @@ from starlette.types import Scope as HttpScope
 from service import logs
 from service.access import OPEN_CALLER, Access, Caller, Entry, Scope
 from service.app.factory import App
+from service.contract.base import Page
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
-from service.storage.models.base import Page
 from service.web.requests.metrics import Metrics
 from service.web.requests.request_body import JSON
 

@@ -25,10 +25,10 @@ from starlette.types import Scope
 from service import __version__
 from service.alarms.limits import Severity
 from service.app.factory import App
+from service.contract.alarms import Alarm
+from service.contract.spacecraft import ZoneCache
 from service.feature import feature_modules
 from service.ingest.queue import OUTCOMES, Backlog, RecordedCounts
-from service.storage.models.alarms import Alarm
-from service.storage.models.spacecraft import ZoneCache
 from service.storage.progress import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries

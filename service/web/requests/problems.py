@@ -20,9 +20,9 @@ from starlette.responses import Response
 from starlette.routing import Match
 
 from service import errors
+from service.contract.base import Problem
 from service.gyro import SampleTaken
 from service.missions.faults import causes, plain_message
-from service.storage.models.base import Problem
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ from starlette.responses import Response
 
 from service.alarms.limits import Severity
 from service.alarms.quantities import limited_trackers, quantity_named, trend_names
+from service.contract.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
-from service.storage.models.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName
 from service.storage.queries.alarms import TimeOut, present_rank
 from service.times import Utc, recorded_utc, shifted
 from service.web.console.formatting import second_after, with_day_of_year

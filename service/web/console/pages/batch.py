@@ -12,12 +12,12 @@ from starlette.responses import RedirectResponse, Response
 
 from service.alarms.quantities import QUANTITIES
 from service.app.context import ALL_RUNS
+from service.contract.answers import Answer, Summary
+from service.contract.answers import Star as FoundStar
+from service.contract.base import Page
 from service.errors import BadBatch, BadInput, Fault, NotFound, shown_value
 from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
 from service.observations.schema import Key
-from service.storage.models.answers import Answer, Summary
-from service.storage.models.answers import Star as FoundStar
-from service.storage.models.base import Page
 from service.storage.queries.results import OutcomeName, StatusName, answer_from_json
 from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid

@@ -12,9 +12,9 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.app.runs import MOST_COMPARED
+from service.contract.runs import Comparison, RefusedLine
 from service.errors import BadBatch
 from service.observations.schema import Key, OptionsIn, RunName
-from service.storage.models.runs import Comparison, RefusedLine
 from service.times import DAY_S, recorded_utc, unix_seconds, utc_now
 from service.vectors import Vector
 from service.web.api.batches import COMPARISON_S, SampleSize

@@ -6,9 +6,9 @@ from typing import Any, Literal
 
 from starlette.responses import Response
 
+from service.contract.spacecraft import MissionThen
 from service.errors import BadConfiguration
 from service.observations.schema import Key
-from service.storage.models.spacecraft import MissionThen
 from service.web.console.options import SYMBOLS
 from service.web.console.page import ContextDep, FromQuery, PageQuery, console_page
 from service.web.requests.access import Policy

@@ -16,11 +16,11 @@ from service.alarms.quantities import (
     ranked_names,
     trend_names,
 )
+from service.contract.alarms import Annotation
+from service.contract.answers import Summary
+from service.contract.base import Page
+from service.contract.spacecraft import MissionThen, Ranking
 from service.observations.schema import Key
-from service.storage.models.alarms import Annotation
-from service.storage.models.answers import Summary
-from service.storage.models.base import Page
-from service.storage.models.spacecraft import MissionThen, Ranking
 from service.storage.recording.unsaved_result import LIVE
 from service.times import (
     DAY_S,

@@ -3,8 +3,8 @@
 import math
 from typing import TYPE_CHECKING, Annotated, ClassVar
 
+from service.contract.base import Components, Count, Quaternion, Record, doc
 from service.observations.frame_record import rounded_counts
-from service.storage.models.base import Components, Count, Quaternion, Record, doc
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureAttitude, PictureResult

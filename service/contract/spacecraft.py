@@ -10,10 +10,10 @@ from pydantic import Field
 
 from service.acquire.result import TrackingState
 from service.alarms.quantities import QuantityName
-from service.storage.models import answers
-from service.storage.models.alarms import Alarm, AlarmSummary
-from service.storage.models.answers import Summary
-from service.storage.models.base import (
+from service.contract import answers
+from service.contract.alarms import Alarm, AlarmSummary
+from service.contract.answers import Summary
+from service.contract.base import (
     Components,
     Count,
     Covariance,

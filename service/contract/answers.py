@@ -9,9 +9,7 @@ from pydantic_core import CoreSchema
 
 from service.acquire.result import TrackingState
 from service.alarms.quantities import QUANTITIES, value_names
-from service.missions.mission import Identifier
-from service.observations.schema import BatchIn, NoPrediction, RateSource
-from service.storage.models.base import (
+from service.contract.base import (
     Count,
     Covariance,
     DescribedAs,
@@ -31,6 +29,8 @@ from service.storage.models.base import (
     list_record,
     page_record,
 )
+from service.missions.mission import Identifier
+from service.observations.schema import BatchIn, NoPrediction, RateSource
 
 
 class FrameTimings(Record, frozen=True, kw_only=True):

@@ -7,7 +7,7 @@ from msgspec import Struct
 from service.alarms.limits import LimitSettings
 from service.alarms.quantities import QuantityName
 from service.alarms.state_machine import AlarmActionName, AlarmState
-from service.storage.models.base import (
+from service.contract.base import (
     DescribedAs,
     Id,
     Moment,

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 from msgspec import UNSET, UnsetType
 from pydantic import Field
 
-from service.storage.models.base import (
+from service.contract.base import (
     Components,
     Count,
     Covariance,

@@ -7,8 +7,8 @@ from typing import Annotated, ClassVar, Literal
 from msgspec import UNSET, Struct, UnsetType, field
 from pydantic import Field
 
-from service.storage.models.answers import StarCounts
-from service.storage.models.base import (
+from service.contract.answers import StarCounts
+from service.contract.base import (
     Count,
     FieldFault,
     Id,
