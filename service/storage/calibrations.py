@@ -24,6 +24,7 @@ from service.contract.base import (
 from service.errors import NotFound, shown_value
 from service.storage.recording.ids import following_ulid
 from service.storage.sql.columns import Row
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.statements import execute, rows_of
 from service.storage.sql.tables import calibration_adoptions, calibrations
 
@@ -325,8 +326,7 @@ def begin_adoption(connection: Connection, id: str) -> str:
 
     Until the end of the transaction no other process adds one.
     """
-    if connection.dialect.name == "postgresql":
-        connection.exec_driver_sql("LOCK TABLE calibration_adoptions IN SHARE ROW EXCLUSIVE MODE")
+    dialect_of(connection).lock_table(connection, calibration_adoptions.name)
     newest = newest_adoption(connection)
     return id if id > newest else following_ulid(newest)
 

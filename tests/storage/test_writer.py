@@ -8,7 +8,7 @@ from sqlalchemy import Engine, event, func, insert, inspect, select, text
 from sqlalchemy.exc import IntegrityError, OperationalError
 
 from service.errors import Busy, Stopping
-from service.storage.recording.writer import PROBE_TABLE
+from service.storage.sql.dialects import PROBE_TABLE
 from service.storage.sql.tables import results, runs
 from service.storage.store import Store
 from tests.storage.recount import assert_equal_to_a_recount

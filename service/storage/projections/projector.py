@@ -31,8 +31,8 @@ from service.storage.recording.answer import state_in
 from service.storage.recording.chain import Statement
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
 from service.storage.sql.columns import Row, unpack
+from service.storage.sql.dialects import dialect_of, next_transaction
 from service.storage.sql.projector_lock import NotProjecting
-from service.storage.sql.statements import execute
 from service.storage.sql.tables import projector, results
 from service.storage.store import Store
 
@@ -258,8 +258,7 @@ class Projector:
         begun_s, most = time.monotonic(), self._most
         position = lock_position(connection)
         # Before the results are read: those of older transactions are among them.
-        is_shared = connection.dialect.name == "postgresql"
-        oldest = _transaction(connection, "xmin") if is_shared else None
+        oldest = dialect_of(connection).oldest_transaction(connection)
         new = recorded_after(connection, position, most)
         is_all = len(new) < most
         if oldest is not None:
@@ -296,7 +295,7 @@ class Projector:
         """True if no result between two places will come any more."""
         gap = self._gap
         if gap is None or gap.before != before or gap.after < after:
-            self._gap = _Gap(before, after, _transaction(connection, "xmax"))
+            self._gap = _Gap(before, after, next_transaction(connection))
             return False
         return oldest >= gap.next
 
@@ -338,9 +337,3 @@ def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
         store.writer.change(partial(rollups.renew, hours=chunk))
         step(first + len(chunk), len(hours))
     return len(hours)
-
-
-def _transaction(connection: Connection, which: str) -> int:
-    """A number of PostgreSQL's snapshot: `xmin`, the oldest left, or `xmax`, the next to come."""
-    ((number,),) = execute(connection, f"SELECT pg_snapshot_{which}(pg_current_snapshot())::text")
-    return int(number)

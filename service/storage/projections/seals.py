@@ -18,9 +18,9 @@ from sqlalchemy import (
     func,
     select,
 )
-from sqlalchemy.dialects import postgresql, sqlite
 
 from service.storage.projections.rollups import RecordedResult, lock_position
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.statements import Prepared
 from service.storage.sql.tables import projector, results, seals
 
@@ -40,8 +40,7 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
 
 def add(connection: Connection, chosen: ColumnElement[bool], sign: int = 1) -> None:
     """Add results to the seals of their hours, or take them out with a `sign` of -1."""
-    dialect = postgresql if connection.dialect.name == "postgresql" else sqlite
-    connection.execute(_adding(dialect, chosen, sign))
+    connection.execute(_adding(dialect_of(connection).module, chosen, sign))
 
 
 def _adding(dialect: Any, chosen: ColumnElement[bool], sign: int = 1) -> Executable:

@@ -25,6 +25,7 @@ from service.storage.recording import chain
 from service.storage.recording.ids import is_ulid
 from service.storage.sql.alarm_tables import annotations
 from service.storage.sql.columns import Row
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.statements import execute, insert_all, rows_of
 from service.storage.sql.tables import event_counter, events
 from service.times import Utc, utc_now
@@ -106,9 +107,7 @@ def numbered(connection: Connection) -> Iterator[None]:
     now = utc_now().text
     rows = [{"id": first + place, "at": now} | row for place, row in enumerate(outbox)]
     insert_all(connection, events, rows)
-    if connection.dialect.name == "postgresql":
-        # Other services wake at the commit, and read the table.
-        execute(connection, f"SELECT pg_notify('{CHANNEL}', '')")
+    dialect_of(connection).wake_listeners(connection, CHANNEL)
     if first // PRUNED_EVERY != (last + 1) // PRUNED_EVERY:
         connection.execute(delete(events).where(events.c.id <= last - KEPT))
 

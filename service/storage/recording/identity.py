@@ -21,6 +21,7 @@ from service.errors import Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, unpack
+from service.storage.sql.dialects import Dialect, dialect_of
 from service.storage.sql.statements import execute
 
 Identity = tuple[str, str, str]
@@ -31,48 +32,6 @@ OwnKey = tuple[str, str]
 
 The id is empty where a key came without a token.
 """
-
-# The wanted identities and keys are one JSON value, so that the text of each statement never
-# changes: compiling a statement for many values takes longer than running it.
-_BY_IDENTITY = {
-    "sqlite": """
-        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint, {archived}
-        FROM json_each(:wanted) AS w CROSS JOIN {table} AS b
-        WHERE b.spacecraft = json_extract(w.value, '$[0]')
-          AND b.run = json_extract(w.value, '$[1]') AND b.batch = json_extract(w.value, '$[2]')
-    """,
-    "postgresql": """
-        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint, {archived}
-        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN {table} AS b
-        ON b.spacecraft = w->>0 AND b.run = w->>1 AND b.batch = w->>2
-    """,
-}
-_ARCHIVED_BY_IDENTITY = {
-    dialect: sql.format(table="archived_batches", archived=1)
-    for dialect, sql in _BY_IDENTITY.items()
-}
-# One statement sees one moment: a batch that is being archived is found in one of the two.
-_KNOWN_BY_IDENTITY = {
-    dialect: sql.format(table="batches", archived=0) + "UNION ALL" + _ARCHIVED_BY_IDENTITY[dialect]
-    for dialect, sql in _BY_IDENTITY.items()
-}
-_AMONG = {
-    "sqlite": "(SELECT value FROM json_each(:wanted))",
-    "postgresql": "(SELECT json_array_elements_text(CAST(%(wanted)s AS json)))",
-}
-_BY_KEY = {
-    "sqlite": """
-        SELECT k.token_id, k.key, k.result_id, k.fingerprint
-        FROM json_each(:wanted) AS w CROSS JOIN idempotency_keys AS k
-        WHERE k.token_id = json_extract(w.value, '$[0]') AND k.key = json_extract(w.value, '$[1]')
-    """,
-    "postgresql": """
-        SELECT k.token_id, k.key, k.result_id, k.fingerprint
-        FROM json_array_elements(CAST(%(wanted)s AS json)) AS w JOIN idempotency_keys AS k
-        ON k.token_id = w->>0 AND k.key = w->>1
-    """,
-}
-_ANSWERS = "SELECT id, answer FROM results WHERE id IN "
 
 
 class ExistingResult(Struct, frozen=True):
@@ -139,14 +98,14 @@ def look_up(
 ) -> Registry:
     """The recorded results of these identities and keys."""
     registry = Registry()
-    dialect = connection.dialect.name
+    dialect = dialect_of(connection)
     if identities:
-        rows = _rows(connection, _KNOWN_BY_IDENTITY[dialect], identities)
+        rows = _rows(connection, _known_by_identity(dialect), identities)
         for spacecraft, run, batch, id, fingerprint, archived in rows:
             found = ExistingResult(id, fingerprint, bool(archived))
             registry.identities[spacecraft, run, batch] = found
     if keys:
-        rows = _rows(connection, _BY_KEY[dialect], keys)
+        rows = _rows(connection, _by_key(dialect), keys)
         registry.keys = {
             (token_id, key): ExistingResult(id, fingerprint)
             for token_id, key, id, fingerprint in rows
@@ -159,7 +118,7 @@ def require_not_archived(connection: Connection, identities: Collection[Identity
 
     The insert waits for a transaction that archives the same batch, and this sees its end.
     """
-    if identities and _rows(connection, _ARCHIVED_BY_IDENTITY[connection.dialect.name], identities):
+    if identities and _rows(connection, _archived(dialect_of(connection)), identities):
         raise ArchivedMeanwhile
 
 
@@ -191,8 +150,42 @@ def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
 
 def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
     """The answers of recorded results, byte for byte as first sent."""
-    rows = _rows(connection, _ANSWERS + _AMONG[connection.dialect.name], ids) if ids else ()
+    sql = f"SELECT id, answer FROM results WHERE id IN ({dialect_of(connection).wanted_texts})"
+    rows = _rows(connection, sql, ids) if ids else ()
     return {id: unpack(answer).encode() for id, answer in rows}
+
+
+# The wanted identities and keys are one JSON value, so that the text of each statement never
+# changes: compiling a statement for many values takes longer than running it.
+
+
+@cache
+def _known_by_identity(dialect: Dialect) -> str:
+    # One statement sees one moment: a batch that is being archived is found in one of the two.
+    return f"{_by_identity(dialect, 'batches', archived=0)} UNION ALL {_archived(dialect)}"
+
+
+@cache
+def _archived(dialect: Dialect) -> str:
+    return _by_identity(dialect, "archived_batches", archived=1)
+
+
+def _by_identity(dialect: Dialect, table: str, archived: int) -> str:
+    item = dialect.item
+    return f"""
+        SELECT b.spacecraft, b.run, b.batch, b.id, b.fingerprint, {archived}
+        FROM {dialect.wanted} CROSS JOIN {table} AS b
+        WHERE b.spacecraft = {item(0)} AND b.run = {item(1)} AND b.batch = {item(2)}
+    """
+
+
+@cache
+def _by_key(dialect: Dialect) -> str:
+    return f"""
+        SELECT k.token_id, k.key, k.result_id, k.fingerprint
+        FROM {dialect.wanted} CROSS JOIN idempotency_keys AS k
+        WHERE k.token_id = {dialect.item(0)} AND k.key = {dialect.item(1)}
+    """
 
 
 # ---- digests ----------------------------------------------------------------------------------

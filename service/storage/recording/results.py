@@ -22,6 +22,7 @@ from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.sql import tables
 from service.storage.sql.chain_tables import record_leaves
 from service.storage.sql.columns import Row
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
 from service.storage.sql.tables import audit
 
@@ -238,23 +239,5 @@ def next_seqs(connection: Connection, count: int) -> list[int]:
     it takes places: whoever sees a later place, and finds that no transaction of that moment is
     left, knows that the missing ones will not come.
     """
-    rows = execute(connection, _NEXT_SEQS[connection.dialect.name], {"count": count})
+    rows = execute(connection, dialect_of(connection).next_seqs, {"count": count})
     return [int(place) for *_, place in rows]
-
-
-_NEXT_SEQS = {
-    # Of results that were deleted before they were projected nothing is left to tell.
-    "sqlite": """
-        WITH RECURSIVE next(seq, n) AS (
-            SELECT max(
-                ifnull((SELECT max(seq) FROM record_leaves), 0),
-                ifnull((SELECT max(seq) FROM results), 0), (SELECT seq FROM projector)
-            ), 0
-            UNION ALL SELECT seq + 1, n + 1 FROM next WHERE n < :count
-        ) SELECT seq FROM next WHERE n > 0
-    """,
-    "postgresql": """
-        SELECT pg_current_xact_id()::text, nextval('results_seq')
-        FROM generate_series(1, %(count)s)
-    """,
-}

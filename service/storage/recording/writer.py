@@ -26,6 +26,7 @@ from service.storage.recording.identity import ArchivedMeanwhile
 from service.storage.recording.results import RecordOutcome, record
 from service.storage.recording.unsaved_result import UnsavedResult
 from service.storage.sql.database_file import DatabaseFile, FileLock
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.engines import TO_WRITE, PersistentConnection, RolledBack, patience
 from service.storage.sql.projector_lock import Attempt, ProjectorLock
 from service.storage.sql.statements import execute
@@ -41,9 +42,6 @@ WriteOutcomes = list[WriteOutcome]
 MAX_ATTEMPTS = 5
 MAX_LOOKS = 5
 RETRY_AFTER_S = 5
-PROBE_BYTES = 1 << 20
-"""The probe that readiness writes after a failed write: as much as a batch of many stars."""
-PROBE_TABLE = "probe_of_room"
 
 # PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
 _CROSSED = ("40001", "40P01")
@@ -398,22 +396,13 @@ def may_pass(error: exc.DBAPIError) -> bool:
 
 def _write_as_a_batch(connection: Connection) -> None:
     """Take the locks that a post takes, and write as much as a large batch does."""
-    if connection.dialect.name == "postgresql":
-        names = ", ".join(sorted(table.name for table in WRITTEN_BY_POSTS))
-        connection.exec_driver_sql(f"LOCK TABLE {names} IN ROW EXCLUSIVE MODE")
-        connection.exec_driver_sql(
-            f"SELECT pg_logical_emit_message(true, 'acquire', repeat('0', {PROBE_BYTES}))"
-        )
-    else:
-        # Of what is written and freed in one transaction SQLite writes nothing.
-        connection.exec_driver_sql(f"CREATE TABLE IF NOT EXISTS {PROBE_TABLE} (content BLOB)")
-        connection.exec_driver_sql(f"INSERT INTO {PROBE_TABLE} VALUES (zeroblob({PROBE_BYTES}))")
+    names = [table.name for table in WRITTEN_BY_POSTS]
+    dialect_of(connection).write_probe(connection, names)
     # There and back: of a row that gets the value it has SQLite writes nothing.
     for step in (1, -1):
         connection.execute(update(event_counter).values(last=event_counter.c.last + step))
 
 
 def remove_probe(connection: Connection) -> None:
-    """Give back what a probe wrote on SQLite, also one of a process that was killed."""
-    if connection.dialect.name == "sqlite":
-        connection.exec_driver_sql(f"DROP TABLE IF EXISTS {PROBE_TABLE}")
+    """Give back what a probe wrote, also one of a process that was killed."""
+    dialect_of(connection).remove_probe(connection)

@@ -21,6 +21,7 @@ from sqlalchemy.pool import QueuePool
 
 from service.errors import BadConfiguration, Busy
 from service.storage.sql.database_file import DatabaseFile, FileIdentity
+from service.storage.sql.dialects import dialect_of
 
 if TYPE_CHECKING:
     from psycopg.abc import PQGen
@@ -91,7 +92,7 @@ class PersistentConnection:
         self._file = file
         self._log: FileIdentity | None = None
         self._turn_s = -1.0 if turn_s is None else turn_s
-        self._is_sqlite = engine.dialect.name == "sqlite"
+        self._is_shared = dialect_of(engine).is_shared
         self._lock = threading.Lock()
         self._open: Connection | None = None
 
@@ -123,7 +124,7 @@ class PersistentConnection:
     def lookup(self) -> Iterator[Connection]:
         """A connection for look-ups; on SQLite each prepared statement sees its own snapshot."""
         with self._exclusive() as connection:
-            if not self._is_sqlite:
+            if self._is_shared:
                 connection.begin()
             yield connection
             # SQLAlchemy has begun one if it ran a statement itself.
@@ -159,19 +160,19 @@ class PersistentConnection:
 
         The session may hold a lock, which would be lost with it.
         """
-        if self._is_sqlite or connection.invalidated or connection.in_transaction():
+        if not self._is_shared or connection.invalidated or connection.in_transaction():
             return False
         driver: Any = connection.connection.driver_connection
         return bool(driver.info.transaction_status.name == "IDLE")
 
     def _keep(self, connection: Connection) -> None:
-        if self._is_sqlite:
+        if not self._is_shared:
             self._open = connection
         else:
             connection.close()
 
     def _start(self, connection: Connection) -> None:
-        if self._is_sqlite:
+        if not self._is_shared:
             run_by_driver(connection, self._begin)
             if self._file is not None:
                 self._log = self._file.log_identity()

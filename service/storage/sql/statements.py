@@ -9,10 +9,10 @@ from operator import itemgetter
 from typing import Any, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import DBAPIError
 
 from service.storage.sql.columns import PackedText, Row, pack
+from service.storage.sql.dialects import Dialect, dialect_of
 from service.storage.sql.engines import TranslatedErrors
 from service.storage.sql.tables import COUNTS, MAXIMA, MINIMA, SUMS, runs
 
@@ -20,13 +20,11 @@ T = TypeVar("T")
 
 # SQLAlchemy compiles a statement at every execution and wraps every row.  With a
 # dozen statements for each group of results that takes longer than running them.
-# On SQLite the compiled text goes to the driver directly, with values by position;
-# on PostgreSQL through SQLAlchemy, with values by name.
+# For a file the compiled text goes to the driver directly, with values by position;
+# for a server through SQLAlchemy, with values by name.
 
 ROWS_AT_ONCE = (64, 8)
 """Few sizes, so that the driver keeps what it made of each statement."""
-
-_STYLES = {"sqlite": (sqlite, "qmark"), "postgresql": (postgresql, "pyformat")}
 
 
 class Prepared:
@@ -35,7 +33,7 @@ class Prepared:
     def __init__(self, make: Callable[[Any], sa.Executable]) -> None:
         """`make` is given the module of a dialect, whose `insert` knows of conflicts."""
         self._make = make
-        self._ready: dict[str, tuple[str, tuple[str, ...]]] = {}
+        self._ready: dict[Dialect, tuple[str, tuple[str, ...]]] = {}
         self._of_many: dict[int, str] = {}
         self._constants: Row = {}
         """Values that are part of the statement itself."""
@@ -44,10 +42,11 @@ class Prepared:
         """Run the statement with the values of every row, by name."""
         if not rows:
             return
-        sql, names = self._sql(connection.dialect.name)
+        dialect = dialect_of(connection)
+        sql, names = self._sql(dialect)
         if self._constants:
             rows = [self._constants | row for row in rows]
-        if connection.dialect.name != "sqlite":
+        if dialect.is_shared:
             connection.exec_driver_sql(sql, list(rows))
             return
         take = itemgetter(*names)
@@ -60,34 +59,37 @@ class Prepared:
         The driver lets go of the interpreter's lock with every step, and while
         others compute it takes longer to get that back than to write a row.
         """
-        if connection.dialect.name != "sqlite" or len(rows) < ROWS_AT_ONCE[-1]:
+        dialect = dialect_of(connection)
+        if dialect.is_shared or len(rows) < ROWS_AT_ONCE[-1]:
             self.run(connection, rows)
             return
-        sql, names = self._sql("sqlite")
+        sql, names = self._sql(dialect)
         values = list(map(itemgetter(*names), rows))
         done = 0
         with TranslatedErrors(connection, sql) as driver:
             for count in ROWS_AT_ONCE:
                 while len(values) - done >= count:
                     part = values[done : done + count]
-                    driver.execute(self._many(count), list(chain.from_iterable(part)))
+                    driver.execute(
+                        self._many(sql, len(names), count), list(chain.from_iterable(part))
+                    )
                     done += count
             driver.executemany(sql, values[done:])
 
-    def _many(self, count: int) -> str:
+    def _many(self, sql: str, columns: int, count: int) -> str:
         """The statement of so many rows; always the same object, whose hash is known."""
         many = self._of_many.get(count)
         if many is None:
-            sql, names = self._sql("sqlite")
-            one_more = ", (" + ", ".join("?" * len(names)) + ")"
+            one_more = ", (" + ", ".join("?" * columns) + ")"
             many = self._of_many[count] = sql + one_more * (count - 1)
         return many
 
     def read(self, connection: sa.Connection, values: Row) -> list[Row]:
         """The rows that the statement gives."""
-        sql, names = self._sql(connection.dialect.name)
+        dialect = dialect_of(connection)
+        sql, names = self._sql(dialect)
         values = self._constants | values
-        if connection.dialect.name != "sqlite":
+        if dialect.is_shared:
             found = connection.exec_driver_sql(sql, values)
             return [dict(row) for row in found.mappings()]
         with TranslatedErrors(connection, sql) as driver:
@@ -95,13 +97,13 @@ class Prepared:
             rows = cursor.fetchall()
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
 
-    def _sql(self, dialect: str) -> tuple[str, tuple[str, ...]]:
+    def _sql(self, dialect: Dialect) -> tuple[str, tuple[str, ...]]:
         """The text, and the names of its values in the order of their places."""
         ready = self._ready.get(dialect)
         if ready is None:
-            kind, style = _STYLES[dialect]
-            compiled: Any = self._make(kind)
-            compiled = compiled.compile(dialect=kind.dialect(paramstyle=style))
+            module: Any = dialect.module
+            compiled: Any = self._make(module)
+            compiled = compiled.compile(dialect=module.dialect(paramstyle=dialect.paramstyle))
             self._constants = {
                 name: value for name, value in compiled.params.items() if value is not None
             }
@@ -118,7 +120,7 @@ def execute(
     connection: sa.Connection, sql: str, values: Row | None = None
 ) -> list[tuple[Any, ...]]:
     """Run SQL of the dialect's own, values by name; its rows."""
-    if connection.dialect.name != "sqlite":
+    if dialect_of(connection).is_shared:
         result = connection.exec_driver_sql(sql, values or {})
         return [tuple(row) for row in result] if result.returns_rows else []
     with TranslatedErrors(connection, sql) as driver:
@@ -174,10 +176,10 @@ _COPIED: Sequence[tuple[type[Any], str]] = (
 
 def insert_all(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
     """Insert rows that name every column; on PostgreSQL many of them by COPY."""
-    if len(rows) >= COPIED_FROM and connection.dialect.name == "postgresql":
+    if len(rows) >= COPIED_FROM and dialect_of(connection).is_shared:
         _copy(connection, table, rows)
         return
-    if connection.dialect.name == "sqlite":
+    if not dialect_of(connection).is_shared:
         for name in _packed(table):
             rows = [row | {name: pack(row[name])} for row in rows]
     _insert(table).insert(connection, rows)

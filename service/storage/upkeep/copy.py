@@ -22,6 +22,7 @@ from service.errors import BadConfiguration
 from service.storage.sql import engines, migrations
 from service.storage.sql.columns import HAS_FIRST_ROW
 from service.storage.sql.database_file import writing_alone
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.projector_lock import ProjectorLock
 from service.storage.sql.statements import count, insert_all
 from service.storage.upkeep.verify import verify
@@ -101,8 +102,8 @@ def _named(argument: str) -> Iterator[None]:
 
 
 def _take_lock(connection: sa.Connection) -> None:
-    """Hold the projector's lock of PostgreSQL until the session ends."""
-    if connection.dialect.name != "postgresql":
+    """Hold the projector's lock of a shared database until the session ends."""
+    if not dialect_of(connection).is_shared:
         return
     if ProjectorLock().take(connection) != "taken":
         raise BadConfiguration(
@@ -241,7 +242,7 @@ def _digest(connection: sa.Connection, table: sa.Table) -> int:
 
 def _set_sequences(connection: sa.Connection, tables: Sequence[sa.Table]) -> None:
     """Let PostgreSQL's next numbers come after those that were copied; SQLite looks for itself."""
-    if connection.dialect.name != "postgresql":
+    if not dialect_of(connection).is_shared:
         return
     after = "coalesce(max({0}), 0) + 1, false) FROM {1}"
     connection.execute(

@@ -37,6 +37,7 @@ from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.signing import PublicKey
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, metadata
+from service.storage.sql.dialects import dialect_of
 from service.storage.sql.engines import database_url, reading_engine
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.migrations import check, disposed, reading, reported
@@ -72,7 +73,7 @@ def verify(
         return problems
     url = database_url(database)
     engine = reading_engine(url)
-    if engine.dialect.name == "sqlite":
+    if not dialect_of(engine).is_shared:
         sa.event.listen(engine, "connect", _read_any_text)
     with disposed(engine), reported(url):
         found = list(_of_the_file(engine))
@@ -105,7 +106,7 @@ def earlier_results(database: str) -> tuple[int, int]:
 
 
 def _of_the_file(engine: sa.Engine) -> Iterator[str]:
-    if engine.dialect.name != "sqlite":
+    if dialect_of(engine).is_shared:
         return
     try:
         with engine.begin() as connection:
@@ -118,7 +119,7 @@ def _of_the_file(engine: sa.Engine) -> Iterator[str]:
 
 
 def _of_the_references(engine: sa.Engine) -> Iterator[str]:
-    if engine.dialect.name != "sqlite":
+    if dialect_of(engine).is_shared:
         return
     with engine.begin() as connection:
         for name, row, parent, _ in connection.exec_driver_sql("PRAGMA foreign_key_check").all():
