@@ -44,7 +44,7 @@ DEV = $(VENV)/.installed-dev
 
 .DEFAULT_GOAL = help
 .PHONY: help run test full kernels torture mutants check static format-check lint types floors \
-	migrations-check openapi-check \
+	migrations-check openapi-check client client-check \
 	format lock bench compare stale pythons dist openapi clean
 
 help:
@@ -55,7 +55,7 @@ help:
 	@echo "              stopped); PARTS=\"kills and sqlite\" for some, as pytest -k has it"
 	@echo "make mutants  give the service 60 single faults, one at a time, and say which of them"
 	@echo "              the tests miss (hours; goes on where it stopped)"
-	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml"
+	@echo "make check    tests, format, lint, types, import floors, migrations, openapi.yaml, client"
 	@echo "make format   format the code and mend what the linter can"
 	@echo "make bench    measure speed, write docs/performance.md; BENCH_ARGS=--all for all benchmarks"
 	@echo "make compare  send the same inputs to this version and to BASE=commit, show differences"
@@ -104,7 +104,7 @@ check: $(DEV)
 	@echo "== all checks passed"
 
 static: $(DEV)
-	@MAKEFLAGS= $(MAKE) --no-print-directory format-check lint types floors migrations-check openapi-check
+	@MAKEFLAGS= $(MAKE) --no-print-directory format-check lint types floors migrations-check openapi-check client-check
 
 format-check: $(DEV)
 	@echo "== format"
@@ -129,6 +129,10 @@ migrations-check: $(DEV)
 openapi-check: $(DEV)
 	@echo "== openapi.yaml"
 	@$(BIN)/acquire openapi --check
+
+client-check: $(DEV)
+	@echo "== generated parts of the client"
+	@$(BIN)/python client/generate.py --check
 
 format: $(DEV)
 	@$(BIN)/ruff format
@@ -163,6 +167,10 @@ dist: $(DEV)
 # Written beside and then moved: a failure leaves the old file.
 openapi: $(DEV)
 	@$(BIN)/acquire openapi > openapi.yaml.new && mv openapi.yaml.new openapi.yaml || { rm -f openapi.yaml.new; exit 1; }
+
+# From the records of the service, and the synchronous half from the asynchronous one.
+client: $(DEV)
+	@$(BIN)/python client/generate.py
 
 # The second lock is bound to the first, so that one .venv serves both.
 lock: $(DEV)

@@ -16,11 +16,12 @@ import time
 from collections.abc import Callable, Collection, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, Literal, Protocol, get_args
+from typing import Any, Protocol, get_args
 
 from sqlalchemy import Connection, delete, insert, select, update
 
-from service.contract.base import Id, Page, Record, Stamp, doc, list_record, page_record
+from service.contract.access import AuditEntry, NewToken, Scope, Token, TokenState
+from service.contract.base import Page
 from service.errors import (
     BadInput,
     Busy,
@@ -38,63 +39,6 @@ from service.storage.recording.signatures import signed_in
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import access_sessions, access_tokens, audit
 from service.times import DAY_S, Utc, shifted, utc_now
-
-Scope = Literal["read", "submit", "operate"]
-
-
-class Session(Record, frozen=True, kw_only=True):
-    """The caller and its scopes."""
-
-    name: str | None
-    """The token's name, which the audit list records with each change."""
-    scopes: list[Scope]
-    spacecraft: list[str] | None
-    """Spacecraft that the token is bound to; null: all."""
-
-
-TokenState = Literal["good", "expired", "revoked"]
-
-
-class Token(Record, frozen=True, kw_only=True):
-    """A token without its secret, of which only a digest is stored."""
-
-    name: Annotated[str, doc("The audit list records changes under it; never used again.")]
-    scopes: list[Scope]
-    spacecraft: list[str] | None
-    """Spacecraft that the token is bound to; null: all."""
-    rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
-    created: Stamp
-    expires: Stamp
-    revoked: Stamp | None
-    state: TokenState
-
-
-class NewToken(Token, frozen=True, kw_only=True):
-    """A new token with its secret, which is shown this once."""
-
-    token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
-
-
-TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
-
-
-class AuditEntry(Record, frozen=True, kw_only=True):
-    """One change."""
-
-    component: ClassVar[str] = "AuditRow"
-    id: Id
-    moment: Stamp
-    who: Annotated[str, doc("The token's name; `local` while access is open.")]
-    action: Annotated[str, doc("The operation's name in this description.")]
-    about: Annotated[str, doc("Path and query of the request.")]
-    body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
-    status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
-    person: Annotated[str, doc("Who signed the request; without a signature the token's name.")]
-    reason: Annotated[str | None, doc("The comment or the note that was sent with it.")]
-
-
-AuditPage = page_record("AuditPage", AuditEntry, "A page of changes.")
-
 
 MAX_BODY_KEPT = 4_000
 

@@ -1,19 +1,14 @@
-"""The base of all models, and what several modules share."""
+"""The base of all models."""
 
-from typing import TYPE_CHECKING, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
 from msgspec import Struct
 
-OutcomeWord = Literal["unique", "ambiguous", "unmatched"]
-StatusWord = Literal["good", "suspect"]
-IdentifierWord = Literal["verified", "starid", "lost_in_space", "ptp"]
 if TYPE_CHECKING:
-    Outcome = OutcomeWord
-    Status = StatusWord
-    Identifier = IdentifierWord
-else:
-    # A later service may know further words: they are read, too.
-    Outcome = Status = Identifier = str
+    import pandas as pd
+    import pyarrow as pa
+
+    from .models import History
 
 T = TypeVar("T")
 
@@ -34,9 +29,23 @@ class Page(Struct, Generic[T], frozen=True):
     next_cursor: str | None = None
 
 
-class FieldFault(Model, frozen=True):
-    """One fault of a request or a line: the field, what is expected, and the value received."""
+class Tabulated(Model, frozen=True):
+    """The methods of quantities over time that make tables of them."""
 
-    field: str
-    message: str
-    value: str | None
+    def to_arrow(self) -> "pa.Table":
+        """A table with a row for each point; a column such as `residual_rms_arcsec.mean`.
+
+        Raises `PackageMissing` where pyarrow is not installed.
+        """
+        from .tables import table_of_history
+
+        return table_of_history(cast("History", self))
+
+    def to_pandas(self) -> "pd.DataFrame":
+        """The same as a data frame.
+
+        Raises `PackageMissing` where pandas and pyarrow are not both installed.
+        """
+        from .tables import pandas_of
+
+        return pandas_of(self.to_arrow())

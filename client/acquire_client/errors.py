@@ -23,7 +23,6 @@
 Not finding a star is a result and raises nothing.  Nothing but this module knows a status.
 """
 
-from collections.abc import Sequence
 from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from typing import TYPE_CHECKING
@@ -31,21 +30,10 @@ from typing import TYPE_CHECKING
 import httpx
 import msgspec
 
-from .base import FieldFault, Model
+from .models.problems import ProblemDocument
 
 if TYPE_CHECKING:
     from .models import Replay
-
-
-class ProblemDocument(Model, frozen=True):
-    """A problem as the service describes it (RFC 9457)."""
-
-    type: str
-    title: str
-    status: int
-    detail: str
-    instance: str
-    errors: Sequence[FieldFault] = ()
 
 
 class ClientError(Exception):
@@ -187,8 +175,13 @@ def problem_of(response: httpx.Response) -> Problem:
         if response.is_redirect and (place := response.headers.get("Location")):
             leads = response.request.url.join(place)
             detail = f"HTTP {status} leads to {leads}: give the client that address"
-        path = response.request.url.path
-        document = ProblemDocument("about:blank", response.reason_phrase, status, detail, path)
+        document = ProblemDocument(
+            type="about:blank",
+            title=response.reason_phrase,
+            status=status,
+            detail=detail,
+            instance=response.request.url.path,
+        )
     kind = _BY_TYPE.get(document.type) or _BY_STATUS.get(response.status_code, ServiceFailed)
     return kind(document, retry_after_s(response))
 

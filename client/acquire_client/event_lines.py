@@ -5,106 +5,27 @@ from typing import Any, Literal, cast, get_args, get_type_hints
 
 import msgspec
 
-from . import models
 from .base import Model
 from .errors import UnexpectedAnswer
+from .events import KnownEvent
 
 
-class _Numbered(Model, frozen=True):
-    id: int
-
-
-class BatchesEvent(_Numbered, frozen=True):
-    """Batches that were recorded."""
-
-    kind: Literal["batches"]
-    data: models.Recorded
-
-
-class AdoptedEvent(_Numbered, frozen=True):
-    """A what-if that was adopted."""
-
-    kind: Literal["adopted"]
-    data: models.Adopted
-
-
-class AlarmEvent(_Numbered, frozen=True):
-    """An alarm that changed."""
-
-    kind: Literal["alarm"]
-    data: models.Alarm
-
-
-class LimitEvent(_Numbered, frozen=True):
-    """Limits that were set."""
-
-    kind: Literal["limit"]
-    data: models.Limit
-
-
-class AnnotationEvent(_Numbered, frozen=True):
-    """A note that was written or deleted."""
-
-    kind: Literal["annotation"]
-    data: models.AnnotationChange
-
-
-class ReplayEvent(_Numbered, frozen=True):
-    """A replay that went on."""
-
-    kind: Literal["replay"]
-    data: models.ReplayProgress
-
-
-class GyroEvent(_Numbered, frozen=True):
-    """A gyro block that was recorded."""
-
-    kind: Literal["gyro"]
-    data: models.GyroBlock
-
-
-class TrackingEvent(_Numbered, frozen=True):
-    """A tracking state that changed."""
-
-    kind: Literal["tracking"]
-    data: models.TrackingChange
-
-
-class CalibrationEvent(_Numbered, frozen=True):
-    """A calibration that was adopted, or taken back."""
-
-    kind: Literal["calibration"]
-    data: models.CalibrationChange
-
-
-class OtherEvent(_Numbered, frozen=True):
+class OtherEvent(Model, frozen=True):
     """An event of a kind that a later service added: the word is `name`."""
 
+    id: int
     kind: Literal["other"]
     name: str
     data: dict[str, Any]
 
 
-Event = (
-    BatchesEvent
-    | AdoptedEvent
-    | AlarmEvent
-    | LimitEvent
-    | AnnotationEvent
-    | ReplayEvent
-    | GyroEvent
-    | TrackingEvent
-    | CalibrationEvent
-    | OtherEvent
-)
+Event = KnownEvent | OtherEvent
 """Something that happened, by its number: numbers have no gaps and are in order of commit.
 
 `kind` says which it is, and so what `data` is.
 """
 _BY_KIND: Mapping[str, Any] = {
-    get_args(get_type_hints(each)["kind"])[0]: each
-    for each in get_args(Event)
-    if each is not OtherEvent
+    get_args(get_type_hints(each)["kind"])[0]: each for each in get_args(KnownEvent)
 }
 
 

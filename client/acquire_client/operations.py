@@ -12,11 +12,11 @@ import httpx
 import msgspec
 
 from . import models
-from .base import Outcome, Status
 from .calls import Call, Listing, get, get_items, paged_list, post, single_request
 from .encoding import Batch, Time, decoded, parameters_of, path_of
 from .errors import Problem, UnexpectedAnswer
 from .retrying import Repeat
+from .words import Outcome, Status
 
 T = TypeVar("T")
 

@@ -12,8 +12,9 @@ import msgspec
 from sqlalchemy import Connection
 
 from service import errors
-from service.access import MAX_DAYS, Entry, NewToken, Token, Tokens
+from service.access import MAX_DAYS, Entry, Tokens
 from service.cli.arguments import http_client, print_json, refusal_of, service_url, settings_of
+from service.contract.access import NewToken, Token
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.storage.readers import Readers

@@ -80,7 +80,7 @@ class LimitPreview(Record, frozen=True, kw_only=True):
     start: Annotated[Moment | None, doc("Time of the first batch; null: there is none.")]
     end: Annotated[Moment | None, doc("Time of the last batch.")]
     batches: int
-    is_cut: Annotated[bool, doc("Whether the days have more batches: these are the latest.")]
+    is_cut: Annotated[bool, doc("True if the days have more batches: these are the latest.")]
     proposed: LimitTrial
     in_force: LimitTrial
 

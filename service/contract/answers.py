@@ -10,6 +10,7 @@ from pydantic_core import CoreSchema
 from service.acquire.result import TrackingState
 from service.alarms.quantities import QUANTITIES, value_names
 from service.contract.base import (
+    Absent,
     Count,
     Covariance,
     DescribedAs,
@@ -18,7 +19,6 @@ from service.contract.base import (
     MissionSettings,
     Moment,
     Outcome,
-    Problem,
     Quaternion,
     Reason,
     Record,
@@ -29,8 +29,11 @@ from service.contract.base import (
     list_record,
     page_record,
 )
-from service.missions.mission import Identifier
+from service.contract.problems import Problem
+from service.missions import mission
 from service.observations.schema import BatchIn, NoPrediction, RateSource
+
+Identifier = Annotated[str, DescribedAs(mission.Identifier)]
 
 
 class FrameTimings(Record, frozen=True, kw_only=True):
@@ -59,7 +62,7 @@ class FrameSummary(Record, frozen=True, kw_only=True):
     noise_counts: Annotated[float, doc("Standard deviation of a background pixel.")]
     candidates: Annotated[Count, doc("Detections above the threshold, without hot pixels.")]
     measured: Annotated[Count, doc("The brightest of these, whose positions were measured.")]
-    used: Annotated[Count, doc("Of these, the stars in the batch.")]
+    used: Annotated[Count, doc("Measured detections that are stars of the batch.")]
     hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
     timings_us: FrameTimings
     remarks: list[str] | UnsetType = UNSET
@@ -95,7 +98,7 @@ class Detection(Record, frozen=True, kw_only=True):
             ),
         ]
     ]
-    used: Annotated[bool, doc("Whether it is in the batch. The batch has the same order.")]
+    used: Annotated[bool, doc("True if it is in the batch, which has the same order.")]
     left_out: Annotated[str | None, doc("Why it is not in the batch.")]
 
 
@@ -206,7 +209,7 @@ class Rival(Record, frozen=True, kw_only=True):
 
 
 class Attitude(Record, frozen=True, kw_only=True):
-    """An attitude with its accuracy and its consistency."""
+    """An attitude with its accuracy and consistency; use it only where `status` is good."""
 
     component: ClassVar[str] = "AttitudeOut"
     quaternion: Quaternion
@@ -259,7 +262,9 @@ class Prediction(Record, frozen=True, kw_only=True):
 
     component: ClassVar[str] = "PredictionOut"
     quaternion: Quaternion
-    covariance_arcsec2: Annotated[Covariance, doc("Of the rotation about the body axes.")]
+    covariance_arcsec2: Annotated[
+        Covariance, doc("Covariance of the rotation about the body axes.")
+    ]
     margin_deg: Annotated[float, doc("How far the zones reach beyond the fields of view.")]
     result: Annotated[str | None, doc("The result whose attitude it came from.")]
     age_s: Annotated[float | None, doc("Time since that attitude.")]
@@ -282,12 +287,13 @@ class Tracking(Record, frozen=True, kw_only=True):
 class Answer(Record, frozen=True, kw_only=True):
     """The answer to a batch, as it is recorded."""
 
+    client_name: ClassVar[str] = "WhatIf"
     id: Annotated[Id | None, doc("null for a what-if that was not recorded.")]
     spacecraft: str
     batch: str
     run: str
     time: Moment
-    identifier: Annotated[str, DescribedAs(Identifier)]
+    identifier: Identifier
     path: Annotated[
         str, DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space", "measured"])
     ]
@@ -304,11 +310,21 @@ class Answer(Record, frozen=True, kw_only=True):
     provenance: Provenance
     parent: Id | UnsetType | None = UNSET
     """Only for a what-if: the result that it started from."""
-    recorded: Annotated[bool | UnsetType, doc("For a what-if: whether it was recorded.")] = UNSET
+    recorded: Annotated[
+        bool | UnsetType, Absent(True), doc("For a what-if: whether it was recorded.")
+    ] = UNSET
     frame: FrameSummary | UnsetType | None = UNSET
     """Only for a batch that was made from a frame."""
     tracking: Tracking | UnsetType | None = UNSET
     """Only for a batch that asks for the last attitude."""
+
+
+class RecordedAnswer(Answer, frozen=True, kw_only=True):
+    """The answer to a batch that was recorded."""
+
+    component: ClassVar[str] = ""
+    client_name: ClassVar[str] = "Answer"
+    id: Id
 
 
 class _MeasuresShape:
@@ -349,8 +365,8 @@ class Summary(Record, frozen=True, kw_only=True):
     reason: Reason | None
     measures: Measures
     parent: Annotated[Id | None, doc("For a what-if: the result that it started from.")]
-    current: Annotated[bool, doc("Whether this is the current result of its batch.")]
-    archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
+    current: Annotated[bool, doc("True if this is the current result of its batch.")]
+    archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
 
 
 BatchPage = page_record("BatchPage", Summary, "A page of results.")
@@ -368,7 +384,7 @@ class Result(Record, frozen=True, kw_only=True):
     """A result with its batch, and the other results of that batch."""
 
     component: ClassVar[str] = "Record"
-    answer: Answer
+    answer: Annotated[RecordedAnswer, DescribedAs(Answer)]
     input: Annotated[dict[str, Any], DescribedAs(BatchIn)]
     """The batch as it was sent, without default values. The service adds the prediction to one that
     asks for the last attitude."""
@@ -380,7 +396,7 @@ class Result(Record, frozen=True, kw_only=True):
     parent: Id | None
     signature: Signature | UnsetType | None = UNSET
     """Only for a recorded what-if: who recorded it; null where the audit list does not know."""
-    archived: Annotated[bool, doc("Whether it is read from the archive, which takes longer.")]
+    archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
     frame: FrameWithStars | UnsetType | None = UNSET
     """Only for a batch that was made from a frame."""

@@ -10,6 +10,7 @@ import ast
 import inspect
 import sys
 from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
 from types import UnionType
@@ -27,7 +28,7 @@ from typing import (
     get_type_hints,
 )
 
-from msgspec import NODEFAULT, UNSET, Struct, UnsetType, defstruct, structs
+from msgspec import NODEFAULT, Struct, UnsetType, defstruct, structs
 from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
@@ -85,13 +86,20 @@ class DescribedAs:
     """Describes a field by another type than that of its value, such as a request's model."""
 
     def __init__(self, shape: Any) -> None:
-        self._shape = shape
+        self.shape = shape
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
         """The schema of that type."""
-        return handler.generate_schema(self._shape)
+        return handler.generate_schema(self.shape)
+
+
+@dataclass(frozen=True)
+class Absent:
+    """What the absence of a field means to a client, where it is neither null nor an empty list."""
+
+    value: bool
 
 
 # Stored answers may hold words of their day: texts are read as they are.
@@ -115,9 +123,11 @@ class Record(Struct, frozen=True, kw_only=True):
     """A record of the OpenAPI document; `component` is its name there if not that of the class.
 
     An empty `component` says that only records derived from it are in the document.
+    `client_name` is the name of its model in the Python client, if not that of the class.
     """
 
     component: ClassVar[str] = ""
+    client_name: ClassVar[str] = ""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -161,7 +171,7 @@ def described(record: type[Record]) -> type[BaseModel]:
     for each in structs.fields(record):
         is_required = each.default is NODEFAULT and each.default_factory is NODEFAULT
         default = ... if is_required else None
-        about: dict[str, Any] = {"description": _text_below(record, each.name)}
+        about: dict[str, Any] = {"description": text_below(record, each.name)}
         if each.encode_name != each.name:
             about["alias"] = each.encode_name
         known = {name: value for name, value in about.items() if value is not None}
@@ -169,7 +179,8 @@ def described(record: type[Record]) -> type[BaseModel]:
     return create_model(component_name(record), __base__=Shape, __doc__=record.__doc__, **fields)
 
 
-def _text_below(record: type[Record], field: str) -> str | None:
+def text_below(record: type[Record], field: str) -> str | None:
+    """The text below a field in the class of a record or of its bases."""
     owners = [each for each in record.__mro__ if issubclass(each, Record)]
     texts = (_texts_below_fields(each.__module__).get((each.__name__, field)) for each in owners)
     return next(filter(None, texts), None)
@@ -205,36 +216,18 @@ class Items(Record, frozen=True, kw_only=True):
 
 def list_record(name: str, item: type[Record], description: str) -> type[Items]:
     """The record of a whole list."""
-    return _defined(name, [("items", list[item])], Items, description)  # type: ignore[valid-type]
+    return _defined(name, item, [("items", list[item])], Items, description)  # type: ignore[valid-type]
 
 
 def page_record(name: str, item: type[Record], description: str) -> type[Record]:
     """The record that describes a `Page` of a list."""
     fields = [("items", list[item]), ("next_cursor", str | None)]  # type: ignore[valid-type]
-    return _defined(name, fields, Record, description)
+    return _defined(name, item, fields, Record, description)
 
 
-def _defined(name: str, fields: Any, base: type[R], description: str) -> type[R]:
-    content = {"__doc__": description, "__module__": __name__}
+def _defined(
+    name: str, item: type[Record], fields: Any, base: type[R], description: str
+) -> type[R]:
+    content = {"__doc__": description, "__module__": item.__module__}
     record = defstruct(name, fields, bases=(base,), namespace=content, frozen=True, kw_only=True)
     return cast(type[R], record)
-
-
-class FieldFault(Record, frozen=True, kw_only=True):
-    """One fault of a request."""
-
-    component: ClassVar[str] = "FaultOut"
-    field: str
-    message: str
-    value: str | None
-
-
-class Problem(Record, frozen=True, kw_only=True):
-    """A problem (RFC 9457)."""
-
-    type: Annotated[str, doc("The type of problem; `about:blank` if the status says everything.")]
-    title: str
-    status: int
-    detail: str
-    instance: Annotated[str, doc("The path of the request.")]
-    errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET

@@ -14,12 +14,13 @@ class PictureAttitudeFound(Record, frozen=True, kw_only=True):
     """The attitude of a picture as a viewer shows it."""
 
     component: ClassVar[str] = "PictureAttitude"
+    client_name: ClassVar[str] = "PictureAttitude"
     status: Annotated[str, doc("`suspect`: the lens was fitted on the picture itself.")]
     quaternion: Quaternion
     """ICRS to camera, scalar last: x right, y down, z to the sky through the middle."""
     sigma_arcsec: Annotated[Components, doc("One standard deviation about x, y and z.")]
-    ra_deg: Annotated[float, doc("Of the middle of the picture.")]
-    dec_deg: Annotated[float, doc("Of the middle of the picture.")]
+    ra_deg: Annotated[float, doc("Right ascension of the middle of the picture.")]
+    dec_deg: Annotated[float, doc("Declination of the middle of the picture.")]
     roll_deg: float
     """Position angle of the upper edge, from north through east, 0 to 360."""
     aberration: str
@@ -29,7 +30,7 @@ class PictureAttitudeFound(Record, frozen=True, kw_only=True):
 class PictureLens(Record, frozen=True, kw_only=True):
     """The lens that fits a picture; a sigma of a parameter that was not fitted is null."""
 
-    field_deg: Annotated[list[float], doc("Of the width and of the height.")]
+    field_deg: Annotated[list[float], doc("Angles of the width and of the height.")]
     focal_px: float
     focal_sigma_px: float | None
     distortion_corner: Annotated[float, doc("At the corners, as a share of their distance.")]
@@ -42,6 +43,7 @@ class PictureStarFound(Record, frozen=True, kw_only=True):
     """A star on a picture; the residual is its place less the expected one."""
 
     component: ClassVar[str] = "PictureStar"
+    client_name: ClassVar[str] = "PictureStar"
     id: str
     name: str | None
     v_mag: float

@@ -51,7 +51,7 @@ class ProductAttitude(Record, frozen=True, kw_only=True):
     predicted_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
     stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
     batch: Annotated[str | None, doc("null unless the grade is `raw`.")]
-    id: Annotated[Id, doc("Of the result; unless the grade is `raw`, of the day's revision.")]
+    id: Annotated[Id, doc("The result's id; unless the grade is `raw`, the revision's.")]
     model: Literal["gyro", "constant_rate"] | UnsetType = UNSET
     """What the filter knows of the motion: the rates of a gyro, or that the rate is constant but
     for a random walk. Absent if the grade is `raw`."""
@@ -107,7 +107,7 @@ class Innovation(Record, frozen=True, kw_only=True):
     difference_sigma_arcsec: Components
     """One sigma; the smoothed attitude is partly made of the measured one."""
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
-    revision: Annotated[int, Field(ge=1), doc("Of the day.")]
+    revision: Annotated[int, Field(ge=1), doc("Revision of the day.")]
 
 
 InnovationPage = page_record("InnovationPage", Innovation, "A page of innovations.")
@@ -139,13 +139,14 @@ DefinitiveJobList = list_record(
 
 
 class LiveAttitude(Record, frozen=True, kw_only=True):
-    """The filtered attitude of a spacecraft at the last epoch of its live data."""
+    """The filtered attitude at the last epoch of live data; use it only where `status` is good."""
 
     spacecraft: str
-    time: Annotated[Moment, doc("Of the last gyro sample or, without a gyro, measurement.")]
+    time: Annotated[Moment, doc("Time of the last gyro sample or, without a gyro, measurement.")]
     quaternion: Quaternion
     covariance_arcsec2: Covariance
-    rate_deg_per_s: Annotated[Components, doc("Of the body relative to inertial, in body axes.")]
+    rate_deg_per_s: Components
+    """Rate of the body relative to inertial space, in body axes."""
     bias_deg_per_h: Components | None
     """Bias of the gyro, in body axes; null at a constant rate."""
     bias_sigma_deg_per_h: Components

@@ -10,7 +10,6 @@ from pydantic import Field
 from service.contract.answers import StarCounts
 from service.contract.base import (
     Count,
-    FieldFault,
     Id,
     MissionSettings,
     Moment,
@@ -20,6 +19,7 @@ from service.contract.base import (
     doc,
     list_record,
 )
+from service.contract.problems import FieldFault
 from service.times import Utc
 from service.vectors import Vector
 
@@ -33,7 +33,7 @@ class Run(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "RunRow"
     run: str
     created: Stamp
-    alarms: Annotated[bool, doc("Whether its batches can raise alarms.")]
+    alarms: Annotated[bool, doc("True if its batches can raise alarms.")]
     batches: Count
     spacecraft: list[str]
     first_day: Annotated[str, Field(examples=["1999-03-01"])]
@@ -84,7 +84,7 @@ class ApidPackets(Record, frozen=True, kw_only=True):
 
     apid: Annotated[int, Field(ge=0, le=2047)]
     packets: Count
-    described: Annotated[bool, doc("Whether the XTCE file describes them.")]
+    described: Annotated[bool, doc("True if the XTCE file describes them.")]
     gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
     missing: Annotated[Count, doc("Packets that are missing in these places.")]
     backward: Count
@@ -250,7 +250,7 @@ class Comparison(Record, frozen=True, kw_only=True):
     batches_in_stretch: Count
     sampled: Count
     compared: Count
-    cut_short: Annotated[bool, doc("Whether the time limit ended the comparison early.")]
+    cut_short: Annotated[bool, doc("True if the time limit ended the comparison early.")]
     cell_s: Annotated[Count, doc("Width of the cells of the trend, in seconds.")]
     trend: Annotated[list[ComparedCell], doc("The cells of time that have batches, oldest first.")]
     a: ComparedSide

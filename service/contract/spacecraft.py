@@ -14,6 +14,7 @@ from service.contract import answers
 from service.contract.alarms import Alarm, AlarmSummary
 from service.contract.answers import Summary
 from service.contract.base import (
+    Absent,
     Components,
     Count,
     Covariance,
@@ -33,7 +34,7 @@ from service.contract.base import (
 
 
 class AttitudeRow(Record, frozen=True, kw_only=True):
-    """An attitude in a history."""
+    """An attitude in a history; use it only where `status` is good."""
 
     id: Id
     batch: str
@@ -130,7 +131,7 @@ class History(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
-    not_split: bool | UnsetType = UNSET
+    not_split: Annotated[bool | UnsetType, Absent(False)] = UNSET
     """With `tracker`: true while older batches of the run are not split by tracker yet, and so are
     missing here."""
     start: Moment | None
@@ -139,7 +140,7 @@ class History(Record, frozen=True, kw_only=True):
     bucket_s: Annotated[int | None, doc("The width of a bucket; null for single batches.")]
     source: Literal["batch", "hour", "day"]
     """The source of the data; both ends of the period are exact in any case."""
-    thinned: Annotated[bool, doc("Whether the period has more batches than the answer has points.")]
+    thinned: Annotated[bool, doc("True if the period has more batches than the answer has points.")]
     unix_s: list[float]
     """POSIX time of the beginning of each bucket, or of each batch. Empty buckets are omitted."""
     batches: Annotated[list[Count] | UnsetType, doc("`minmax`: batches in each bucket.")] = UNSET
@@ -163,7 +164,7 @@ class Ranking(Record, frozen=True, kw_only=True):
     component: ClassVar[str] = "WorstList"
     by: QuantityName
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
-    not_split: bool | UnsetType = UNSET
+    not_split: Annotated[bool | UnsetType, Absent(False)] = UNSET
     """With `tracker`: true while older batches are not split by tracker."""
     items: list[RankedBatch]
 
@@ -172,6 +173,7 @@ class GyroBlockRow(Record, frozen=True, kw_only=True):
     """A recorded gyro block."""
 
     component: ClassVar[str] = "GyroBlock"
+    client_name: ClassVar[str] = "GyroBlock"
     id: Id
     spacecraft: str
     run: str
@@ -190,7 +192,7 @@ GyroBlockPage = page_record("GyroBlockPage", GyroBlockRow, "A page of gyro block
 class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
     """A recorded gyro block with its samples."""
 
-    times_s: Annotated[list[float], doc("Of each sample, in seconds of TAI after `start`.")]
+    times_s: Annotated[list[float], doc("Times of the samples, in seconds of TAI after `start`.")]
     rates_rad_per_s: list[Components]
     """Rates of each sample, as they were sent: about the three axes of the mission's gyro."""
 

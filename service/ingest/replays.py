@@ -18,7 +18,7 @@ from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
 from service.contract import runs as records
-from service.contract.base import FieldFault
+from service.contract.problems import FieldFault
 from service.contract.runs import Replay, ReplayStateName
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping, problem_of
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer

@@ -116,7 +116,7 @@ class CalibrationNotObservable(Record, frozen=True, kw_only=True):
 class ResidualCell(Record, frozen=True, kw_only=True):
     """Mean residuals of the stars in a cell of the focal plane, observed minus predicted."""
 
-    h_deg: Annotated[float, doc("Of the cell's centre.")]
+    h_deg: Annotated[float, doc("Place of the cell's centre.")]
     v_deg: float
     stars: Count
     before_arcsec: Annotated[list[float], Field(min_length=2, max_length=2, description="h, v.")]
@@ -138,7 +138,7 @@ class CalibrationResult(Record, frozen=True, kw_only=True):
     batches: CalibrationBatches
     stars: Count
     stars_left_out: Annotated[Count, doc("Stars that were left out as wrong.")]
-    degree: Annotated[Count, doc("Of the distortion; 0: none.")]
+    degree: Annotated[Count, doc("Degree of the distortion; 0: none.")]
     held_out: Annotated[list[CalibrationHeldOut], doc("Empty where the degree was given.")]
     residual_over_sigma: Annotated[float, doc("Per degree of freedom.")]
     residuals: list[CalibrationResiduals]
@@ -186,7 +186,7 @@ class Calibration(CalibrationProgress, frozen=True, kw_only=True):
     fault: str | None
     result: CalibrationResult | None
     covariance: Annotated[
-        list[list[float]] | None, doc("Of the unknowns, in their order and units.")
+        list[list[float]] | None, doc("Covariance of the unknowns, in their order and units.")
     ]
 
 
@@ -217,7 +217,7 @@ class CalibrationInForce(Record, frozen=True, kw_only=True):
     mission: Annotated[Digest, doc("The settings in force.")]
     calibration: Annotated[Id | None, doc("Null: the mission file holds.")]
     overridden: Annotated[
-        bool, doc("Whether the mission file was changed after the adoption, so that it holds.")
+        bool, doc("True if the mission file was changed after the adoption, so that it holds.")
     ]
     history: Annotated[list[CalibrationAdoption], doc("Newest first.")]
 

@@ -6,109 +6,22 @@ One task reads new events, at once when they were recorded and every second, sho
 process not have been heard.  The latest are held in memory; each listener takes them
 at its own pace and, when it has fallen far behind, reads from the records.  So
 there is no queue that a slow listener could fill.
-
-The data of events, by their kind, are those of this stream and of webhooks.
 """
 
 import asyncio
 import logging
 from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, TypeVar
+from typing import TypeVar
 
 from anyio import CapacityLimiter
 from anyio.to_thread import run_sync
 
 from service.access import Caller
-from service.acquire.result import TrackingState
 from service.app.factory import App
-from service.contract.alarms import Alarm, AnnotationChange, Limit
-from service.contract.answers import StarCounts
-from service.contract.base import (
-    Count,
-    DescribedAs,
-    Digest,
-    Id,
-    Moment,
-    Reason,
-    Record,
-    Stamp,
-    Status,
-    doc,
-)
-from service.contract.runs import ReplayProgress
-from service.contract.spacecraft import GyroBlockRow
 from service.errors import Busy, RateLimited, Unauthenticated
 from service.storage.recording.events import Event
-
-
-class LatestBatch(Record, frozen=True, kw_only=True):
-    """The latest of the batches of an event."""
-
-    id: Id
-    batch: str
-    time: Moment
-    status: Status | None
-    reason: Reason | None
-    counts: StarCounts
-
-
-class BatchesEvent(Record, frozen=True, kw_only=True):
-    """Batches that were recorded."""
-
-    spacecraft: str
-    run: str
-    batches: Annotated[Count, doc("How many.")]
-    latest: LatestBatch
-
-
-class AdoptedEvent(Record, frozen=True, kw_only=True):
-    """A what-if that was adopted."""
-
-    spacecraft: str
-    run: str
-    id: Annotated[Id, doc("Of the result that stands for the batch now.")]
-    batch_id: Annotated[Id, doc("Of the batch: the id of its first result.")]
-
-
-class TrackingEvent(Record, frozen=True, kw_only=True):
-    """A change of the tracking state of a spacecraft."""
-
-    spacecraft: str
-    run: str
-    id: Id
-    batch: str
-    time: Moment
-    state: Annotated[Annotated[str, DescribedAs(TrackingState)] | None, doc("null: not tracked.")]
-    before: Annotated[str, DescribedAs(TrackingState)] | None
-
-
-class CalibrationEvent(Record, frozen=True, kw_only=True):
-    """A change of the calibration in force."""
-
-    id: Id
-    spacecraft: str
-    adopted: Stamp
-    who: str
-    note: str
-    calibration: Annotated[Id | None, doc("null: back to the mission file.")]
-    version: Count | None
-    mission: Annotated[Digest, doc("The settings in force since then.")]
-
-
-EVENT_DATA: Mapping[str, type[Record]] = {
-    "batches": BatchesEvent,
-    "adopted": AdoptedEvent,
-    "alarm": Alarm,
-    "limit": Limit,
-    "annotation": AnnotationChange,
-    "replay": ReplayProgress,
-    "gyro": GyroBlockRow,
-    "tracking": TrackingEvent,
-    "calibration": CalibrationEvent,
-}
-
 
 HELD = 2_000
 READ_AT_ONCE = 500

@@ -20,8 +20,8 @@ from starlette.responses import Response
 
 from service import __version__
 from service.contract.base import Record, component_name, described
+from service.contract.events import EVENT_DATA
 from service.products.formats import attitude_formats, table_formats
-from service.web.event_stream import EVENT_DATA
 from service.web.middleware import API
 from service.web.requests.access import POLICIES
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON

@@ -75,10 +75,10 @@ def run(environment, program, cwd=ROOT):
 def test_the_wheel_holds_the_client_alone(environment):
     (metadata,) = environment.glob("acquire_client-*.dist-info/METADATA")
     assert f"Version: {__version__}" in metadata.read_text(encoding="utf-8")
-    files = {str(path.relative_to(CLIENT / "acquire_client")) for path in CLIENT.rglob("*.py")} | {
-        "py.typed"
-    }
+    source = CLIENT / "acquire_client"
+    files = {str(path.relative_to(source)) for path in source.rglob("*.py")} | {"py.typed"}
     package = environment / "acquire_client"
+    assert not (environment / "generate.py").exists()
     assert {str(p.relative_to(package)) for p in package.rglob("*") if p.is_file()} == files
 
 

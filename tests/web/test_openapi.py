@@ -8,11 +8,11 @@ from jsonschema import Draft202012Validator
 from sqlalchemy import select
 
 from service.contract.base import component_name
+from service.contract.events import EVENT_DATA
 from service.observations.schema import submission_from_json
 from service.storage.recording.events import EVENT_KINDS
 from service.storage.sql.tables import events
 from service.web.app import bare_app, openapi_yaml
-from service.web.event_stream import EVENT_DATA
 from service.web.openapi import examples
 from tests.web.conformance import FILE, reference, validator
 from tests.web.examples import fresh_walk

@@ -1,4 +1,4 @@
-"""The synchronous client, made from `_async`: see `tests/client/sync_source.py`.
+"""The synchronous client, made from `_async`: see `client/generate.py`.
 
 Only `backend.py` is written by hand.
 """

@@ -1,177 +1,99 @@
-"""Every model: what the answers of the service hold."""
+"""Every model: what the answers of the service hold.
 
-from .answers import (
-    Adopted,
-    AnnotationChange,
-    Answer,
-    Attitude,
-    Detection,
-    FrameSummary,
-    FrameTimings,
-    FrameWithStars,
-    LatestBatch,
-    Limit,
-    Picture,
-    PictureAttitude,
-    PictureLens,
-    PictureStar,
-    Provenance,
-    Recorded,
-    Result,
-    Rival,
-    SearchedZone,
-    Signature,
-    Star,
-    StarCounts,
-    StarRef,
-    Summary,
-    Timings,
-    Track,
-    TrackerFit,
-    TrackerStars,
-    TrackingChange,
-    TrackList,
-    TrackPoint,
-    WhatIf,
-)
-from .replays import (
-    ApidPackets,
-    LineProblem,
-    NewToken,
-    RefusedLine,
-    Replay,
-    ReplayCounts,
-    ReplayLines,
-    ReplayPackets,
-    ReplayProgress,
-    Run,
-    RunState,
-    Session,
-    Token,
-    TokenList,
-)
-from .spacecraft import (
-    Acted,
-    Alarm,
-    AlarmAction,
-    AlarmRaised,
-    AlarmValue,
-    AlarmWithActions,
-    AttitudeRow,
-    Calibration,
-    CalibrationAdoption,
-    CalibrationBatches,
-    CalibrationChange,
-    CalibrationHeldOut,
-    CalibrationInForce,
-    CalibrationNotObservable,
-    CalibrationResiduals,
-    CalibrationResult,
-    CalibrationSummary,
-    CalibrationUnknown,
-    DefinitiveJob,
-    FocalPlane,
-    GyroBlock,
-    GyroSamples,
-    History,
-    Innovation,
-    LiveAttitude,
-    MissionNow,
-    MissionThen,
-    RankedBatch,
-    Ranking,
-    Rates,
-    ResidualCell,
-    ResidualMap,
-    Series,
-    Shelved,
-    SpacecraftRow,
-    SpacecraftState,
-    TrackerGeometry,
-)
+Quaternions have the scalar last and transform inertial (EME2000) into body components.
+Covariances are of the small error rotation about the body axes.  Times are UTC in calendar form,
+as text: they may be in a leap second and have nanoseconds.  Ids sort by the time of recording.
+"""
+# Written by `make client` from the records of the service.
 
-__all__ = [
-    "Acted",
-    "Adopted",
-    "Alarm",
-    "AlarmAction",
-    "AlarmRaised",
-    "AlarmValue",
-    "AlarmWithActions",
-    "AnnotationChange",
-    "Answer",
-    "ApidPackets",
-    "Attitude",
-    "AttitudeRow",
-    "Calibration",
-    "CalibrationAdoption",
-    "CalibrationBatches",
-    "CalibrationChange",
-    "CalibrationHeldOut",
-    "CalibrationInForce",
-    "CalibrationNotObservable",
-    "CalibrationResiduals",
-    "CalibrationResult",
-    "CalibrationSummary",
-    "CalibrationUnknown",
-    "DefinitiveJob",
-    "Detection",
-    "FocalPlane",
-    "FrameSummary",
-    "FrameTimings",
-    "FrameWithStars",
-    "GyroBlock",
-    "GyroSamples",
-    "History",
-    "Innovation",
-    "LatestBatch",
-    "Limit",
-    "LineProblem",
-    "LiveAttitude",
-    "MissionNow",
-    "MissionThen",
-    "NewToken",
-    "Picture",
-    "PictureAttitude",
-    "PictureLens",
-    "PictureStar",
-    "Provenance",
-    "RankedBatch",
-    "Ranking",
-    "Rates",
-    "Recorded",
-    "RefusedLine",
-    "Replay",
-    "ReplayCounts",
-    "ReplayLines",
-    "ReplayPackets",
-    "ReplayProgress",
-    "ResidualCell",
-    "ResidualMap",
-    "Result",
-    "Rival",
-    "Run",
-    "RunState",
-    "SearchedZone",
-    "Series",
-    "Session",
-    "Shelved",
-    "Signature",
-    "SpacecraftRow",
-    "SpacecraftState",
-    "Star",
-    "StarCounts",
-    "StarRef",
-    "Summary",
-    "Timings",
-    "Token",
-    "TokenList",
-    "Track",
-    "TrackList",
-    "TrackPoint",
-    "TrackerFit",
-    "TrackerGeometry",
-    "TrackerStars",
-    "TrackingChange",
-    "WhatIf",
-]
+from .access import NewToken as NewToken
+from .access import Session as Session
+from .access import Token as Token
+from .access import TokenList as TokenList
+from .alarms import Acted as Acted
+from .alarms import Alarm as Alarm
+from .alarms import AlarmAction as AlarmAction
+from .alarms import AlarmRaised as AlarmRaised
+from .alarms import AlarmValue as AlarmValue
+from .alarms import AlarmWithActions as AlarmWithActions
+from .alarms import Annotation as Annotation
+from .alarms import AnnotationChange as AnnotationChange
+from .alarms import Limit as Limit
+from .alarms import Shelved as Shelved
+from .answers import Answer as Answer
+from .answers import Attitude as Attitude
+from .answers import Detection as Detection
+from .answers import FrameSummary as FrameSummary
+from .answers import FrameTimings as FrameTimings
+from .answers import FrameWithStars as FrameWithStars
+from .answers import Prediction as Prediction
+from .answers import Provenance as Provenance
+from .answers import Result as Result
+from .answers import Rival as Rival
+from .answers import SearchedZone as SearchedZone
+from .answers import Signature as Signature
+from .answers import Star as Star
+from .answers import StarCounts as StarCounts
+from .answers import StarRef as StarRef
+from .answers import Summary as Summary
+from .answers import Timings as Timings
+from .answers import TrackerFit as TrackerFit
+from .answers import TrackerStars as TrackerStars
+from .answers import Tracking as Tracking
+from .answers import WhatIf as WhatIf
+from .answers import ZoneSummary as ZoneSummary
+from .calibrations import Calibration as Calibration
+from .calibrations import CalibrationAdoption as CalibrationAdoption
+from .calibrations import CalibrationBatches as CalibrationBatches
+from .calibrations import CalibrationHeldOut as CalibrationHeldOut
+from .calibrations import CalibrationInForce as CalibrationInForce
+from .calibrations import CalibrationNotObservable as CalibrationNotObservable
+from .calibrations import CalibrationProgress as CalibrationProgress
+from .calibrations import CalibrationResiduals as CalibrationResiduals
+from .calibrations import CalibrationResult as CalibrationResult
+from .calibrations import CalibrationSummary as CalibrationSummary
+from .calibrations import CalibrationUnknown as CalibrationUnknown
+from .calibrations import FocalPlane as FocalPlane
+from .calibrations import ResidualCell as ResidualCell
+from .calibrations import ResidualMap as ResidualMap
+from .calibrations import TrackerGeometry as TrackerGeometry
+from .calibrations import TrackerMagnitudes as TrackerMagnitudes
+from .events import Adopted as Adopted
+from .events import CalibrationChange as CalibrationChange
+from .events import LatestBatch as LatestBatch
+from .events import Recorded as Recorded
+from .events import TrackingChange as TrackingChange
+from .pictures import Picture as Picture
+from .pictures import PictureAttitude as PictureAttitude
+from .pictures import PictureLens as PictureLens
+from .pictures import PictureStar as PictureStar
+from .problems import FieldFault as FieldFault
+from .problems import ProblemDocument as ProblemDocument
+from .products import DefinitiveJob as DefinitiveJob
+from .products import Innovation as Innovation
+from .products import LiveAttitude as LiveAttitude
+from .runs import ApidPackets as ApidPackets
+from .runs import LineProblem as LineProblem
+from .runs import RefusedLine as RefusedLine
+from .runs import Replay as Replay
+from .runs import ReplayCounts as ReplayCounts
+from .runs import ReplayLines as ReplayLines
+from .runs import ReplayPackets as ReplayPackets
+from .runs import ReplayProgress as ReplayProgress
+from .runs import Run as Run
+from .runs import RunState as RunState
+from .spacecraft import AttitudeRow as AttitudeRow
+from .spacecraft import GyroBlock as GyroBlock
+from .spacecraft import GyroSamples as GyroSamples
+from .spacecraft import History as History
+from .spacecraft import MissionNow as MissionNow
+from .spacecraft import MissionThen as MissionThen
+from .spacecraft import RankedBatch as RankedBatch
+from .spacecraft import Ranking as Ranking
+from .spacecraft import Rates as Rates
+from .spacecraft import Series as Series
+from .spacecraft import SpacecraftRow as SpacecraftRow
+from .spacecraft import SpacecraftState as SpacecraftState
+from .tracks import Track as Track
+from .tracks import TrackList as TrackList
+from .tracks import TrackPoint as TrackPoint

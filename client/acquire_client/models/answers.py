@@ -1,131 +1,14 @@
-"""The answer to a batch, recorded results, pictures, tracks of unexplained stars, data of events.
+"""The answer to a batch, the stars of its frame, and answers in lists."""
+# Written by `make client` from service/contract/answers.py.
 
-Quaternions have the scalar last and transform inertial (EME2000) into body components.  Times
-are UTC in calendar form, as text: they may be in a leap second and have nanoseconds.
-"""
-
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from ..base import Identifier, Model, Outcome, Status
+from ..base import Model
+from ..words import Identifier, Outcome, Status
 
 
-class StarRef(Model, frozen=True):
-    """A star of the catalog, such as `HIP 26311`."""
-
-    catalog: str
-    id: str
-
-
-class Star(Model, frozen=True, kw_only=True):
-    """The result for one observed star; `outcome` is unique, ambiguous or unmatched.
-
-    `probability` is that of `star`, of the most probable of `rivals`, or that it is no star of
-    the zone; None where the identifier gives none.
-    """
-
-    outcome: Outcome
-    star: StarRef | None
-    votes: int
-    runner_up: int
-    rivals: Sequence[str] = ()
-    rival_probabilities: Sequence[float] = ()
-    probability: float | None
-    residual_arcsec: float | None
-    flags: Sequence[str]
-
-
-class SearchedZone(Model, frozen=True):
-    """The part of the sky in which the service searched for the stars of a tracker."""
-
-    kind: str
-    ra_deg: float
-    dec_deg: float
-    stars: int
-    pairs: int
-    cached: bool
-
-
-class TrackerStars(Model, frozen=True):
-    """One tracker's stars, in the order observed."""
-
-    tracker: str
-    zone: SearchedZone | None
-    stars: Sequence[Star]
-
-
-class StarCounts(Model, frozen=True):
-    """Stars by outcome."""
-
-    observed: int
-    unique: int
-    ambiguous: int
-    unmatched: int
-
-
-class TrackerFit(Model, frozen=True):
-    """Agreement of one tracker with the attitude from all trackers."""
-
-    tracker: str
-    stars: int
-    taste: float
-    outlier: bool
-
-
-class Rival(Model, frozen=True):
-    """A second attitude, from stars that the first one leaves unexplained."""
-
-    quaternion: Sequence[float]
-    covariance_arcsec2: Sequence[Sequence[float]]
-    probability: float
-    angle_deg: float
-    stars: Sequence[Sequence[str | None]]
-
-
-class Attitude(Model, frozen=True):
-    """An attitude with its accuracy; use it only where `status` is good.
-
-    `covariance_arcsec2` (3, 3) is of the small error rotation about the body axes.  The method
-    `measured` is that of an attitude that a tracker sent: what needs stars is None then.
-    """
-
-    quaternion: Sequence[float]
-    frame: str
-    covariance_arcsec2: Sequence[Sequence[float]]
-    method: str
-    residual_rms_arcsec: float | None
-    predicted_rms_arcsec: float | None
-    taste: float | None
-    degrees_of_freedom: int
-    status: Status
-    triad: Sequence[float] | None
-    quest: Sequence[float] | None
-    triad_quest_angle_arcsec: float | None
-    trackers: Sequence[TrackerFit] = ()
-    outlier: str | None = None
-    rival: Rival | None = None
-
-
-class Timings(Model, frozen=True):
-    """Microseconds per step; `record` is None where nothing was recorded."""
-
-    zone: int
-    identify: int
-    solve: int
-    record: int | None
-
-
-class Provenance(Model, frozen=True):
-    """The versions of the data and the program that made the answer."""
-
-    catalog: str
-    run_catalog: str
-    epoch_year: float
-    mission: str
-    version: str
-
-
-class FrameTimings(Model, frozen=True):
+class FrameTimings(Model, frozen=True, kw_only=True):
     """Microseconds per step from file to stars."""
 
     read: int
@@ -144,100 +27,257 @@ class FrameSummary(Model, frozen=True, kw_only=True):
     exposure_s: float
     centroid: str
     background_counts: float
+    """Median background above the bias."""
     noise_counts: float
+    """Standard deviation of a background pixel."""
     candidates: int
+    """Detections above the threshold, without hot pixels."""
     measured: int
+    """The brightest of these, whose positions were measured."""
     used: int
+    """Measured detections that are stars of the batch."""
     hot_or_cosmic: int
+    """Detections that are sharper than a star."""
     timings_us: FrameTimings
     remarks: Sequence[str] = ()
+    """What the service fitted, chose of the file, or turned, in words."""
 
 
-class Detection(Model, frozen=True):
+class Detection(Model, frozen=True, kw_only=True):
     """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
 
     u_px: float | None
+    """None if the position could not be measured; `left_out` states the reason."""
     v_px: float | None
     sigma_u_px: float | None
+    """Predicted, one standard deviation."""
     sigma_v_px: float | None
     flux_counts: float | None
     magnitude: float | None
     signal_ratio: float | None
+    """Signal divided by its noise."""
     flags: Sequence[str]
     used: bool
+    """True if it is in the batch, which has the same order."""
     left_out: str | None
+    """Why it is not in the batch."""
 
 
 class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
-    """A frame with every candidate; those in the batch come first."""
+    """A frame with every candidate."""
 
     stars: Sequence[Detection]
+    """The stars in the batch come first."""
     hot_or_cosmic_px: Sequence[Sequence[float]]
+    """Positions (u, v) of rejected hot pixels and cosmic rays; the first 500."""
 
 
-class Prediction(Model, frozen=True, kw_only=True):
-    """The attitude that was predicted for a batch, and the result that it came from."""
+class StarRef(Model, frozen=True, kw_only=True):
+    """A star of the catalog."""
+
+    catalog: str
+    id: str
+
+
+class Star(Model, frozen=True, kw_only=True):
+    """The result for one observed star."""
+
+    outcome: Outcome
+    star: StarRef | None
+    votes: int
+    """Highest number of votes (STARID)."""
+    runner_up: int
+    """Second highest number of votes; equal to `votes` in a tie."""
+    rivals: Sequence[str] = ()
+    """Catalog stars that it can be, if it is not unique: those with equal votes or, with
+    probabilities, the probable ones, most probable first."""
+    rival_probabilities: Sequence[float] = ()
+    """Probability of each entry of `rivals`, if the identifier gives probabilities."""
+    probability: float | None
+    """Probability of `star`; for an ambiguous star, of its most probable rival; for an unmatched
+    star, that it is no star of the zone. None: the identifier gives none."""
+    residual_arcsec: float | None
+    """None if the attitude does not use the star."""
+    flags: Sequence[str]
+
+
+class ZoneSummary(Model, frozen=True, kw_only=True):
+    """The part of the sky in which the service searched for stars."""
+
+    kind: str
+    ra_deg: float
+    """Centre of the cap, or pole of the band."""
+    dec_deg: float
+    stars: int
+    """Number of stars (NCAP)."""
+    pairs: int
+    """Number of pairs (NTOT)."""
+
+
+class SearchedZone(ZoneSummary, frozen=True, kw_only=True):
+    """The zone of a batch."""
+
+    cached: bool
+
+
+class TrackerStars(Model, frozen=True, kw_only=True):
+    """One tracker's stars, in the order observed."""
+
+    tracker: str
+    zone: SearchedZone | None
+    """None if the whole sky gave no attitude."""
+    stars: Sequence[Star]
+
+
+class StarCounts(Model, frozen=True, kw_only=True):
+    """Stars by outcome."""
+
+    observed: int
+    unique: int
+    ambiguous: int
+    unmatched: int
+
+
+class TrackerFit(Model, frozen=True, kw_only=True):
+    """Agreement of one tracker with the attitude from all trackers."""
+
+    tracker: str
+    stars: int
+    taste: float
+    outlier: bool
+
+
+class Rival(Model, frozen=True, kw_only=True):
+    """A second attitude, from stars that the first one leaves unexplained."""
 
     quaternion: Sequence[float]
     covariance_arcsec2: Sequence[Sequence[float]]
+    probability: float
+    """Its probability, relative to the first attitude."""
+    angle_deg: float
+    """The rotation between the two attitudes."""
+    stars: Sequence[Sequence[str | None]]
+    """For each tracker, its stars in the order observed; None for a star that is not in the
+    group."""
+
+
+class Attitude(Model, frozen=True, kw_only=True):
+    """An attitude with its accuracy and consistency; use it only where `status` is good."""
+
+    quaternion: Sequence[float]
+    frame: str
+    covariance_arcsec2: Sequence[Sequence[float]]
+    method: str
+    """`measured`: by a tracker itself; all that needs stars is None then."""
+    residual_rms_arcsec: float | None
+    predicted_rms_arcsec: float | None
+    taste: float | None
+    """Weighted sum of squared residuals; follows chi-square."""
+    degrees_of_freedom: int
+    status: Status
+    """`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."""
+    triad: Sequence[float] | None
+    quest: Sequence[float] | None
+    triad_quest_angle_arcsec: float | None
+    trackers: Sequence[TrackerFit] = ()
+    """If there are several trackers."""
+    outlier: str | None = None
+    """The tracker that disagrees."""
+    rival: Rival | None = None
+    """If two groups of stars give two attitudes: the less probable one."""
+
+
+class Timings(Model, frozen=True, kw_only=True):
+    """Microseconds per step."""
+
+    zone: int
+    identify: int
+    solve: int
+    record: int | None
+    """None if nothing was recorded."""
+
+
+class Provenance(Model, frozen=True, kw_only=True):
+    """The versions of the data and the program that made the answer."""
+
+    catalog: str
+    run_catalog: str
+    epoch_year: float
+    mission: str
+    version: str
+
+
+class Prediction(Model, frozen=True, kw_only=True):
+    """The attitude that was predicted for a batch."""
+
+    quaternion: Sequence[float]
+    covariance_arcsec2: Sequence[Sequence[float]]
+    """Covariance of the rotation about the body axes."""
     margin_deg: float
+    """How far the zones reach beyond the fields of view."""
     result: str | None
+    """The result whose attitude it came from."""
     age_s: float | None
+    """Time since that attitude."""
     rate: str | None
+    """What told how the body turned since then."""
 
 
 class Tracking(Model, frozen=True, kw_only=True):
-    """What came of asking for the last attitude: `state` is acquiring, tracking or lost."""
+    """What came of asking for the last attitude."""
 
     state: str
+    """`tracking`: a good attitude was found about the prediction, or the prediction identified a
+    star of a batch that has no attitude. `acquiring`: a good attitude was found in the whole sky.
+    `lost`: none of these."""
     by_default: bool
+    """The mission asks for it, not the batch."""
     prediction: Prediction | None
     reason: str | None
+    """Why nothing was predicted."""
 
 
-class AnswerFields(Model, frozen=True, kw_only=True):
-    """What every answer has.  Without an attitude, `reason` says why there is none.
+class WhatIf(Model, frozen=True, kw_only=True):
+    """The answer to a batch, as it is recorded."""
 
-    `parent` is the result that a what-if started from.
-    """
-
+    id: str | None
+    """None for a what-if that was not recorded."""
     spacecraft: str
     batch: str
     run: str
     time: str
     identifier: Identifier
     path: str
+    """`zone`: the service searched about the a priori attitude. `lost_in_space`: without an a
+    priori attitude, it searched about an attitude from the whole sky. `zone_then_lost_in_space`:
+    the first search found nothing good, so the service made the second. `measured`: the batch holds
+    an attitude that a tracker measured; nothing was searched for, and `identifier` was not used."""
     observations: Sequence[TrackerStars]
     counts: StarCounts
     attitude: Attitude | None
     reason: str | None
+    """Why there is no attitude."""
     warnings: Sequence[str]
     timings_us: Timings
     provenance: Provenance
     parent: str | None = None
+    """Only for a what-if: the result that it started from."""
     recorded: bool = True
+    """For a what-if: whether it was recorded."""
     frame: FrameSummary | None = None
+    """Only for a batch that was made from a frame."""
     tracking: Tracking | None = None
+    """Only for a batch that asks for the last attitude."""
 
 
-class Answer(AnswerFields, frozen=True, kw_only=True):
+class Answer(WhatIf, frozen=True, kw_only=True):
     """The answer to a batch that was recorded."""
 
     id: str
 
 
-class WhatIf(AnswerFields, frozen=True, kw_only=True):
-    """The answer to a what-if; `id` is None where it was not recorded."""
-
-    id: str | None
-
-
 class Summary(Model, frozen=True, kw_only=True):
-    """A result in a list, without its stars and its attitude; `status` is the attitude's.
-
-    `measures` has quantities of the result, None where they could not be measured.  `current`
-    tells whether this result stands for its batch.
-    """
+    """A result in a list, without its stars and its attitude."""
 
     id: str
     spacecraft: str
@@ -245,16 +285,23 @@ class Summary(Model, frozen=True, kw_only=True):
     run: str
     time: str
     received: str
+    """Time at which the service first received the batch."""
     created: str
-    identifier: Identifier
+    """Time at which this result was recorded."""
+    identifier: str
     options: dict[str, Any]
+    """Options that replaced the mission's settings."""
     counts: StarCounts
     status: Status | None
+    """Status of the attitude; None without an attitude."""
     reason: str | None
     measures: dict[str, float | None]
     parent: str | None
+    """For a what-if: the result that it started from."""
     current: bool
+    """True if this is the current result of its batch."""
     archived: bool
+    """True if it is read from the archive, which takes longer."""
 
 
 class Signature(Model, frozen=True, kw_only=True):
@@ -266,201 +313,22 @@ class Signature(Model, frozen=True, kw_only=True):
 
 
 class Result(Model, frozen=True, kw_only=True):
-    """A result with its batch as it was sent, and the other results of that batch."""
+    """A result with its batch, and the other results of that batch."""
 
     answer: Answer
     input: dict[str, Any]
+    """The batch as it was sent, without default values. The service adds the prediction to one that
+    asks for the last attitude."""
     options: dict[str, Any]
+    """Options of this result that replaced the mission's settings; `provenance.mission` identifies
+    those settings."""
     measures: dict[str, float | None]
     current: bool
     parent: str | None
+    signature: Signature | None = None
+    """Only for a recorded what-if: who recorded it; None where the audit list does not know."""
     archived: bool
+    """True if it is read from the archive, which takes longer."""
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None
-    signature: Signature | None = None
-
-
-class PictureAttitude(Model, frozen=True, kw_only=True):
-    """The attitude of a picture; the quaternion turns ICRS into the camera's axes."""
-
-    status: str
-    quaternion: Sequence[float]
-    sigma_arcsec: Sequence[float]
-    ra_deg: float
-    dec_deg: float
-    roll_deg: float
-    aberration: str
-    log_odds: float
-
-
-class PictureLens(Model, frozen=True, kw_only=True):
-    """The lens that fits a picture; None: the sigma of a parameter that was not fitted."""
-
-    field_deg: Sequence[float]
-    focal_px: float
-    focal_sigma_px: float | None
-    distortion_corner: float
-    distortion_sigma: float | None
-    center_px: Sequence[float]
-    center_sigma_px: float | None
-
-
-class PictureStar(Model, frozen=True, kw_only=True):
-    """A star on a picture; the residual is its place less the expected one."""
-
-    id: str
-    name: str | None
-    v_mag: float
-    u_px: float
-    v_px: float
-    residual_px: Sequence[float]
-
-
-class Picture(Model, frozen=True, kw_only=True):
-    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
-
-    width_px: int
-    height_px: int
-    candidates: int
-    psf_sigma_px: float
-    noise_counts: float
-    attitude: PictureAttitude | None
-    orientation: str
-    remarks: Sequence[str]
-    time: str | None
-    exposure_s: float | None
-    lens: PictureLens | None
-    residual_rms_px: float | None
-    sigma_scale: float | None
-    shared_error_px: float | None
-    zero_point_mag: float | None
-    zero_point_sigma_mag: float | None
-    stars: Sequence[PictureStar]
-    overlay_png: str | None = None
-
-
-class TrackPoint(Model, frozen=True):
-    """A point of a track: the result, the tracker, and its place among the tracker's stars."""
-
-    id: str
-    tracker: str
-    star: int
-    time: str
-    ra_deg: float
-    dec_deg: float
-    magnitude: float | None
-
-
-class Track(Model, frozen=True, kw_only=True):
-    """Points that move together; direction and rate hold for `time`, the middle.
-
-    `kind` is moving, planet, fixed_on_sky, fixed_on_detector or fixed.  Components along right
-    ascension are on the sky: with the cosine of the declination.
-    """
-
-    kind: str
-    planet: str | None
-    planet_offset_arcsec: float | None
-    first: str
-    last: str
-    time: str
-    ra_deg: float
-    dec_deg: float
-    sigma_ra_arcsec: float
-    sigma_dec_arcsec: float
-    rate_ra_arcsec_per_s: float
-    rate_dec_arcsec_per_s: float
-    sigma_rate_ra_arcsec_per_s: float
-    sigma_rate_dec_arcsec_per_s: float
-    rate_arcsec_per_s: float
-    sigma_rate_arcsec_per_s: float
-    magnitude: float | None
-    sigma_magnitude: float | None
-    chi_square: float
-    degrees_of_freedom: int
-    log10_expected: float
-    points: list[TrackPoint]
-
-
-class TrackList(Model, frozen=True, kw_only=True):
-    """The tracks of a period, those of most points first.
-
-    `unexplained` counts the unmatched stars of batches with an attitude, `linked` those of them
-    that are points of a track.
-    """
-
-    spacecraft: str
-    run: str
-    batches: int
-    without_attitude: int
-    unexplained: int
-    linked: int
-    items: list[Track]
-
-
-class LatestBatch(Model, frozen=True, kw_only=True):
-    """The latest of the batches of an event; `status` is None without an attitude."""
-
-    id: str
-    batch: str
-    time: str
-    status: Status | None
-    reason: str | None
-    counts: StarCounts
-
-
-class Recorded(Model, frozen=True, kw_only=True):
-    """Batches that were recorded: how many, and the latest of them."""
-
-    spacecraft: str
-    run: str
-    batches: int
-    latest: LatestBatch
-
-
-class Adopted(Model, frozen=True, kw_only=True):
-    """A what-if that was adopted: its id, and that of the batch."""
-
-    spacecraft: str
-    run: str
-    id: str
-    batch_id: str
-
-
-class Limit(Model, frozen=True, kw_only=True):
-    """The limits of a quantity; `since`, `who` and `comment` are None for the default."""
-
-    spacecraft: str
-    quantity: str
-    tracker: str | None = None
-    unit: str
-    is_default: bool
-    since: str | None
-    who: str | None
-    comment: str | None
-    settings: Mapping[str, Any]
-
-
-class AnnotationChange(Model, frozen=True, kw_only=True):
-    """A note that was written, or deleted."""
-
-    id: str
-    spacecraft: str | None
-    start: str
-    end: str | None
-    text: str
-    who: str
-    created: str
-    deleted: bool
-
-
-class TrackingChange(Model, frozen=True, kw_only=True):
-    """A change of the tracking state of a spacecraft at a batch; None: not tracked."""
-
-    spacecraft: str
-    run: str
-    id: str
-    batch: str
-    time: str
-    state: str | None
-    before: str | None
+    """Only for a batch that was made from a frame."""

@@ -117,7 +117,7 @@ TrackKindName = Literal["moving", "planet", "fixed_on_sky", "fixed_on_detector",
 class TrackPoint(Record, frozen=True, kw_only=True):
     """A point of a track."""
 
-    id: Annotated[Id, doc("Of the batch's result.")]
+    id: Annotated[Id, doc("The result of the batch.")]
     tracker: str
     star: Annotated[Count, doc("Its place among the tracker's stars in the batch, from 0.")]
     time: Annotated[Moment, doc("Its own time, UTC.")]
@@ -159,10 +159,10 @@ class Track(Record, frozen=True, kw_only=True):
     sigma_rate_arcsec_per_s: float
     magnitude: Annotated[float | None, doc("Mean of the points; null if none came with one.")]
     sigma_magnitude: Annotated[
-        float | None, doc("Of the mean, from the scatter; null with fewer than two.")
+        float | None, doc("Sigma of the mean, from the scatter; null with fewer than two.")
     ]
     chi_square: Annotated[
-        float, doc("Of the points about the motion; near `degrees_of_freedom` if the sigmas hold.")
+        float, doc("Scatter about the motion; near `degrees_of_freedom` if the sigmas hold.")
     ]
     degrees_of_freedom: Count
     log10_expected: Annotated[
@@ -178,7 +178,7 @@ class TrackList(Record, frozen=True, kw_only=True):
     spacecraft: str
     run: str
     batches: Annotated[Count, doc("Batches of the period.")]
-    without_attitude: Annotated[Count, doc("Of these, batches whose points have no direction.")]
+    without_attitude: Annotated[Count, doc("Batches of these whose points have no direction.")]
     unexplained: Annotated[Count, doc("Unmatched stars of the others.")]
-    linked: Annotated[Count, doc("Of these, points of a track.")]
+    linked: Annotated[Count, doc("Unmatched stars that are points of a track.")]
     items: list[Track]

@@ -166,12 +166,12 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> a
     )
 
 
-def answer_from_json(text: str | bytes) -> answers.Answer:
+def answer_from_json(text: str | bytes) -> answers.RecordedAnswer:
     """A stored answer, which may be of an earlier version of the service."""
     return _ANSWERS.decode(text)
 
 
-_ANSWERS = msgspec.json.Decoder(answers.Answer)
+_ANSWERS = msgspec.json.Decoder(answers.RecordedAnswer)
 
 
 def _frame_of(row: Any) -> answers.FrameWithStars:

@@ -8,6 +8,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service import access
+from service.contract.access import AuditPage, NewToken, Scope, Session, Token, TokenList
 from service.errors import Unauthenticated
 from service.observations.schema import Key, Wire
 from service.web.openapi import LINK, ApiRouter, Returns
@@ -32,7 +33,7 @@ class SignIn(Wire):
 
 
 @router.serves(
-    "POST /session", Returns("The signed-in caller.", access.Session), body=SignIn, problems=(401,)
+    "POST /session", Returns("The signed-in caller.", Session), body=SignIn, problems=(401,)
 )
 def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     """Exchange a token for a session cookie (`HttpOnly`, `SameSite=Strict`)."""
@@ -49,15 +50,13 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     return response
 
 
-@router.serves("GET /session", Returns("The caller.", access.Session))
+@router.serves("GET /session", Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
     """The caller and its scopes."""
     return json_response(_shown(caller))
 
 
-@router.serves(
-    "DELETE /session", Returns("The session has ended.", access.Session), problems=(401,)
-)
+@router.serves("DELETE /session", Returns("The session has ended.", Session), problems=(401,))
 def sign_out(request: Request, app: AppDep) -> Response:
     """End the browser's session."""
     cookie = request.cookies.get(COOKIE)
@@ -80,7 +79,7 @@ class TokenIn(Wire):
             examples=["pipeline"],
         ),
     ]
-    scopes: Annotated[list[access.Scope], Field(min_length=1, max_length=3)]
+    scopes: Annotated[list[Scope], Field(min_length=1, max_length=3)]
     spacecraft: Annotated[
         list[Key] | None,
         Field(min_length=1, max_length=200, description="Bind it to these; null: all."),
@@ -96,15 +95,15 @@ class TokenIn(Wire):
 TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
 
 
-@router.serves("GET /tokens", Returns("All tokens, without their secrets.", access.TokenList))
+@router.serves("GET /tokens", Returns("All tokens, without their secrets.", TokenList))
 def list_tokens(app: AppDep) -> Response:
     """Every token, with its scopes, spacecraft, end and state."""
-    return json_response(access.TokenList(items=app.tokens.all()))
+    return json_response(TokenList(items=app.tokens.all()))
 
 
 @router.serves(
     "POST /tokens",
-    Returns("The token, and its secret this once.", access.NewToken, status=201),
+    Returns("The token, and its secret this once.", NewToken, status=201),
     body=TokenIn,
     problems=(409,),
 )
@@ -117,7 +116,7 @@ def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
 
 
 @router.serves(
-    "DELETE /tokens/{token}", Returns("The token that was revoked.", access.Token), problems=(503,)
+    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(503,)
 )
 def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     """Revoke a token at once, with the browser sessions that were begun with it."""
@@ -126,7 +125,7 @@ def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     return json_response(revoked)
 
 
-@router.serves("GET /audit", Returns("A page of changes.", access.AuditPage, LINK))
+@router.serves("GET /audit", Returns("A page of changes.", AuditPage, LINK))
 def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
     with app.context.reading() as connection:

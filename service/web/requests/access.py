@@ -22,8 +22,9 @@ from starlette.responses import Response
 from starlette.types import Scope as HttpScope
 
 from service import logs
-from service.access import OPEN_CALLER, Access, Caller, Entry, Scope
+from service.access import OPEN_CALLER, Access, Caller, Entry
 from service.app.factory import App
+from service.contract.access import Scope
 from service.contract.base import Page
 from service.errors import BadBatch, Busy, Fault, Forbidden, NotFound, Unauthenticated
 from service.web.requests.metrics import Metrics

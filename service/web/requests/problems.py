@@ -20,7 +20,7 @@ from starlette.responses import Response
 from starlette.routing import Match
 
 from service import errors
-from service.contract.base import Problem
+from service.contract.problems import Problem
 from service.gyro import SampleTaken
 from service.missions.faults import causes, plain_message
 

@@ -1,0 +1,119 @@
+"""Limits and alarms, and annotations: notes that people write on times and periods."""
+# Written by `make client` from service/contract/alarms.py.
+
+from collections.abc import Sequence
+from typing import Any
+
+from ..base import Model
+
+
+class Limit(Model, frozen=True, kw_only=True):
+    """The limit of one quantity of a spacecraft."""
+
+    spacecraft: str
+    quantity: str
+    tracker: str | None = None
+    """None: of the spacecraft as a whole."""
+    unit: str
+    is_default: bool
+    """True if this is the shipped limit; for a tracker, if it is the limit of its spacecraft."""
+    since: str | None
+    """None: it was never changed."""
+    who: str | None
+    comment: str | None
+    settings: dict[str, Any]
+
+
+class AlarmValue(Model, frozen=True, kw_only=True):
+    """An evaluated value with its time and its batch."""
+
+    value: float
+    time: str
+    """Time of the batch; for silence, of the batch before it."""
+    batch_id: str | None
+
+
+class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
+    """The value that raised an alarm."""
+
+    at: str
+    bound: float
+    """The bound of the worst severity so far."""
+
+
+class Acted(Model, frozen=True, kw_only=True):
+    """The author and the time of an action."""
+
+    at: str
+    who: str
+
+
+class Shelved(Acted, frozen=True, kw_only=True):
+    """Shelved until a time."""
+
+    until: str
+
+
+class Alarm(Model, frozen=True, kw_only=True):
+    """An alarm. It stays until it is acknowledged and its quantity is back in limits."""
+
+    id: str
+    spacecraft: str
+    run: str
+    quantity: str
+    tracker: str | None = None
+    """The tracker that it is about; None: the spacecraft as a whole."""
+    unit: str
+    state: str
+    severity: str
+    """The worst severity so far."""
+    current_severity: str | None
+    """None: the value is back in limits."""
+    in_limits: bool
+    raised: AlarmRaised
+    worst: AlarmValue
+    latest: AlarmValue
+    returned_at: str | None
+    acknowledged: Acted | None
+    shelved: Shelved | None
+    cleared_at: str | None
+
+
+class AlarmAction(Model, frozen=True, kw_only=True):
+    """A change of an alarm, by its value or by a person."""
+
+    at: str
+    action: str
+    who: str | None
+    comment: str | None
+    severity: str | None
+    value: float | None
+    time: str | None
+
+
+class AlarmWithActions(Alarm, frozen=True, kw_only=True):
+    """An alarm with its history."""
+
+    actions: Sequence[AlarmAction]
+    """Oldest first."""
+
+
+class Annotation(Model, frozen=True, kw_only=True):
+    """A note on a time or a period, signed by its author."""
+
+    id: str
+    spacecraft: str | None
+    """None: it is about every spacecraft."""
+    start: str
+    """Telemetry time."""
+    end: str | None
+    """None: the note is about a moment."""
+    text: str
+    who: str
+    created: str
+
+
+class AnnotationChange(Annotation, frozen=True, kw_only=True):
+    """The data of an event: an annotation that was written or deleted."""
+
+    deleted: bool

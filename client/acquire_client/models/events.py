@@ -1,0 +1,66 @@
+"""The data of events, as the event stream and webhooks send them."""
+# Written by `make client` from service/contract/events.py.
+
+from ..base import Model
+from ..words import Status
+from .answers import StarCounts
+
+
+class LatestBatch(Model, frozen=True, kw_only=True):
+    """The latest of the batches of an event."""
+
+    id: str
+    batch: str
+    time: str
+    status: Status | None
+    reason: str | None
+    counts: StarCounts
+
+
+class Recorded(Model, frozen=True, kw_only=True):
+    """Batches that were recorded."""
+
+    spacecraft: str
+    run: str
+    batches: int
+    """How many."""
+    latest: LatestBatch
+
+
+class Adopted(Model, frozen=True, kw_only=True):
+    """A what-if that was adopted."""
+
+    spacecraft: str
+    run: str
+    id: str
+    """The result that stands for the batch now."""
+    batch_id: str
+    """The batch, by the id of its first result."""
+
+
+class TrackingChange(Model, frozen=True, kw_only=True):
+    """A change of the tracking state of a spacecraft."""
+
+    spacecraft: str
+    run: str
+    id: str
+    batch: str
+    time: str
+    state: str | None
+    """None: not tracked."""
+    before: str | None
+
+
+class CalibrationChange(Model, frozen=True, kw_only=True):
+    """A change of the calibration in force."""
+
+    id: str
+    spacecraft: str
+    adopted: str
+    who: str
+    note: str
+    calibration: str | None
+    """None: back to the mission file."""
+    version: int | None
+    mission: str
+    """The settings in force since then."""

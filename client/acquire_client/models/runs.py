@@ -1,0 +1,150 @@
+"""Runs and replays; two runs, and two sets of options, side by side."""
+# Written by `make client` from service/contract/runs.py.
+
+from collections.abc import Sequence
+
+from ..base import Model
+from .problems import FieldFault
+
+
+class Run(Model, frozen=True, kw_only=True):
+    """A run."""
+
+    run: str
+    created: str
+    alarms: bool
+    """True if its batches can raise alarms."""
+    batches: int
+    spacecraft: Sequence[str]
+    first_day: str
+    last_day: str
+
+
+class ReplayLines(Model, frozen=True, kw_only=True):
+    """The lines of a replay."""
+
+    total: int | None
+    """None if the number is not known in advance."""
+    done: int
+    refused: int
+
+
+class ReplayCounts(Model, frozen=True, kw_only=True):
+    """Results of the lines so far."""
+
+    new: int
+    """Batches that this replay recorded."""
+    repeated: int
+    """Batches that were already recorded."""
+    observed: int
+    """Stars of these batches; the next fields count them by outcome."""
+    unique: int
+    ambiguous: int
+    unmatched: int
+    attitudes: int
+    """Batches with an attitude."""
+    gyro_new: int = 0
+    """Gyro blocks that this replay recorded."""
+    gyro_repeated: int = 0
+    """Gyro blocks that were already recorded."""
+
+
+class ApidPackets(Model, frozen=True, kw_only=True):
+    """The packets of one APID."""
+
+    apid: int
+    packets: int
+    described: bool
+    """True if the XTCE file describes them."""
+    gaps: int
+    """Places where the sequence count skips packets."""
+    missing: int
+    """Packets that are missing in these places."""
+    backward: int
+    """Places where the count repeats or goes back: a reset, or a changed order."""
+    refused: int
+    incomplete: int = 0
+    """Segments of packets of which others are missing."""
+
+
+class ReplayPackets(Model, frozen=True, kw_only=True):
+    """The space packets of a replay so far."""
+
+    packets: int
+    bytes: int
+    batches: int
+    """Batches that the packets hold."""
+    without_stars: int
+    """Without a star or a measured attitude: left out."""
+    gyro_blocks: int
+    """Gyro blocks that the packets hold."""
+    gyro_samples: int
+    """Samples of these blocks."""
+    unknown: int
+    """Packets that the XTCE file does not describe."""
+    not_asked: int
+    """Packets of APIDs that the mission's table leaves out."""
+    idle: int
+    """Idle packets (APID 2047)."""
+    gaps: int
+    missing: int
+    backward: int
+    refused: int
+    """Packets that could not be read."""
+    joined: int = 0
+    """Packets that were joined of segments."""
+    incomplete: int = 0
+    """Segments of packets of which others are missing; they are refused, too."""
+    unread_bytes: int = 0
+    """From the packets on at which files could not be read any further."""
+    empty_files: int = 0
+    """Files without a packet."""
+    without_attitude: int = 0
+    """Packets whose a priori quaternion was zero or not finite."""
+    apids: Sequence[ApidPackets]
+    """The hundred APIDs with the most packets."""
+
+
+class LineProblem(Model, frozen=True, kw_only=True):
+    """The faults of a line."""
+
+    detail: str
+    errors: Sequence[FieldFault] = ()
+    """Every fault, field by field."""
+
+
+class RefusedLine(Model, frozen=True, kw_only=True):
+    """A refused line; the replay continues with the next one."""
+
+    line: int
+    """Number of the line, or of the packet in its file, from 1."""
+    problem: LineProblem
+
+
+class ReplayProgress(Model, frozen=True, kw_only=True):
+    """A replay and its progress, without the refused lines: the data of an event."""
+
+    id: str
+    run: str
+    name: str
+    state: str
+    lines: ReplayLines
+    counts: ReplayCounts
+    started: str
+    finished: str | None
+
+
+class Replay(ReplayProgress, frozen=True, kw_only=True):
+    """A replay and its progress."""
+
+    packets: ReplayPackets | None
+    """None unless the replay reads space packets."""
+    errors: Sequence[RefusedLine]
+    """The first thousand refused lines; then, for a failed replay, the reason."""
+
+
+class RunState(Model, frozen=True, kw_only=True):
+    """A run, and whether its batches can raise alarms."""
+
+    run: str
+    alarms: bool

@@ -1,0 +1,337 @@
+"""Writes what of the client is generated: python client/generate.py, or --check for differences.
+
+The models come from the records of the service that the client's methods and events name, with
+all that these hold; the synchronous half comes from the asynchronous one, as httpcore does it.
+"""
+
+import argparse
+import re
+import subprocess
+import sys
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from pkgutil import iter_modules
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_type_hints
+
+from msgspec import NODEFAULT, UNSET, UnsetType, structs
+from pydantic.fields import FieldInfo
+
+from service import contract
+from service.contract import answers, base
+from service.contract.base import Absent, DescribedAs, Record, text_below
+from service.contract.events import EVENT_DATA
+from service.feature import known_features
+
+CLIENT = Path(__file__).parent / "acquire_client"
+HEADER = "# Written by `make client` from {}.\n"
+
+# ---- models ----------------------------------------------------------------------------------
+
+NAMED_BESIDE = {"ProblemDocument", "TokenList"}
+"""Models that no module of the client names as `models.`..., and no other model holds."""
+BASES = {"History": "Tabulated"}
+"""The classes of the client's `base` that give methods to models."""
+WORDS = {"Outcome": base.Outcome, "Status": base.Status, "Identifier": answers.Identifier}
+"""Types for which a type checker knows the words of this version."""
+ABOUT = """Every model: what the answers of the service hold.
+
+Quaternions have the scalar last and transform inertial (EME2000) into body components.
+Covariances are of the small error rotation about the body axes.  Times are UTC in calendar form,
+as text: they may be in a leap second and have nanoseconds.  Ids sort by the time of recording.
+"""
+
+
+def client_name(record: type[Record]) -> str:
+    """The name of a record's model."""
+    return vars(record).get("client_name") or record.__name__
+
+
+def module_name(record: type[Record]) -> str:
+    """The client's module of a record: that of the contract, or the folder of a feature."""
+    return record.__module__.removesuffix(".records").rpartition(".")[2]
+
+
+def all_records() -> Mapping[str, type[Record]]:
+    """Every record of the contract and of the installed features, by the name of its model."""
+    modules = [f"{contract.__name__}.{each.name}" for each in iter_modules(contract.__path__)]
+    modules += [f"{feature.package}.records" for feature in known_features().values()]
+    modules += ["service.storage.calibrations"]
+    for module in filter(find_spec, modules):
+        import_module(module)
+
+    def derived(record: type[Record]) -> Iterator[type[Record]]:
+        for each in record.__subclasses__():
+            yield each
+            yield from derived(each)
+
+    return {client_name(each): each for each in derived(Record)}
+
+
+def own_fields(record: type[Record]) -> dict[str, Any]:
+    """The types of the fields that a record adds to those of its base."""
+    hints = get_type_hints(record, include_extras=True)
+    return {name: hints[name] for name in record.__annotations__ if name in structs_of(record)}
+
+
+def structs_of(record: type[Record]) -> Mapping[str, structs.FieldInfo]:
+    """The fields of a record by name."""
+    return {each.name: each for each in structs.fields(record)}
+
+
+def with_parts(record: type[Record], known: dict[type[Record], None]) -> None:
+    """Add a record to those known, behind its base and the records that its fields hold."""
+
+    def records_in(kind: Any) -> Iterator[type[Record]]:
+        if isinstance(kind, type) and issubclass(kind, Record):
+            yield kind
+        for each in get_args(kind):
+            yield from records_in(each)
+
+    if record in (Record, base.Items) or record in known:
+        return
+    for part in (record.__base__, *own_fields(record).values()):
+        for each in records_in(part):
+            with_parts(each, known)
+    known[record] = None
+
+
+def models() -> Mapping[str, str]:
+    """The text of each module of models, by its path in the client."""
+    own = {*CLIENT.glob("*.py"), *CLIENT.glob("_async/*.py")} - {CLIENT / "events.py"}
+    texts = "\n".join(path.read_text(encoding="utf-8") for path in own)
+    names = set(re.findall(r"\bmodels\.([A-Z]\w+)", texts)) | NAMED_BESIDE
+    known = all_records()
+    needed: dict[type[Record], None] = {}
+    for each in (*(known[name] for name in sorted(names)), *EVENT_DATA.values()):
+        with_parts(each, needed)
+    modules: dict[str, list[type[Record]]] = {}
+    for record in needed:
+        modules.setdefault(module_name(record), []).append(record)
+    for held in modules.values():
+        in_source = list(vars(sys.modules[held[0].__module__]))
+        held.sort(key=lambda record: in_source.index(record.__name__))
+    texts_of = {
+        f"models/{name}.py": module_text(name, held, needed) for name, held in modules.items()
+    }
+    imports = [
+        f"from .{name} import {', '.join(f'{n} as {n}' for n in map(client_name, held))}\n"
+        for name, held in modules.items()
+    ]
+    return texts_of | {
+        "models/__init__.py": f'"""{ABOUT}"""\n{HEADER.format("the records of the service")}\n'
+        + "".join(imports),
+        "events.py": events_text(),
+        "words.py": words_text(),
+    }
+
+
+def module_text(name: str, held: Sequence[type[Record]], needed: Sequence[type[Record]]) -> str:
+    """A module of models; ruff takes away what it need not import."""
+    source = sys.modules[held[0].__module__]
+    others = sorted({module_name(each) for each in needed} - {name})
+    imports = [
+        f"from .{other} import {client_name(each)}\n"
+        for other in others
+        for each in needed
+        if module_name(each) == other
+    ]
+    place = source.__name__.replace(".", "/") + ".py"
+    text = [
+        f'"""{(source.__doc__ or "").splitlines()[0]}"""\n{HEADER.format(place)}\n',
+        "from collections.abc import Sequence\nfrom typing import Any\n\n",
+        f"from ..base import Model, {', '.join(BASES.values())}\n",
+        f"from ..words import {', '.join(WORDS)}\n",
+        *imports,
+        *(class_text(each) for each in held),
+    ]
+    return "".join(text)
+
+
+def words_text() -> str:
+    """The words that a type checker knows, and any text where an answer is read."""
+    words = {name: get_args(described_type(alias)) for name, alias in WORDS.items()}
+    return "".join(
+        [
+            '"""Words of answers: those of this version for a type checker, else any text."""\n',
+            f"{HEADER.format('service/contract')}\nfrom typing import TYPE_CHECKING, Literal\n\n",
+            *(f"{name}Word = Literal{list(known)}\n" for name, known in words.items()),
+            "if TYPE_CHECKING:\n",
+            *(f"    {name} = {name}Word\n" for name in words),
+            "else:\n    # A later service may know further words: they are read, too.\n",
+            f"    {' = '.join(words)} = str\n",
+        ]
+    )
+
+
+def described_type(alias: Any) -> Any:
+    """The type that describes a text, such as a `Literal`."""
+    (described,) = (each for each in alias.__metadata__ if isinstance(each, DescribedAs))
+    return described.shape
+
+
+def class_text(record: type[Record]) -> str:
+    """The class of a model."""
+    parent = record.__base__
+    is_derived = parent not in (Record, base.Items)
+    name = client_name(record)
+    bases = client_name(parent) if is_derived else BASES.get(name, "Model")  # type: ignore[arg-type]
+    fields = "".join(field_text(record, *each) for each in own_fields(record).items())
+    about = in_client_words(record.__doc__ or "")
+    return f'\n\nclass {name}({bases}, frozen=True, kw_only=True):\n    """{about}"""\n\n{fields}'
+
+
+def field_text(record: type[Record], name: str, hint: Any) -> str:
+    """The line of a field with its default, and the text below it."""
+    field = structs_of(record)[name]
+    kind, default = type_text(hint), field.default
+    if field.default_factory is not NODEFAULT:
+        default = ()
+    elif default is UNSET:
+        absent = [each.value for each in metadata_of(hint) if isinstance(each, Absent)]
+        default = absent[0] if absent else () if kind.startswith("Sequence[") else None
+        if default is None and not kind.endswith(" | None"):
+            kind += " | None"
+    end = "" if default is NODEFAULT else f" = {default!r}"
+    about = description(hint) or text_below(record, name)
+    return f"    {name}: {kind}{end}\n" + (documented(in_client_words(about)) if about else "")
+
+
+def metadata_of(hint: Any) -> tuple[Any, ...]:
+    """What an annotation says beside the type."""
+    return hint.__metadata__ if get_origin(hint) is Annotated else ()
+
+
+OF_ALIASES = [each for alias in vars(base).values() for each in metadata_of(alias)]
+
+
+def description(hint: Any) -> str | None:
+    """What an annotation says of its own field, not of every quaternion or time."""
+    found = [
+        each.description
+        for each in metadata_of(hint)
+        if isinstance(each, FieldInfo) and not any(each is known for known in OF_ALIASES)
+    ]
+    return found[-1] if found else None
+
+
+def type_text(hint: Any) -> str:
+    """The type of a field in the client: lists are sequences, words are any text."""
+    for word, alias in WORDS.items():
+        if any(each in metadata_of(hint) for each in alias.__metadata__):
+            return word
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        return type_text(parts[0])
+    if origin is Literal:
+        return "str"
+    if origin in (Union, UnionType):
+        return " | ".join(type_text(each) for each in parts if each is not UnsetType)
+    if origin in (list, dict):
+        outer = "Sequence" if origin is list else "dict"
+        return f"{outer}[{', '.join(map(type_text, parts))}]"
+    if isinstance(hint, type) and issubclass(hint, Record):
+        return client_name(hint)
+    return "None" if hint is NoneType else hint.__name__
+
+
+def in_client_words(text: str) -> str:
+    """A description in the words of Python."""
+    return re.sub(r"\b[nN]ull\b", "None", text.strip())
+
+
+def documented(text: str) -> str:
+    """A text below a field."""
+    lines = textwrap.wrap(f'"""{text}"""', 96)
+    return textwrap.indent("\n".join(lines), "    ") + "\n"
+
+
+def events_text() -> str:
+    """The kinds of events, each with the model of its data."""
+    classes = [
+        f'class {kind.capitalize()}Event(_Numbered, frozen=True):\n    """An event `{kind}`."""\n\n'
+        f'    kind: Literal["{kind}"]\n    data: models.{client_name(data)}\n\n\n'
+        for kind, data in EVENT_DATA.items()
+    ]
+    return (
+        f'"""The kinds of events that this version knows."""\n'
+        f"{HEADER.format('service/contract/events.py')}\n"
+        "from typing import Literal\n\nfrom . import models\nfrom .base import Model\n\n\n"
+        "class _Numbered(Model, frozen=True):\n    id: int\n\n\n"
+        + "".join(classes)
+        + f"KnownEvent = {' | '.join(f'{kind.capitalize()}Event' for kind in EVENT_DATA)}\n"
+    )
+
+
+# ---- the synchronous half --------------------------------------------------------------------
+
+BY_HAND = ("__init__.py", "backend.py")
+SYNCHRONOUS = [
+    (re.compile(pattern), replacement)
+    for pattern, replacement in (
+        (r"\basync (def|for|with)\b", r"\1"),
+        (r"\bawait ", ""),
+        (r"\bAsyncGenerator\[(.*), None\]", r"Generator[\1, None, None]"),
+        (r"\bAsync([A-Z]\w*)", r"\1"),
+        (r"\basynccontextmanager\b", "contextmanager"),
+        (r"\b__a(enter|exit|iter|next)__\b", r"__\1__"),
+        (r"\ba(close|closing|read|iter_bytes)\b", r"\1"),
+    )
+]
+
+
+def synchronous() -> Mapping[str, str]:
+    """The text of each module that is written for asyncio, with its words replaced, by path."""
+    texts = {}
+    for path in sorted((CLIENT / "_async").glob("*.py")):
+        if path.name not in BY_HAND:
+            text = path.read_text(encoding="utf-8")
+            for pattern, replacement in SYNCHRONOUS:
+                text = pattern.sub(replacement, text)
+            texts[f"_sync/{path.name}"] = text
+    return texts
+
+
+# ---- files -----------------------------------------------------------------------------------
+
+# The rest makes one call of loops that wait for nothing any more, and sorts imports.
+TIDY = ["check", "--quiet", "--fix-only", "--unsafe-fixes", "--select=C4,F401,I,UP028"]
+
+
+def tidied(text: str, path: Path) -> str:
+    """A module as ruff formats it."""
+    for step in (TIDY, ["format"]):
+        command = [sys.executable, "-m", "ruff", *step, "--stdin-filename", str(path), "-"]
+        text = subprocess.run(
+            command, input=text, capture_output=True, text=True, check=True
+        ).stdout
+    return text
+
+
+def main() -> int:
+    """Write the files; with `--check` name those that differ, and return 1 for any."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--check", action="store_true", help="write nothing, name what differs")
+    only_checks = parser.parse_args().check
+    made = {CLIENT / path: text for path, text in {**models(), **synchronous()}.items()}
+    texts = {path: tidied(text, path) for path, text in made.items()}
+    folders = [CLIENT / "models", CLIENT / "_sync"]
+    found = {path for folder in folders for path in folder.glob("*.py")}
+    left = {path for path in found - texts.keys() if path.name not in BY_HAND}
+    stale = [p for p, text in texts.items() if not p.exists() or p.read_text("utf-8") != text]
+    if only_checks:
+        for path in sorted((*stale, *left)):
+            print(f"{path.relative_to(CLIENT.parent)} differs from its source; run: make client")
+        return 1 if stale or left else 0
+    for path in stale:
+        path.write_text(texts[path], encoding="utf-8")
+    for path in left:
+        path.unlink()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,93 @@
+"""The data of events, as the event stream and webhooks send them."""
+
+from collections.abc import Mapping
+from typing import Annotated, ClassVar
+
+from service.acquire.result import TrackingState
+from service.contract.alarms import Alarm, AnnotationChange, Limit
+from service.contract.answers import StarCounts
+from service.contract.base import (
+    Count,
+    DescribedAs,
+    Digest,
+    Id,
+    Moment,
+    Reason,
+    Record,
+    Stamp,
+    Status,
+    doc,
+)
+from service.contract.runs import ReplayProgress
+from service.contract.spacecraft import GyroBlockRow
+
+
+class LatestBatch(Record, frozen=True, kw_only=True):
+    """The latest of the batches of an event."""
+
+    id: Id
+    batch: str
+    time: Moment
+    status: Status | None
+    reason: Reason | None
+    counts: StarCounts
+
+
+class Recorded(Record, frozen=True, kw_only=True):
+    """Batches that were recorded."""
+
+    component: ClassVar[str] = "BatchesEvent"
+    spacecraft: str
+    run: str
+    batches: Annotated[Count, doc("How many.")]
+    latest: LatestBatch
+
+
+class Adopted(Record, frozen=True, kw_only=True):
+    """A what-if that was adopted."""
+
+    component: ClassVar[str] = "AdoptedEvent"
+    spacecraft: str
+    run: str
+    id: Annotated[Id, doc("The result that stands for the batch now.")]
+    batch_id: Annotated[Id, doc("The batch, by the id of its first result.")]
+
+
+class TrackingChange(Record, frozen=True, kw_only=True):
+    """A change of the tracking state of a spacecraft."""
+
+    component: ClassVar[str] = "TrackingEvent"
+    spacecraft: str
+    run: str
+    id: Id
+    batch: str
+    time: Moment
+    state: Annotated[Annotated[str, DescribedAs(TrackingState)] | None, doc("null: not tracked.")]
+    before: Annotated[str, DescribedAs(TrackingState)] | None
+
+
+class CalibrationChange(Record, frozen=True, kw_only=True):
+    """A change of the calibration in force."""
+
+    component: ClassVar[str] = "CalibrationEvent"
+    id: Id
+    spacecraft: str
+    adopted: Stamp
+    who: str
+    note: str
+    calibration: Annotated[Id | None, doc("null: back to the mission file.")]
+    version: Count | None
+    mission: Annotated[Digest, doc("The settings in force since then.")]
+
+
+EVENT_DATA: Mapping[str, type[Record]] = {
+    "batches": Recorded,
+    "adopted": Adopted,
+    "alarm": Alarm,
+    "limit": Limit,
+    "annotation": AnnotationChange,
+    "replay": ReplayProgress,
+    "gyro": GyroBlockRow,
+    "tracking": TrackingChange,
+    "calibration": CalibrationChange,
+}
