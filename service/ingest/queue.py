@@ -36,7 +36,7 @@ from service.storage.recording.identity import (
     OwnKey,
     PredictionOutdated,
     look_up,
-    remember_key,
+    remember_keys,
 )
 from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
 from service.storage.recording.writer import RETRY_AFTER_S, WriteOutcome, WriterState
@@ -290,22 +290,21 @@ class IngestQueue:
         self, repeats: Mapping[PendingBatch, ExistingResult]
     ) -> dict[PendingBatch, Exception]:
         """Let the keys of repeats belong to their bodies from now on; those that are refused."""
-
-        def change(connection: Connection) -> dict[PendingBatch, Exception]:
-            refused: dict[PendingBatch, Exception] = {}
-            for pending, first in repeats.items():
-                assert pending.key is not None
-                try:
-                    remember_key(connection, pending.identity, pending.key, first)
-                except AcquisitionError as error:
-                    refused[pending] = error
-            return refused
-
+        keys = [
+            (pending.identity, pending.key, first)
+            for pending, first in repeats.items()
+            if pending.key is not None
+        ]
         try:
-            return self._store.writer.change(change)
+            outcomes = self._store.writer.change(partial(remember_keys, keys=keys))
         except Exception as error:
             # A client whose key is not kept must send again: it gets the error, not the answer.
             return dict.fromkeys(repeats, error)
+        return {
+            pending: outcome
+            for pending, outcome in zip(repeats, outcomes, strict=True)
+            if outcome is not None
+        }
 
     def _begins(self, pending: PendingBatch) -> bool:
         """True for a batch to compute now; the others go to the pool, or wait for one like them."""

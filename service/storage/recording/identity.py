@@ -17,7 +17,7 @@ import msgspec
 from msgspec import Struct
 from sqlalchemy import Connection, Double, Table, insert
 
-from service.errors import Busy, Conflict, KeyReused, shown_value
+from service.errors import AcquisitionError, Busy, Conflict, KeyReused, shown_value
 from service.observations.batch import ObservationBatch
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, unpack
@@ -126,15 +126,17 @@ def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Seque
     return execute(connection, sql, {"wanted": msgspec.json.encode(list(wanted)).decode()})
 
 
-def remember_key(
-    connection: Connection, identity: Identity, key: OwnKey, taken: ExistingResult
-) -> None:
-    """Give a key to a body that is recorded without it; raises `KeyReused` if another has it."""
-    holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
-    if isinstance(holder, KeyReused | Conflict):
-        raise holder
-    if holder is None:
-        connection.execute(insert(tables.idempotency_keys), key_row(key, taken))
+def remember_keys(
+    connection: Connection, keys: Sequence[tuple[Identity, OwnKey, ExistingResult]]
+) -> list[AcquisitionError | None]:
+    """Give keys to bodies that are recorded without them; the error of each that another has."""
+    outcomes: list[AcquisitionError | None] = []
+    for identity, key, taken in keys:
+        holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
+        outcomes.append(holder if isinstance(holder, AcquisitionError) else None)
+        if holder is None:
+            connection.execute(insert(tables.idempotency_keys), key_row(key, taken))
+    return outcomes
 
 
 def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
