@@ -76,7 +76,7 @@ def search(observed, stars, pairs, exhaustive, max_work, scratch, ledger):  # ty
     seeds, group, group_of = scratch.seeds, scratch.group, scratch.group_of
     first_pair, last_pair = scratch.first_pair, scratch.last_pair
     s = len(seeds)
-    _choose_seeds(observed.magnitude, seeds)
+    _choose_seeds(observed, stars, seeds)
     _find_candidates(observed, pairs, scratch)
     # By observed star; those that are no seeds are each by themselves.
     for k in range(n):
@@ -145,19 +145,28 @@ def _most_unseen(observed, stars, groups, scratch):  # type: ignore[no-untyped-d
 
 
 @njit_no_refcount
-def _choose_seeds(magnitude, seeds):  # type: ignore[no-untyped-def]
+def _choose_seeds(observed, stars, seeds):  # type: ignore[no-untyped-def]
     """The stars whose pairs are scanned: all, or the brightest; those without a magnitude last.
 
-    By insertion: to compile numba's sorts took longer than the rest of this module.
+    Stars that the presumed attitude puts outside the zone come after all others: nothing in the
+    zone matches them.  By insertion: to compile numba's sorts took longer than the rest of this
+    module.
     """
-    chosen = 0
-    for k in range(len(magnitude)):
-        at = chosen
-        while at > 0 and _is_brighter(magnitude[k], magnitude[seeds[at - 1]]):
-            at -= 1
-        if at < len(seeds):
-            _insert(seeds, min(chosen, len(seeds) - 1), at, k)
-            chosen = min(chosen + 1, len(seeds))
+    magnitude, direction = observed.magnitude, observed.direction
+    chosen = first = 0
+    for inside in (True, False):
+        for k in range(len(magnitude)):
+            at = chosen
+            if len(magnitude) > len(seeds):
+                polar = separation_rad(direction[k], stars.axis)
+                if (stars.least <= polar <= stars.most) != inside:
+                    continue
+                while at > first and _is_brighter(magnitude[k], magnitude[seeds[at - 1]]):
+                    at -= 1
+            if at < len(seeds):
+                _insert(seeds, min(chosen, len(seeds) - 1), at, k)
+                chosen = min(chosen + 1, len(seeds))
+        first = chosen
     for x in range(1, len(seeds)):
         at = x
         while at > 0 and seeds[x] < seeds[at - 1]:
