@@ -60,9 +60,9 @@ def filter_attitude(
     """Filter a stretch from `state`, or from the first measured attitude where there is none.
 
     Epochs are all times of gyro samples and, up to the last sample, of measurements.  A
-    `GyroModel` needs `gyro`; a `ConstantRateModel` takes none, and its epochs are the
-    measurements.  Filtering in parts, each from the state at the end of the one
-    before, gives the same bytes as in one.
+    `GyroModel` needs `gyro`; the epochs of a `ConstantRateModel` are the measurements, and
+    `gyro` has a rate for each of their times, or is None.  Filtering in parts, each from the
+    state at the end of the one before, gives the same bytes as in one.
 
     Raises `BadInput` for a rate beyond the gyro's limit, samples that are not later than
     the state, measurements before it, and a stretch without any epoch.
@@ -70,12 +70,13 @@ def filter_attitude(
     attitudes, directions = attitudes or no_attitudes(), directions or no_directions()
     least_redundancy = LEAST_REDUNDANCY
     if isinstance(model, ConstantRateModel):
-        if gyro is not None:
-            raise BadInput(Fault("gyro", "must be absent where the model is of a constant rate"))
         times = np.unique(np.concatenate([attitudes.tai_ns, directions.tai_ns]))
-        if state is not None:
-            times = times[times >= state.tai_ns]
-        gyro, model = GyroSamples(times, np.zeros((len(times), 3))), model.as_gyro()
+        if gyro is not None and not np.array_equal(gyro.tai_ns, times):
+            expected = "must be the times of the measurements where the model is of a constant rate"
+            raise BadInput(Fault("gyro.tai_ns", expected, f"{len(gyro.tai_ns)} times"))
+        rates = np.zeros((len(times), 3)) if gyro is None else gyro.rate_rad_s
+        begin = 0 if state is None else np.searchsorted(times, state.tai_ns)
+        gyro, model = GyroSamples(times[begin:], rates[begin:]), model.as_gyro()
         # A rate that nothing measures may be too uncertain ever to check an attitude.
         least_redundancy = 1.0
     elif gyro is None:

@@ -73,16 +73,20 @@ class ConstantRateModel:
     one sigma of the rate when nothing is known of it.
 
     The filter then runs with a measured rate of zero, so that **the bias is minus the
-    rate**: w_true = 0 - b.
+    rate**: w_true = 0 - b.  A body that turns far from one measurement to the next looks
+    slower than it is, or still.  Of such a body the rates that came with its measurements
+    can be given as samples; the bias is then what they are off, `rate_sigma_rad_s` one sigma
+    of it, and `angle_walk_rad_s0_5` the density of their other errors in rad/s^.5.
     """
 
     rate_walk_rad_s1_5: float
     rate_sigma_rad_s: float = RATE_RAD_S
+    angle_walk_rad_s0_5: float = 0.0
 
     def as_gyro(self) -> GyroModel:
         """The gyro that always reads zero and whose bias is minus the rate; it has no gaps."""
         return GyroModel(
-            sigma_v_rad_s0_5=0.0,
+            sigma_v_rad_s0_5=self.angle_walk_rad_s0_5,
             sigma_u_rad_s1_5=self.rate_walk_rad_s1_5,
             bias_sigma_rad_s=self.rate_sigma_rad_s,
             largest_step_s=1e6,

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.filtering.filter import filter_attitude
-from service.filtering.inputs import ConstantRateModel, GyroSamples
+from service.filtering.inputs import ConstantRateModel, GyroModel, GyroSamples
 from service.filtering.result import FilterResult, FilterState
 from service.grades.day import WARM_UP_S, GradedSamples, Model, samples_of
 from service.grades.stretches import (
@@ -115,7 +115,7 @@ def last_stretch(recorded: Recorded, mission: Mission) -> Stretch | None:
     if not found:
         return None
     end_ns = max(_end_ns(each) for each in found)
-    with_gyro = [each for each in found if each.gyro is not None]
+    with_gyro = [each for each in found if isinstance(each.model, GyroModel)]
     for each in reversed(with_gyro):
         if end_ns - _end_ns(each) <= LONGEST_GAP_S * 1e9:
             return each

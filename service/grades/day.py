@@ -174,7 +174,8 @@ class GradedDay:
     """The stretches of a day, and what became of what was recorded.
 
     `measurements` counts by the names of `filtering.result.Outcome`, and `unusable` and `alone`
-    ones; `gyro` counts samples, gaps and those beyond the largest rate.  `nis_per_degree` is
+    ones; `gyro` counts samples, gaps, those beyond the
+    largest rate, and zeros while the body turned.  `nis_per_degree` is
     the mean of z^T S^-1 z of the accepted measurements by their degrees of freedom: about 1.
     """
 
@@ -239,6 +240,7 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
             "samples": int(np.count_nonzero(of_gyro)),
             "gaps": gaps,
             "beyond_largest": found.beyond_largest,
+            "not_given": found.not_given,
         },
         nis / degrees if degrees else None,
     )

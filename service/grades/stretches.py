@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -19,9 +19,10 @@ from service.filtering.inputs import (
     GyroSamples,
 )
 from service.gyro import Nanoseconds
+from service.interpolation import QUARTER_TURN_RAD
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings, MotionSettings
-from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices
+from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices, rotation_vectors
 
 LONGEST_GAP_S = 600.0
 """A longer gap ends a stretch; what an attitude is worth is gone by then."""
@@ -30,7 +31,10 @@ _LONGEST_GAP_NS = int(LONGEST_GAP_S) * 10**9
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """The filter's input of an unbroken stretch; `gyro` is None at a constant rate."""
+    """The filter's input of an unbroken stretch.
+
+    At a constant rate `gyro` is None, or the rates that the batches of a spinning body carried.
+    """
 
     model: GyroModel | ConstantRateModel
     gyro: GyroSamples | None
@@ -49,12 +53,14 @@ class Stretch:
 class Cut:
     """The stretches of a window in order of time, and what is in none of them.
 
-    `beyond_largest` counts gyro samples beyond the mission's largest rate, `alone` the
-    measurements that are too few to confirm an attitude at a constant rate.
+    `beyond_largest` counts gyro samples beyond the mission's largest rate, `not_given` samples of
+    zeros while the body turned, `alone` the measurements that are too few to confirm an attitude
+    at a constant rate.
     """
 
     stretches: list[Stretch]
     beyond_largest: int
+    not_given: int
     alone: int
 
 
@@ -69,6 +75,8 @@ class Recorded:
 
     `gyro_ns` (n,) and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.  Of m
     attitudes those are left out whose covariance says nothing, and counted in `unusable`.
+    `carried_rad_s` (m, 3) are the rates about the body axes that the batches of the attitudes
+    carried, zeros where none; None where none carried any.
     """
 
     gyro_ns: Nanoseconds
@@ -76,6 +84,23 @@ class Recorded:
     attitudes: AttitudeMeasurements
     directions: DirectionMeasurements
     unusable: int = 0
+    carried_rad_s: Vector | None = None
+
+
+RATE_SIGMAS = 3.0
+"""A body that turns faster than so many of the mission's sigmas is not found by its attitudes."""
+
+
+def rates_of_use(model: ConstantRateModel, tai_ns: Nanoseconds, carried_rad_s: Vector) -> bool:
+    """True if the attitudes of a body at times (m,) do not tell how it turns at rates (m, 3).
+
+    The filter does not expect it to turn so fast.  Where it makes more than a quarter turn between
+    two of them, they leave open how many turns and which way round.
+    """
+    fastest = np.linalg.norm(carried_rad_s, axis=1)
+    turn = np.maximum(fastest[1:], fastest[:-1]) * np.diff(tai_ns) * NS
+    is_fast = fastest > RATE_SIGMAS * model.rate_sigma_rad_s
+    return bool(is_fast.any() or (turn > QUARTER_TURN_RAD).any())
 
 
 def arrays_of(
@@ -95,8 +120,8 @@ def arrays_of(
 
 def usable_attitudes(
     tai_ns: Nanoseconds, quaternion: Vector, covariance_arcsec2: Vector
-) -> tuple[AttitudeMeasurements, int]:
-    """The attitudes with a sound covariance, and how many there are without one.
+) -> tuple[AttitudeMeasurements, Mask]:
+    """The attitudes with a sound covariance, and marks (m,) of those among all.
 
     `covariance_arcsec2` (m, 6) is the upper triangle: 11, 12, 13, 22, 23, 33.
     """
@@ -108,7 +133,7 @@ def usable_attitudes(
     sound &= variances[:, 2] < LARGEST_SIGMA_RAD**2
     norm = np.linalg.norm(quaternion[sound], axis=1, keepdims=True)
     kept = AttitudeMeasurements(tai_ns[sound], quaternion[sound] / norm, full[sound])
-    return kept, int(np.count_nonzero(~sound))
+    return kept, sound
 
 
 def attitudes_where(attitudes: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
@@ -138,11 +163,14 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
     stretches: list[Stretch] = []
     attitude_ns, direction_ns = recorded.attitudes.tai_ns, recorded.directions.tai_ns
     left_a, left_d = np.ones(len(attitude_ns), bool), np.ones(len(direction_ns), bool)
-    beyond = 0
+    beyond = not_given = 0
     edges: list[int] = []
     if mission.gyro is not None and len(recorded.gyro_ns):
         kept = believed(mission.gyro, recorded.rates_rad_s)
         beyond = int(np.count_nonzero(~kept))
+        none = zeros_while_turning(mission.gyro, recorded)
+        not_given = int(np.count_nonzero(none))
+        kept &= ~none
         times, rates = recorded.gyro_ns[kept], recorded.rates_rad_s[kept]
         for part in _unbroken(times):
             model, gyro = gyro_samples(mission.gyro, times[part], rates[part])
@@ -164,17 +192,23 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
         if np.count_nonzero(of_a) + np.count_nonzero(of_d) < FilterSettings().confirmations:
             alone += int(np.count_nonzero(of_a) + np.count_nonzero(of_d))
             continue
+        at_rate, carried = constant_rate(mission.motion), None
+        if recorded.carried_rad_s is not None:
+            times = np.union1d(attitude_ns[of_a], direction_ns[of_d])
+            at_rate, carried = at_carried_rates(
+                at_rate, times, attitude_ns[of_a], recorded.carried_rad_s[of_a]
+            )
         stretches.append(
             Stretch(
-                constant_rate(mission.motion),
-                None,
+                at_rate,
+                carried,
                 attitudes_where(recorded.attitudes, of_a),
                 directions_where(recorded.directions, of_d),
             )
         )
     # At least one measured attitude: the filter starts from nothing else.
     stretches = [each for each in stretches if len(each.attitudes.tai_ns)]
-    return Cut(sorted(stretches, key=lambda each: each.begin_ns), beyond, alone)
+    return Cut(sorted(stretches, key=lambda each: each.begin_ns), beyond, not_given, alone)
 
 
 def _unbroken(times_ns: Nanoseconds) -> Iterator[slice]:
@@ -230,6 +264,49 @@ def believed(settings: GyroSettings, rates_rad_s: Vector) -> npt.NDArray[np.bool
     return np.asarray((np.abs(rates_rad_s) <= largest).all(axis=1))
 
 
+BIAS_SIGMAS = 6.0
+"""No bias of a gyro is as many of its sigmas."""
+
+
+def turns_beside_bias(
+    settings: GyroSettings, attitudes: AttitudeMeasurements
+) -> npt.NDArray[np.bool_]:
+    """Marks (m - 1,) of the steps between attitudes in which the body turned for certain.
+
+    It turned by more than the attitudes' errors and a gyro's bias can make of a body at rest.
+    """
+    q, covariance = attitudes.quaternion, attitudes.covariance_rad2
+    turn_rad = np.linalg.norm(rotation_vectors(q[:-1], q[1:]), axis=1)
+    variance = np.trace(covariance, axis1=1, axis2=2)
+    noise_rad = np.sqrt(variance[1:] + variance[:-1])
+    drift_rad = settings.bias_sigma_rad_s * np.diff(attitudes.tai_ns) * NS
+    return np.asarray(turn_rad > BIAS_SIGMAS * (noise_rad + drift_rad))
+
+
+def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
+    """Marks (n,) of gyro samples that are zero about all axes, in a row, while the body turned.
+
+    Such samples stand for none.  A gyro of coarse steps also reads zero, of a body nearly at rest.
+    """
+    none = np.zeros(len(recorded.gyro_ns), bool)
+    zero = ~recorded.rates_rad_s.any(axis=1)
+    attitude_ns = recorded.attitudes.tai_ns
+    if not zero.any() or len(attitude_ns) < 2:
+        return none
+    # Samples after the first attitude of each step, up to that after the second.
+    first = np.searchsorted(recorded.gyro_ns, attitude_ns[:-1], side="right")
+    end = np.searchsorted(recorded.gyro_ns, attitude_ns[1:])
+    zeros = np.append(0, np.cumsum(zero))
+    turned = turns_beside_bias(settings, recorded.attitudes) & (end > first)
+    turned &= zeros[end] - zeros[first] == end - first
+    # Each run of zeros of which a part is none, is none.
+    edge = np.flatnonzero(np.diff(np.concatenate([[0], zero, [0]])))
+    for begin, stop in edge.reshape(-1, 2).tolist():
+        within = turned & (first >= begin) & (end <= stop)
+        none[begin:stop] = within.any()
+    return none
+
+
 def gyro_samples(
     settings: GyroSettings, tai_ns: Nanoseconds, rates_rad_s: Vector
 ) -> tuple[GyroModel, GyroSamples]:
@@ -264,3 +341,31 @@ def constant_rate(settings: MotionSettings | None) -> ConstantRateModel:
     """The model of a body without a gyro."""
     settings = settings or MotionSettings()
     return ConstantRateModel(settings.rate_walk_rad_s1_5, settings.rate_sigma_rad_s)
+
+
+def at_carried_rates(
+    model: ConstantRateModel,
+    times_ns: Nanoseconds,
+    attitude_ns: Nanoseconds,
+    carried_rad_s: Vector,
+) -> tuple[ConstantRateModel, GyroSamples | None]:
+    """The model and the rates of a stretch whose batches carried rates of a body that spins.
+
+    `times_ns` (n,) are those of all measurements, `carried_rad_s` (m, 3) the rates of the
+    attitudes, zeros where none.  Where they are of no use, the model comes back without rates.
+    """
+    known = carried_rad_s.any(axis=1)
+    if not rates_of_use(model, attitude_ns, carried_rad_s):
+        return model, None
+    known_ns = attitude_ns[known]
+    # Each measurement without rates takes those of the nearest that has some.
+    after = np.searchsorted(known_ns, times_ns).clip(max=len(known_ns) - 1)
+    before = (after - 1).clip(0)
+    is_before = np.abs(times_ns - known_ns[before]) < np.abs(known_ns[after] - times_ns)
+    rates = carried_rad_s[known][np.where(is_before, before, after)]
+    step_s = np.diff(times_ns) * NS
+    # Between two batches the body may nutate: half of the change is an error of the mean.
+    error = 0.5 * np.abs(np.diff(rates, axis=0)).max(axis=1)
+    angle_walk = math.sqrt(float(np.mean(error**2 * step_s)))
+    mean = np.vstack([rates[:1], 0.5 * (rates[1:] + rates[:-1])])
+    return replace(model, angle_walk_rad_s0_5=angle_walk), GyroSamples(times_ns, mean)

@@ -209,6 +209,9 @@ def _by_gyro(
     tai_ns, rates = gyro_in(connection, selected)
     if len(tai_ns) < 2 or not believed(mission.gyro, rates).all():
         return None
+    if not rates.any() and (last.body_rates_deg_per_s.any() or batch.body_rates_deg_per_s.any()):
+        # A gyro that reads zero while the batches say that the body turns, gives nothing.
+        return None
     try:
         model, samples = gyro_samples(mission.gyro, tai_ns, rates)
     except BadInput:

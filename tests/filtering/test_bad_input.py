@@ -129,7 +129,7 @@ def test_a_stretch_needs_a_gyro_or_a_constant_rate_and_one_sample():
     for given in (
         (MODEL, None, attitudes),
         (MODEL, empty, attitudes),
-        (ConstantRateModel(1e-9), GyroSamples(TIMES, RATES), attitudes),
+        (ConstantRateModel(1e-9), GyroSamples(TIMES + 1, RATES), attitudes),
         (ConstantRateModel(1e-9), None, None),
     ):
         with pytest.raises(BadInput, match="gyro"):

@@ -1,5 +1,7 @@
 """The grades of a day: what they promise of accuracy, of gaps, and of what is wrong."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -14,6 +16,7 @@ from tests.filtering.simulated import (
     ARCSEC,
     attitudes_of,
     gyro_of,
+    inertial_hold,
     slews,
     squares,
     truth_of,
@@ -79,7 +82,7 @@ def test_what_became_of_the_record_is_told(hours):
     _, day = hours
     assert day.measurements["started"] == 1
     assert day.measurements["accepted"] == 1350
-    assert day.gyro == {"samples": 10740, "gaps": 1, "beyond_largest": 0}
+    assert day.gyro == {"samples": 10740, "gaps": 1, "beyond_largest": 0, "not_given": 0}
     assert 0.9 < day.nis_per_degree < 1.1
 
 
@@ -166,7 +169,7 @@ def test_axes_steps_and_the_moment_of_samples_are_the_mission_s(missions, rng):
     np.testing.assert_array_equal(one.quaternion, two.quaternion)
     assert len(one) == 1201
     # A median step of .25 s: nothing is a gap, though all is finer than a second.
-    assert same.gyro == {"samples": 4801, "gaps": 0, "beyond_largest": 0}
+    assert same.gyro == {"samples": 4801, "gaps": 0, "beyond_largest": 0, "not_given": 0}
     # Of a steady turn the instant and the mean are the same; of its beginning they are not.
     instants = graded(
         recorded_of(gyro.tai_ns, gyro.rate_rad_s, attitudes),
@@ -185,7 +188,7 @@ def test_samples_beyond_the_largest_rate_are_left_out_and_counted(missions, rng)
     day = graded(
         recorded_of(gyro.tai_ns, rates, attitudes), mission_with(missions["XTE"], gyro=GYRO)
     )
-    assert day.gyro == {"samples": 601, "gaps": 1, "beyond_largest": 3}
+    assert day.gyro == {"samples": 601, "gaps": 1, "beyond_largest": 3, "not_given": 0}
     errors = errors_of(day.stretches[0].samples["smoothed"], truth, NOON_NS)
     assert np.abs(errors).max() < 120.0 * ARCSEC
 
@@ -244,9 +247,9 @@ def test_attitudes_whose_covariance_says_nothing_are_left_out():
     flat = [1.0, 1.0, 0.0, 1.0, 0.0, 1.0]
     covariance = np.array([good, flat, [np.nan] * 6, [0.0] * 6, [1e12, 0, 0, 1e12, 0, 1e12], good])
     q = np.tile([0.0, 0.0, 0.0, 1.0], (6, 1))
-    kept, unusable = usable_attitudes(np.arange(6), q, covariance)
+    kept, sound = usable_attitudes(np.arange(6), q, covariance)
     assert kept.tai_ns.tolist() == [0, 5]
-    assert unusable == 4
+    assert sound.tolist() == [True, False, False, False, False, True]
 
 
 def test_measurements_that_cannot_confirm_an_attitude_are_counted(missions, rng):
@@ -295,3 +298,99 @@ def test_damaged_bytes_are_named(hours, damage, said):
 def test_settings_of_a_gyro_have_bounds():
     with pytest.raises(ValueError, match="largest_step_s"):
         GyroSettings(sigma_v_rad_s0_5=1e-7, sigma_u_rad_s1_5=1e-10, largest_step_s=0.0)
+
+
+def spun(rate_deg_per_s, rng, step_s=10.0, duration_s=900.0, carried=None, wander=0.0):
+    """A body that spins at a rate (3,) and nutates by `wander` deg/s, seen every `step_s` seconds.
+
+    `carried` (3,) in deg/s are the rates that its batches carry, by default its own.
+    """
+    spin = np.radians(rate_deg_per_s)
+    across = np.cross(spin, [0.3, 0.5, 0.8])
+    across *= np.radians(wander) / (np.linalg.norm(across) or 1.0)
+    other = np.cross(spin, across) / (np.linalg.norm(spin) or 1.0)
+
+    def rate(t):
+        phase = 0.3 * np.linalg.norm(spin) * t[:, None]
+        return spin + across * np.cos(phase) + other * np.sin(phase)
+
+    truth = truth_of(rate, duration_s, 0.5)
+    rows = np.arange(0, len(truth.time_s), round(step_s / 0.5))
+    attitudes = attitudes_of(truth, rows, SIGMAS, rng)
+    own = rate(truth.time_s[rows])
+    rates = own if carried is None else np.tile(np.radians(carried), (len(rows), 1))
+    recorded = replace(recorded_of([], np.zeros((0, 3)), attitudes), carried_rad_s=rates)
+    return truth, rows, recorded, np.degrees(own)
+
+
+@pytest.mark.parametrize("spin", [(0.0, 0.0, 36.0), (0.0, -24.0, 0.0), (18.0, 18.0, 1.0)])
+def test_a_spinning_body_has_the_rates_that_its_batches_carried(rng, spin):
+    """At 36 deg/s, with a batch every ten seconds, a body looks still; at 24 it looks reversed."""
+    truth, rows, recorded, own = spun(spin, rng)
+    (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+    for samples in stretch.samples.values():
+        assert (samples.status[10:] == Status.GOOD).all()
+        np.testing.assert_allclose(samples.rate_deg_per_s[5:-1], own[5:-1], atol=0.02)
+        found = Rotation.from_quat(samples.quaternion)
+        e = (found.inv() * truth.attitude[rows]).as_rotvec()
+        assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
+
+
+def test_rates_that_are_a_little_off_are_corrected_along_the_spin(rng):
+    """Across it, a constant error turns with the body: one turn a step leaves nothing of it."""
+    _, _, recorded, own = spun((0.0, 0.0, 36.0), rng, carried=(0.0, 0.02, 36.03))
+    (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+    rates = stretch.samples["smoothed"].rate_deg_per_s
+    np.testing.assert_allclose(rates[5:-1, 2], own[5:-1, 2], atol=0.01)
+    np.testing.assert_allclose(rates[5:-1, :2], own[5:-1, :2], atol=0.03)
+
+
+def test_random_spinners_are_smoothed_at_their_own_rates(rng):
+    """Bodies of up to 60 deg/s about any axis that nutate a little, seen each second to minute."""
+    for _ in range(20):
+        axis = rng.normal(size=3)
+        spin = rng.uniform(0.0, 60.0) * axis / np.linalg.norm(axis)
+        step_s = float(rng.choice([1.0, 2.5, 10.0, 30.0, 60.0]))
+        truth, rows, recorded, own = spun(spin, rng, step_s, 40 * step_s, wander=0.02)
+        (stretch,) = graded(recorded, mission_without_gyro("XTE")).stretches
+        samples = stretch.samples["smoothed"]
+        found = Rotation.from_quat(samples.quaternion)
+        e = (found.inv() * truth.attitude[rows]).as_rotvec()
+        assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
+        off = np.abs(samples.rate_deg_per_s - own)[3:-1].max()
+        # What the body nutates, and what attitudes of 40 arcsec leave over a step.
+        assert off < 0.05 + 0.05 / step_s, (spin, step_s)
+
+
+def test_rates_of_a_body_that_turns_little_change_nothing(rng):
+    _, _, recorded, _ = spun((0.0, 0.0, 0.2), rng)
+    mission = mission_without_gyro("XTE")
+    with_rates, without = (
+        graded(r, mission) for r in (recorded, replace(recorded, carried_rad_s=None))
+    )
+    for grade in ("filtered", "smoothed"):
+        pair = (each.stretches[0].samples[grade] for each in (with_rates, without))
+        assert len({packed(samples) for samples in pair}) == 1
+
+
+def test_zeros_of_a_gyro_while_the_body_turns_are_none(missions, rng):
+    """As a system writes them whose gyro is off; a body at rest may read zero."""
+    truth = truth_of(lambda t: np.tile([0.0, 2e-3, 0.0], (len(t), 1)), 3600.0)
+    gyro, _ = gyro_of(truth, MODEL, rng)
+    attitudes = attitudes_of(truth, np.arange(0, 3601, 8), SIGMAS, rng)
+    off = (truth.time_s >= 1000.0) & (truth.time_s < 2800.0)
+    rates = np.where(off[:, None], 0.0, gyro.rate_rad_s)
+    mission = mission_with(missions["XTE"], gyro=GYRO)
+    day = graded(recorded_of(gyro.tai_ns, rates, attitudes), mission)
+    assert day.gyro["not_given"] == np.count_nonzero(off)
+    assert [each.model for each in day.stretches] == ["gyro", "constant_rate", "gyro"]
+    for stretch in day.stretches:
+        samples = stretch.samples["smoothed"]
+        e = errors_of(samples, truth, NOON_NS)
+        assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
+        assert (samples.status == Status.GOOD).mean() > 0.9
+    still = truth_of(inertial_hold, 3600.0)
+    attitudes = attitudes_of(still, np.arange(0, 3601, 8), SIGMAS, rng)
+    day = graded(recorded_of(still.tai_ns, np.zeros((3601, 3)), attitudes), mission)
+    assert day.gyro["not_given"] == 0
+    assert [each.model for each in day.stretches] == ["gyro"]

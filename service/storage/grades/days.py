@@ -87,7 +87,10 @@ class DaySummary(Struct, frozen=True, kw_only=True):
     measurements: dict[str, int]
     """Measured attitudes by what became of them: accepted, rejected, started (with it the filter
     began), undecided, unused, unusable (its covariance), alone (too few)."""
-    gyro: Annotated[dict[str, int], doc("Samples, gaps, samples beyond the largest rate.")]
+    gyro: Annotated[
+        dict[str, int],
+        doc("Samples, gaps, samples beyond the largest rate, zeros while the body turned."),
+    ]
     nis_per_degree: float | None
     """Mean of z^T S^-1 z of the accepted measurements by degrees of freedom: about 1."""
 

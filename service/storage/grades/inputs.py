@@ -15,7 +15,14 @@ from service.errors import BadInput
 from service.filtering.inputs import DirectionMeasurements, no_directions
 from service.filtering.prediction import Known
 from service.grades.day import METHOD
-from service.grades.stretches import Recorded, arrays_of, usable_attitudes
+from service.grades.stretches import (
+    LONGEST_GAP_S,
+    Recorded,
+    arrays_of,
+    constant_rate,
+    rates_of_use,
+    usable_attitudes,
+)
 from service.gyro import Nanoseconds, tai_ns_of
 from service.identify.attitude_from_matches import matched_vectors
 from service.identify.identification import Outcome
@@ -37,7 +44,9 @@ from service.times import DAY_S, Utc, recorded_utc
 from service.vectors import ARCSEC_PER_RADIAN, Vector, unit
 
 _ATTITUDES = select(
-    results.c.time_ns, *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE))
+    results.c.time_ns,
+    *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
+    results.c.batch_id,
 ).join_from(results, solutions, solutions.c.result_id == results.c.id)
 
 
@@ -58,14 +67,32 @@ def recorded_in(
     selected = ResultFilter(run, spacecraft, start, end)
     query = _ATTITUDES.where(*selected.conditions(), results.c.status == "good").order_by(*PLACE)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=object)
-    rows = rows.reshape(-1, 11)
-    numbers = rows[:, 1:].astype(np.float64)
-    attitudes, unusable = usable_attitudes(
-        rows[:, 0].astype(np.int64), numbers[:, :4], numbers[:, 4:]
-    )
+    rows = rows.reshape(-1, 12)
+    numbers = rows[:, 1:11].astype(np.float64)
+    attitudes, sound = usable_attitudes(rows[:, 0].astype(np.int64), numbers[:, :4], numbers[:, 4:])
     gyro_ns, rates = gyro_in(connection, BlockFilter(spacecraft, run, start, end))
+    carried = _carried_rates(connection, rows[sound, 11].tolist(), attitudes.tai_ns, gyro_ns)
     directions = lone_stars(connection, sky, selected)
-    return Recorded(gyro_ns, rates, attitudes, directions, unusable)
+    unusable = int(np.count_nonzero(~sound))
+    return Recorded(gyro_ns, rates, attitudes, directions, unusable, carried)
+
+
+def _carried_rates(
+    connection: Connection, batch_ids: list[str], tai_ns: Nanoseconds, gyro_ns: Nanoseconds
+) -> Vector | None:
+    """The rates that batches carried, see `Recorded`; zeros near gyro samples, which are better."""
+    carried = np.zeros((len(batch_ids), 3))
+    padded = np.concatenate([[-FAR_NS], gyro_ns, [FAR_NS]])
+    place = np.searchsorted(gyro_ns, tai_ns)
+    near = np.minimum(tai_ns - padded[place], padded[place + 1] - tai_ns)
+    chosen = np.flatnonzero(near > LONGEST_GAP_S * 1e9).tolist()
+    for first in range(0, len(chosen), _READ_AT_ONCE):
+        part = chosen[first : first + _READ_AT_ONCE]
+        inputs = _inputs(connection, [batch_ids[row] for row in part])
+        for row in part:
+            sent = RATES.decode(inputs[batch_ids[row]]).body_rates_deg_per_s
+            carried[row] = np.radians(sent or np.zeros(3))
+    return carried if carried.any() else None
 
 
 def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[Nanoseconds, Vector]:
@@ -99,11 +126,15 @@ def inputs_digest(recorded: Recorded, mission: Mission) -> str:
         for name, each in (("gyro", mission.gyro), ("motion", mission.motion))
     }
     digest = hashlib.sha256(json.dumps([METHOD, settings], sort_keys=True).encode())
+    carried, model = recorded.carried_rad_s, constant_rate(mission.motion)
+    if carried is not None and not rates_of_use(model, recorded.attitudes.tai_ns, carried):
+        carried = None
     for values in (
         recorded.gyro_ns,
         recorded.rates_rad_s,
         *arrays_of(recorded.attitudes, recorded.directions),
         np.array([recorded.unusable]),
+        *(() if carried is None else (carried,)),
     ):
         digest.update(f"{values.dtype}{values.shape}".encode())
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -167,6 +198,8 @@ WITHOUT_ATTITUDE = (
     str(NoAttitude.DEGENERATE_GEOMETRY),
 )
 """Why a batch has no attitude although stars of it are identified."""
+FAR_NS = 2**62
+"""Nanoseconds of TAI beyond any time of a record."""
 _READ_AT_ONCE = 100
 """Inputs may be long: few of them are in memory at a time."""
 
