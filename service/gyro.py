@@ -244,7 +244,7 @@ def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None
             message = f"{len(rates)} samples span {times_s[-1]:g} s, at most {MAX_SPAN_S:g} s may"
             raise BadBatch(Fault("step_s", message, shown_value(model.step_s)))
     else:
-        times_s = np.array(model.times_s, np.float64)
+        times_s, rates = _once(np.array(model.times_s, np.float64), rates)
         _check_times(times_s, len(rates))
     return GyroBlock(
         spacecraft,
@@ -255,6 +255,15 @@ def block_from_model(model: GyroBlockIn, spacecraft: str, run: str | None = None
         read_only(times_s),
         read_only(rates),
     )
+
+
+def _once(times_s: Vector, rates: Vector) -> tuple[Vector, Vector]:
+    """The samples without those that repeat the one before exactly, in time and rates."""
+    if times_s.size != len(rates):
+        return times_s, rates
+    again = (np.diff(times_s) == 0.0) & (np.diff(rates, axis=0) == 0.0).all(axis=1)
+    once = np.append(True, ~again)
+    return times_s[once], rates[once]
 
 
 def _check_times(times_s: Vector, samples: int) -> None:

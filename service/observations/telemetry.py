@@ -157,6 +157,7 @@ class BlockRows(csv_rows.JoinedRows):
         self.start, self.start_ns = "", 0
         self.times_s: list[float] = []
         self.rates: list[list[float]] = []
+        self._taken: set[tuple[float, ...]] = set()
 
     def take(self, row: CsvRow) -> None:
         """Take the cells of a row; raises `BadCell`."""
@@ -168,8 +169,14 @@ class BlockRows(csv_rows.JoinedRows):
             raise csv_rows.BadCell("time", error.faults[0].message, row["time"]) from None
         if not self.rates:
             self.start, self.start_ns = time.text, time.tai_ns
-        self.times_s.append((time.tai_ns - self.start_ns) * 1e-9)
-        self.rates.append([csv_rows.number_cell(row, column) for column in RATES])
+        time_s = (time.tai_ns - self.start_ns) * 1e-9
+        rates = [csv_rows.number_cell(row, column) for column in RATES]
+        if (row_of := (time_s, *rates)) in self._taken:
+            # The row was written twice, or the file to its own end.
+            return
+        self._taken.add(row_of)
+        self.times_s.append(time_s)
+        self.rates.append(rates)
 
     def body(self) -> Mapping[str, Any]:
         """The JSON object of the block."""

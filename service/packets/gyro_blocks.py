@@ -1,6 +1,7 @@
 """Packets to gyro blocks: the samples of packets, gathered in blocks of a fixed time."""
 
 import math
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -20,6 +21,9 @@ from service.times import parse_utc, shifted
 
 MOST_SAMPLES = 10_000
 """The most samples of a block, as in a request."""
+
+LATEST = 16
+"""Packets among which one that comes again is recognised."""
 
 Values = Mapping[str, Any]
 Axes = tuple[float, float, float]
@@ -58,6 +62,7 @@ class GyroBlockMaker:
         self._turn = 1 << self._table.counter_bits
         self._block_ns = round(self._table.block_s * NS)
         self._before: _Sample | None = None
+        self._latest: deque[list[_Sample]] = deque(maxlen=LATEST)
         self._pending: PacketBlock | None = None
 
     def add(self, packet: SpacePacket, values: Values) -> Iterator[PacketBlock]:
@@ -68,13 +73,18 @@ class GyroBlockMaker:
         if self._mapped.gyro_values[0][0] not in values:
             return
         moment = moment_of(self._table.time or self._mapped.table.time, values)
-        found = [self._sample(values, moment, row) for row in range(self._used(values))]
+        rows = range(self._used(values))
+        found = [self._sample(values, moment, row) for row in rows]
+        if found in self._latest:
+            # The packet was sent or stored twice.
+            return
         for before, after in pairwise(found):
             if after.tai_ns <= before.tai_ns:
                 name = ", ".join(self._mapped.gyro_offsets)
                 raise PacketFault(name, "must rise from sample to sample")
         rates = self._rates(found)
         self._before = found[-1] if found else self._before
+        self._latest.append(found)
         for sample, rate in rates:
             if (done := self._taken(packet, moment, sample, rate)) is not None:
                 yield done

@@ -29,6 +29,19 @@ SYNC_MARKERS = {
     )
 }
 """Source: CCSDS 131.0-B, section 9, and 231.0-B; transfer frames begin with them."""
+CONTAINERS = {
+    b"CCSD": "an SFDU label (CCSDS 620.0-B)",
+    b"NJPL": "an SFDU label of JPL",
+    b"cFE1": "a file header of cFS: 64 bytes, and 76 more of its Data Storage application",
+    b"\xd4\xc3\xb2\xa1": "the header of a pcap capture",
+    b"\xa1\xb2\xc3\xd4": "the header of a pcap capture",
+    b"\x4d\x3c\xb2\xa1": "the header of a pcap capture",
+    b"\x0a\x0d\x0d\x0a": "the header of a pcapng capture",
+    b"\x1f\x8b\x08": "the header of gzip",
+    b"\x28\xb5\x2f\xfd": "the header of zstd",
+    b"PK\x03\x04": "the header of a zip archive",
+}
+"""The first bytes of files that hold packets within something else."""
 SEQUENCE_COUNTS = 1 << 14
 
 
@@ -95,6 +108,14 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
             message = (
                 f"{marker} is where a packet should begin: these are transfer frames; extract the "
                 "space packets first, or set packets.prefix_bytes if each packet has such a prefix"
+            )
+            raise EndOfPackets(number, offset, len(header), message)
+        # Later packets may begin so by chance.
+        marks = [mark for mark in CONTAINERS if number == 1 and header.startswith(mark)]
+        if marks:
+            message = (
+                f"{CONTAINERS[marks[0]]} is where a packet should begin: take the space packets "
+                "out of the file, or set packets.prefix_bytes if each packet has such a prefix"
             )
             raise EndOfPackets(number, offset, len(header), message)
         if header[0] >> 5:

@@ -8,7 +8,7 @@ from acquire_client import Client
 
 from service.access import Caller
 from service.app.factory import open_app
-from service.errors import BadFile
+from service.errors import BadBatch, BadFile
 from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
 from service.observations.telemetry import read_lines
 from service.replay.in_process import replay_in_process
@@ -199,6 +199,23 @@ def test_rows_of_samples_are_the_blocks_that_lines_would_be(tmp_path):
     assert first.times_s.tolist() == [0.0, 1.0, 2.0]
     assert first.rates_rad_per_s[2].tolist() == [0.0012, -4e-5, 2e-5]
     assert second.rates_rad_per_s.tolist() == [[0.0005, 0.0, 0.0]]
+
+
+def test_rows_and_samples_that_are_there_twice_count_once(tmp_path):
+    """A file appended to itself, and a body whose every sample is sent twice."""
+    rows = [f"XTE,,a,1999-03-01T00:00:0{k}Z,0.00{k},0,1e-5" for k in range(5)]
+    (once,) = read(tmp_path, csv_of(*rows))
+    (twice,) = read(tmp_path, csv_of(*rows, *rows))
+    assert twice.body == once.body
+    block = block_from_line(once.body)
+    told = json.loads(once.body)
+    told |= {
+        name: [each for each in told[name] for _ in "ab"] for name in ("times_s", "rates_rad_per_s")
+    }
+    assert block_from_line(json.dumps(told)).fingerprint == block.fingerprint
+    told["rates_rad_per_s"][1] = [0.5, 0.0, 1e-5]
+    with pytest.raises(BadBatch, match=r"times_s.1: must be at least 1e-06 s after"):
+        block_from_line(json.dumps(told))
 
 
 def test_an_export_can_be_read_with_a_column_for_the_spacecraft(service, tmp_path, rng):

@@ -148,6 +148,14 @@ def test_blocks_do_not_depend_on_the_packets_that_a_file_begins_with(rates):
     assert [each.body for each in later[1:]] == [each.body for each in whole[1:]]
 
 
+def test_packets_that_were_sent_twice_give_their_samples_once(rates):
+    """One after the other, as two receivers of a ground station store them."""
+    once = packets_of(rates)
+    twice = [packet for each in once for packet in (each, each)]
+    found = [each.body for each in read(twice, reader_of())]
+    assert found == [each.body for each in read(once, reader_of())]
+
+
 def test_accumulated_counts_give_the_rates_of_their_steps_through_the_end_of_the_counter(rates):
     unit = 1e-6
     counts = np.cumsum(np.rint(rates * 0.5 / unit), axis=0).astype(int)

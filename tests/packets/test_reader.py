@@ -1,5 +1,6 @@
 """Packets give the batches that were packed; a fault names file, packet, byte and parameter."""
 
+import gzip
 import io
 import json
 import math
@@ -245,6 +246,29 @@ def test_a_damaged_packet_is_named_by_file_packet_byte_and_parameter(spoilt, pla
     assert place in faults[0].field
     assert why in faults[0].message
     assert sum(each.body is not None for each in lines) >= 19
+
+
+CONTAINERS = [
+    (b"CCSD3ZF0000100000001" + b"NJPL3IS0L015\0\0\0\0\0\0\0\0", "an SFDU label"),
+    (b"cFE1" + bytes(136), "a file header of cFS"),
+    (b"\xd4\xc3\xb2\xa1\2\0\4\0" + bytes(16), "a pcap capture"),
+    (b"\x0a\x0d\x0d\x0a" + bytes(24), "a pcapng capture"),
+]
+
+
+@pytest.mark.parametrize(("before", "what"), CONTAINERS)
+def test_packets_within_a_file_of_another_kind_are_refused_by_its_name(before, what, batches):
+    """Dumps of networks and of flight software: their headers are no packets."""
+    lines = read(before + packed(batches))
+    (line,) = lines
+    assert line.body is None
+    assert what in line.fault.message
+    assert "packets.prefix_bytes" in line.fault.message
+
+
+def test_compressed_packets_are_not_read_as_packets(batches):
+    (line,) = read(gzip.compress(packed(batches)))
+    assert "the header of gzip" in line.fault.message
 
 
 VALUES = [
