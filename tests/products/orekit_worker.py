@@ -101,7 +101,7 @@ def acm(asked):
     source, shift_s = source_of(asked), asked["shift_s"]
     message = ParserBuilder().buildAcmParser().parseMessage(source)
     data = message.getSegments().get(0).getData()
-    determination = data.getAttitudeDeterminationBlock()
+    determination, user = data.getAttitudeDeterminationBlock(), data.getUserDefinedBlock()
     return {
         "stretches": [
             [state_of(each.shiftedBy(float(shift_s))) for each in block.getAngularCoordinates()]
@@ -115,19 +115,19 @@ def acm(asked):
                     for each in block.getCovariances()
                 ],
             }
-            for block in data.getCovarianceBlocks()
+            for block in data.getCovarianceBlocks() or []
         ],
-        "method": str(determination.getMethod()),
+        "method": determination and str(determination.getMethod()),
         "sensors": [
             {
                 "name": str(each.getSensorUsed()),
                 "sigma_rad": [float(sigma) for sigma in each.getSensorNoiseCovariance()],
             }
-            for each in determination.getSensorsUsed()
+            for each in (determination.getSensorsUsed() if determination else [])
         ],
         "user": {
             str(entry.getKey()): str(entry.getValue())
-            for entry in data.getUserDefinedBlock().getParameters().entrySet()
+            for entry in (user.getParameters().entrySet() if user else [])
         },
     }
 

@@ -112,6 +112,21 @@ def test_both_forms_are_read_alike(rng):
     assert kvn.at(times).tobytes() == xml.at(times).tobytes()
 
 
+def test_a_message_among_others_or_with_a_prefix_is_read_alike(rng):
+    """As catalogs wrap even one message, and as the schema with qualified names has it."""
+    page = rows(random_quaternions(rng, 20))
+    xml = written("aem-xml", page).decode()
+    _, _, message = xml.partition("?>")
+    wrapped = f'<?xml version="1.0"?>\n<ndm><MESSAGE_ID>7</MESSAGE_ID>{message}</ndm>'
+    prefixed = re.sub(r"<(/?)aem\b", r"<\1ndm:aem", xml)
+    assert "<ndm:aem" in prefixed
+    times = whole(page).time_ns
+    found = {read(each).at(times).tobytes() for each in (xml, wrapped, prefixed)}
+    assert len(found) == 1
+    with pytest.raises(BadFile, match="XML: must be the element aem"):
+        read("<ndm><oem/></ndm>")
+
+
 def segments_of(text):
     """The messages of each segment of one by itself: those of some examples overlap."""
     head, *segments = text.split("META_START")
@@ -147,6 +162,7 @@ READ = {
     *(f"AEMExample{name}" for name in ("01.txt", "02.txt", "03.xml", "04.txt", "06a.txt")),
     *(f"AEMExample{name}" for name in ("06b.txt", "11.xml", "15.txt")),
     "aemLowerCaseValue.aem",
+    *("ACMExample01.txt", "ACMExample06.txt"),
 }
 REFUSED = {
     "AEM-inconsistent-direction.txt": "line 14: ATTITUDE_DIR: is of version 1",
@@ -164,7 +180,7 @@ REFUSED = {
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("a*-*")), ids=lambda file: file.name)
 def test_orekit_s_examples_are_read_and_others_refused_by_line(file):
     kind, _, name = file.name.partition("-")
-    if kind == "aem" and name in READ:
+    if kind in ("aem", "acm") and name in READ:
         assert len(read_attitudes(file, "FILE")) >= 2
         return
     with pytest.raises(BadFile) as refusal:

@@ -175,7 +175,7 @@ HERMITE = {"INTERPOLATION": "HERMITE", "INTERPOLATION_DEGREE": 7}
 BAD = [
     ("", "line 1: CCSDS_OEM_VERS: must come first"),
     (GOOD.replace("VERS = 2.0", "VERS = 4.0"), "must be 1.0, 2.0 or 3.0 (got '4.0')"),
-    (GOOD.replace("OEM_VERS", "AEM_VERS"), "line 1: CCSDS_OEM_VERS: must come first"),
+    (GOOD.replace("OEM_VERS", "AEM_VERS"), "line 1: CCSDS_AEM_VERS: is of an AEM, not of an OEM"),
     (GOOD[: GOOD.index("META_STOP")], "META_STOP: is missing: the file was cut short"),
     (GOOD[: GOOD.index("META_START")], "line 3: META_START: is missing"),
     (GOOD.removesuffix(LAST + "\n"), "states: the last state is earlier than STOP_TIME"),

@@ -83,7 +83,8 @@ def _add_knowledge(parser: ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="set each batch's a_priori to the attitude that a file gives for its time: an AEM "
-        "(KVN or XML), or a C-kernel; batches without one in the file keep their own",
+        "or ACM (KVN or XML), a C-kernel, or CSV as `acquire export` writes; batches without one "
+        "in the file keep their own",
     )
     source.add_argument(
         "--carry-attitude",
@@ -96,7 +97,7 @@ def _add_knowledge(parser: ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="set velocity_km_per_s and position_km of batches that lack them to those that a file "
-        "gives for their time: an OEM (KVN or XML), or two-line element sets (TLE)",
+        "gives for their time: an OEM (KVN or XML), an OMM, or two-line element sets (TLE)",
     )
 
 

@@ -33,7 +33,7 @@ def add(commands: Any) -> None:
 
 
 def run(parsed: Namespace) -> int:
-    """Compare recorded attitudes with true ones: an AEM (KVN or XML) or a C-kernel. Prints the
+    """Compare recorded attitudes with true ones: an AEM or ACM, a C-kernel, or CSV. Prints the
     errors about each body axis, and whether the covariances fit them.
 
     acquire score truth.aem --spacecraft XTE --run pass-7

@@ -8,7 +8,6 @@ last, and a file that has either keyword is refused.
 """
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import IO
@@ -18,14 +17,12 @@ import numpy as np
 from service.observations.schema import NORM_TOLERANCE
 from service.products.reading import tokens as ccsds
 from service.products.reading.attitude_types import (
-    SEQUENCES,
     AttitudeType,
     Frames,
     body_attitudes,
 )
 from service.products.reading.known import KnownAttitudes, Segment, known_attitudes, told_rates
 
-_BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
 _V1_ONLY = {"QUATERNION_TYPE": ("FIRST", "LAST"), "ATTITUDE_DIR": ("A2B", "B2A")}
 _TYPES = {
     "QUATERNION": AttitudeType("quaternion"),
@@ -161,7 +158,7 @@ class _Reader(ccsds.MessageReader):
         if type.rates == "euler" and not sequence:
             # Without a sequence the rates of version 1 can be but an angular velocity.
             type = AttitudeType(type.attitude, "angvel")
-        from_body = self._from_body(metadata)
+        from_body = ccsds.from_body(metadata)
         reverse = self._v1_keyword(metadata, "ATTITUDE_DIR") == "B2A"
         return _Form(
             line=metadata.line,
@@ -177,16 +174,9 @@ class _Reader(ccsds.MessageReader):
 
     def _sequence(self, metadata: ccsds.Metadata, type: AttitudeType) -> str:
         """The axes of Euler angles, such as ZXZ; empty where the type has none."""
-        if type.attitude == "euler":
-            metadata.require(("EULER_ROT_SEQ",))
-        if "EULER_ROT_SEQ" not in metadata.values or "euler" not in (type.attitude, type.rates):
+        if type.attitude != "euler" and "EULER_ROT_SEQ" not in metadata.values:
             return ""
-        value = metadata.values["EULER_ROT_SEQ"].upper()
-        sequence = value.translate(str.maketrans("123", "XYZ"))
-        if sequence not in SEQUENCES:
-            message = "must name three axes as ZXZ or 313, no two in a row the same"
-            raise metadata.fault("EULER_ROT_SEQ", message)
-        return sequence
+        return ccsds.euler_sequence(metadata) if "euler" in (type.attitude, type.rates) else ""
 
     def _rate_in_body(self, metadata: ccsds.Metadata, from_body: bool) -> bool:
         """True if components of an angular velocity are about the axes of the body."""
@@ -205,19 +195,6 @@ class _Reader(ccsds.MessageReader):
         if self._version > 1 or name not in metadata.values:
             return ""
         return metadata.one_of(name, _V1_ONLY[name])
-
-    def _from_body(self, metadata: ccsds.Metadata) -> bool:
-        """True if REF_FRAME_A is the body; the other frame must be inertial."""
-        frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
-        is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
-        for name, frame in frames.items():
-            if not is_body[name] and frame not in ccsds.INERTIAL:
-                message = f"must be one of {', '.join(ccsds.INERTIAL)}, or the body as SC_BODY_1"
-                raise metadata.fault(name, message)
-        if is_body["REF_FRAME_A"] == is_body["REF_FRAME_B"]:
-            message = "one of REF_FRAME_A and REF_FRAME_B must be inertial, the other the body"
-            raise metadata.fault("REF_FRAME_B", message)
-        return is_body["REF_FRAME_A"]
 
     def _state(self, token: ccsds.Token, form: _Form) -> tuple[int, tuple[float, ...]]:
         words = token.words if token.names is None else self._named(token, form)

@@ -57,7 +57,7 @@ _SPACES = {1: (1, 8, 17, 32, 43, 52, 61, 63), 2: (1, 7, 16, 25, 33, 42, 51)}
 
 
 @dataclass(frozen=True)
-class _Set:
+class ElementSet:
     """A set of elements with its epoch, `Utc.tai_ns`."""
 
     epoch_ns: int
@@ -69,7 +69,7 @@ class TleEphemeris:
     """Sets of elements of one object, in order of their epochs."""
 
     object_name: str
-    sets: list[_Set]
+    sets: list[ElementSet]
 
     def at(self, moment: Utc) -> Vector | None:
         """The geocentric state (6,) in EME2000, km and km/s, by the set with the nearest epoch.
@@ -104,7 +104,7 @@ def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
     """
     require_extra("tle", "sgp4", field, name)
     source = Source(name)
-    sets: list[_Set] = []
+    sets: list[ElementSet] = []
     first: tuple[int, str] | None = None
     number, title = "", ""
     for line, text in _lines(source, file):
@@ -173,7 +173,7 @@ def _check(source: Source, line: int, text: str, which: int) -> None:
             raise source.bad(line, name, message, text[begin:end])
 
 
-def _set(source: Source, line: int, first: str, second: str) -> _Set:
+def _set(source: Source, line: int, first: str, second: str) -> ElementSet:
     from sgp4.api import SGP4_ERRORS, Satrec
 
     year, day = int(first[18:20]), float(first[20:32])
@@ -189,4 +189,4 @@ def _set(source: Source, line: int, first: str, second: str) -> _Set:
     if elements.error:
         reason = SGP4_ERRORS.get(elements.error, f"error {elements.error}")
         raise source.bad(line, "elements", f"are refused by SGP4: {reason}")
-    return _Set(midnight_ns + round((day - whole) * DAY_S * 1e9), elements)
+    return ElementSet(midnight_ns + round((day - whole) * DAY_S * 1e9), elements)

@@ -13,6 +13,7 @@ from typing import IO, Any, Literal
 from xml.parsers import expat
 
 from service.errors import BadFile, BadInput, Fault, shown_value
+from service.products.reading.attitude_types import SEQUENCES
 from service.products.reading.known import MOST_RECORDS
 from service.times import FIRST_YEAR, LAST_YEAR, parse_utc
 
@@ -20,6 +21,7 @@ MAX_LINE_BYTES = 4096
 _PIECE_BYTES = 1 << 16
 _MOST_DEPTH = 12
 _PAIR = re.compile(r"([A-Za-z0-9_]+)\s*=\s*(.*)")
+_VERSION = re.compile(r"CCSDS_([A-Z]+)_VERS")
 _D_TO_E = str.maketrans("dD", "ee")
 _UNIT = re.compile(r"\s*\[[^\]]*\]$")
 
@@ -210,13 +212,20 @@ class _XmlReader:
         raise self._source.bad(self._line_number, "DOCTYPE", "is not read: a message has none")
 
     def _start(self, tag: str, attributes: dict[str, str]) -> None:
-        if not self._path:
+        tag = tag.rpartition(":")[2]
+        if not self._path and tag.lower() == "ndm":
+            # Several messages in one, such as catalogs are sent in.
+            self._path.append("ndm")
+            return
+        if self._path in ([], ["ndm"]):
             kind = self._form.kind
-            if tag.upper() != kind:
+            is_about_all = bool(self._path) and tag in ("COMMENT", "MESSAGE_ID")
+            if tag.upper() != kind and not is_about_all:
                 message = f"must be the element {kind.lower()}"
                 raise self._source.bad(self._line_number, "XML", message, tag)
             version = attributes.get("version", "")
-            self._tokens.append(Token(self._line_number, "key", f"CCSDS_{kind}_VERS", version))
+            if not is_about_all:
+                self._tokens.append(Token(self._line_number, "key", f"CCSDS_{kind}_VERS", version))
         elif tag in self._form.parts:
             self._tokens.append(Token(self._line_number, "mark", self._form.parts[tag][0]))
         elif tag == self._form.state:
@@ -238,16 +247,20 @@ class _XmlReader:
         self._text.append(text)
 
     def _end(self, tag: str) -> None:
+        tag = tag.rpartition(":")[2]
         self._path.pop()
         if tag in self._form.parts:
             self._tokens.append(Token(self._line_number, "mark", self._form.parts[tag][1]))
         elif tag == self._form.state:
             names, words, units = zip(*self._state or [("", "", "")], strict=True)
-            self._tokens.append(
-                Token(self._line, "state", "state", words=words, names=names, units=units)
-            )
+            state = Token(self._line, "state", "state", words=words, names=names, units=units)
+            if self._is_leaf:
+                # As in ACM a line of numbers.
+                words = tuple("".join(self._text).split())
+                state = Token(self._line, "state", "state", words=words)
+            self._tokens.append(state)
             self._state = None
-        elif self._is_leaf and tag != "COMMENT":
+        elif self._is_leaf and tag not in ("COMMENT", "MESSAGE_ID"):
             value = "".join(self._text).strip()
             if self._state is None:
                 self._tokens.append(Token(self._line_number, "key", tag, value))
@@ -352,6 +365,33 @@ class Metadata:
         return self.source.bad(self.lines[name], name, message, self.values[name])
 
 
+_BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
+
+
+def from_body(metadata: Metadata) -> bool:
+    """True if REF_FRAME_A is the body; the other frame must be inertial."""
+    frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
+    is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
+    for name, frame in frames.items():
+        if not is_body[name] and frame not in INERTIAL:
+            message = f"must be one of {', '.join(INERTIAL)}, or the body as SC_BODY_1"
+            raise metadata.fault(name, message)
+    if is_body["REF_FRAME_A"] == is_body["REF_FRAME_B"]:
+        message = "one of REF_FRAME_A and REF_FRAME_B must be inertial, the other the body"
+        raise metadata.fault("REF_FRAME_B", message)
+    return is_body["REF_FRAME_A"]
+
+
+def euler_sequence(metadata: Metadata) -> str:
+    """The axes of Euler angles, such as ZXZ, from the required EULER_ROT_SEQ."""
+    metadata.require(("EULER_ROT_SEQ",))
+    sequence = metadata.values["EULER_ROT_SEQ"].upper().translate(str.maketrans("123", "XYZ"))
+    if sequence not in SEQUENCES:
+        message = "must name three axes as ZXZ or 313, no two in a row the same"
+        raise metadata.fault("EULER_ROT_SEQ", message)
+    return sequence
+
+
 def read_metadata(
     source: Source, tokens: Iterator[Token], line: int, known: tuple[str, ...], form: MessageForm
 ) -> Metadata:
@@ -380,9 +420,12 @@ def read_version(
     name = f"CCSDS_{form.kind}_VERS"
     if token is None or token.name != name:
         line = 1 if token is None else token.line
+        if token is not None and (other := _VERSION.fullmatch(token.name)) is not None:
+            raise source.bad(line, token.name, f"is of an {other[1]}, not of an {form.kind}")
         raise source.bad(line, name, "must come first in a message")
     if token.value not in versions:
-        raise source.bad_token(token, f"must be {', '.join(versions[:-1])} or {versions[-1]}")
+        known = " or ".join(filter(None, [", ".join(versions[:-1]), versions[-1]]))
+        raise source.bad_token(token, f"must be {known}")
     return token.value
 
 
