@@ -35,7 +35,11 @@ NAMED_BESIDE = {"ProblemDocument", "TokenList"}
 """Models that no module of the client names as `models.`..., and no other model holds."""
 BASES = {"History": "Tabulated"}
 """The classes of the client's `base` that give methods to models."""
-WORDS = {"Outcome": base.Outcome, "Status": base.Status, "Identifier": answers.Identifier}
+WORDS: Mapping[str, Any] = {
+    "Outcome": base.Outcome,
+    "Status": base.Status,
+    "Identifier": answers.Identifier,
+}
 """Types for which a type checker knows the words of this version."""
 ABOUT = """Every model: what the answers of the service hold.
 
@@ -68,16 +72,20 @@ def all_records() -> Mapping[str, type[Record]]:
             yield each
             yield from derived(each)
 
-    return {client_name(each): each for each in derived(Record)}
+    found: dict[str, type[Record]] = {}
+    for record in derived(Record):
+        if found.setdefault(client_name(record), record) is not record:
+            raise ValueError(f"two records are named {client_name(record)}: name one `client_name`")
+    return found
 
 
 def own_fields(record: type[Record]) -> dict[str, Any]:
     """The types of the fields that a record adds to those of its base."""
     hints = get_type_hints(record, include_extras=True)
-    return {name: hints[name] for name in record.__annotations__ if name in structs_of(record)}
+    return {name: hints[name] for name in record.__annotations__ if name in struct_fields(record)}
 
 
-def structs_of(record: type[Record]) -> Mapping[str, structs.FieldInfo]:
+def struct_fields(record: type[Record]) -> Mapping[str, structs.FieldInfo]:
     """The fields of a record by name."""
     return {each.name: each for each in structs.fields(record)}
 
@@ -115,7 +123,7 @@ def models() -> Mapping[str, str]:
         in_source = list(vars(sys.modules[held[0].__module__]))
         held.sort(key=lambda record: in_source.index(record.__name__))
     texts_of = {
-        f"models/{name}.py": module_text(name, held, needed) for name, held in modules.items()
+        f"models/{name}.py": module_text(name, held, list(needed)) for name, held in modules.items()
     }
     imports = [
         f"from .{name} import {', '.join(f'{n} as {n}' for n in map(client_name, held))}\n"
@@ -186,7 +194,7 @@ def class_text(record: type[Record]) -> str:
 
 def field_text(record: type[Record], name: str, hint: Any) -> str:
     """The line of a field with its default, and the text below it."""
-    field = structs_of(record)[name]
+    field = struct_fields(record)[name]
     kind, default = type_text(hint), field.default
     if field.default_factory is not NODEFAULT:
         default = ()
