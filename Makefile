@@ -63,6 +63,7 @@ help:
 	@echo "make pythons  run the wheel under each supported Python that is here (minutes each)"
 	@echo "make dist     write the wheels, source archive and bill of materials to dist/"
 	@echo "make openapi  write openapi.yaml anew"
+	@echo "make client   write the client's models and its synchronous half anew"
 	@echo "make lock     resolve the dependencies anew (needs the package index)"
 	@echo "make clean    remove .venv and everything that was built or cached"
 	@echo
