@@ -356,3 +356,24 @@ def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
             assert client.post("/api/v1/batches", json=body).status_code == 201
         second = latest(f"{url}/api/v1")
         assert second["covariance_arcsec2"][0][0] < first["covariance_arcsec2"][0][0]
+
+
+def test_rates_of_recorded_batches_lead_a_spinning_body_through_the_day_and_live(live, rng):
+    """36 deg/s and a batch every ten seconds: a turn a batch, by the attitudes a body at rest."""
+    rate_deg_per_s = [0.0, 0.0, 36.0]
+    truth = truth_of(lambda t: np.tile(np.radians(rate_deg_per_s), (len(t), 1)), 400.0, 0.5)
+    measured = attitudes_of(truth, np.arange(0, 801, 20), (6.0, 6.0, 40.0), rng)
+    recorded = recorded_of([], np.zeros((0, 3)), measured).attitudes
+    for body in bodies(recorded):
+        told = json.dumps(body | {"body_rates_deg_per_s": rate_deg_per_s})
+        live.submissions.submit(submission_from_json(told))
+    window = live_window(at(recorded.tai_ns[-1]))
+    with live.context.reading() as connection:
+        found = recorded_in(connection, live.sky, "XTE", "live", *window)
+    np.testing.assert_allclose(np.degrees(found.carried_rad_s), [rate_deg_per_s] * 41, rtol=1e-12)
+    mission = live.context.missions["XTE"]
+    (stretch,) = grade_day(found, mission, NOON.bucket(DAY_S)).stretches
+    carried = CarriedFilter().carry_on(found, mission)
+    assert (stretch.model, carried.model) == ("constant_rate", "constant_rate")
+    for rates in (stretch.samples["smoothed"].rate_deg_per_s[5:], carried.sample.rate_deg_per_s):
+        np.testing.assert_allclose(rates, np.tile(rate_deg_per_s, (len(rates), 1)), atol=0.02)
