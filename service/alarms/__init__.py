@@ -1,1 +1,1 @@
-"""Alarms: the monitored quantities, their limits, and the states of an alarm."""
+"""Alarms: the states of an alarm."""

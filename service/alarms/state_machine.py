@@ -17,8 +17,8 @@ note; nothing is changed in place.
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from service.alarms.limits import LimitSettings, Point, Severity
 from service.errors import WrongState
+from service.trends.limits import LimitSettings, Point, Severity
 
 AlarmState = Literal["open", "acknowledged", "shelved", "cleared"]
 AlarmActionName = Literal[

@@ -9,15 +9,6 @@ from sqlalchemy import Connection
 
 from service.access import Entry
 from service.alarms import state_machine
-from service.alarms.limits import LimitSettings, Preview, Sample, preview_of, preview_of_gaps
-from service.alarms.quantities import (
-    REJECTED,
-    SILENCE,
-    QuantityName,
-    limited_trackers,
-    subject_of,
-    tracker_names,
-)
 from service.app.context import ALL_RUNS, Context, known_id
 from service.contract import alarms as records
 from service.contract.base import Page
@@ -34,6 +25,15 @@ from service.storage.recording.ids import Ulids
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import DAY_S, Utc, shifted, utc_now
+from service.trends.limits import LimitSettings, Preview, Sample, preview_of, preview_of_gaps
+from service.trends.quantities import (
+    REJECTED,
+    SILENCE,
+    QuantityName,
+    limited_trackers,
+    subject_of,
+    tracker_names,
+)
 
 
 class Alarms:

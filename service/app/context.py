@@ -11,8 +11,6 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
 from service.access import Entry
-from service.alarms.quantities import limited_trackers
-from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
@@ -24,6 +22,7 @@ from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
 from service.times import Utc
+from service.trends.quantities import limited_trackers
 
 ALL_RUNS = "*"
 """Stands for every run, the live one included, where the name of a run is expected."""

@@ -11,7 +11,6 @@ from typing import Any, Unpack
 from msgspec import UNSET, structs
 from sqlalchemy import Connection
 
-from service.alarms.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
 from service.app.context import Context, PageOfPeriod, known_id
 from service.contract import spacecraft as records
 from service.contract.base import Page
@@ -32,6 +31,7 @@ from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import Utc, utc_now, utc_of_unix
+from service.trends.quantities import QUANTITIES, QuantityName, tracker_names, trend_names
 
 
 class Spacecraft:

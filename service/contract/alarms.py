@@ -4,8 +4,6 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from msgspec import Struct
 
-from service.alarms.limits import LimitSettings
-from service.alarms.quantities import QuantityName
 from service.alarms.state_machine import AlarmActionName, AlarmState
 from service.contract.base import (
     DescribedAs,
@@ -17,6 +15,8 @@ from service.contract.base import (
     list_record,
     page_record,
 )
+from service.trends.limits import LimitSettings
+from service.trends.quantities import QuantityName
 
 SeverityName = Literal["watch", "warning", "critical"]
 

@@ -8,7 +8,6 @@ from pydantic import BaseModel, Field, GetCoreSchemaHandler, create_model
 from pydantic_core import CoreSchema
 
 from service.acquire.result import TrackingState
-from service.alarms.quantities import QUANTITIES, value_names
 from service.contract.base import (
     Absent,
     Count,
@@ -32,6 +31,7 @@ from service.contract.base import (
 from service.contract.problems import Problem
 from service.missions import mission
 from service.observations.schema import BatchIn, NoPrediction, RateSource
+from service.trends.quantities import QUANTITIES, value_names
 
 Identifier = Annotated[str, DescribedAs(mission.Identifier)]
 

@@ -9,7 +9,6 @@ from msgspec import UNSET, UnsetType
 from pydantic import Field
 
 from service.acquire.result import TrackingState
-from service.alarms.quantities import QuantityName
 from service.contract import answers
 from service.contract.alarms import Alarm, AlarmSummary
 from service.contract.answers import Summary
@@ -31,6 +30,7 @@ from service.contract.base import (
     list_record,
     page_record,
 )
+from service.trends.quantities import QuantityName
 
 
 class AttitudeRow(Record, frozen=True, kw_only=True):

@@ -16,17 +16,14 @@ from typing import Any
 import numpy as np
 
 from service.acquire import Acquisition
-from service.alarms.quantities import (
-    QUANTITIES,
-    predicted_rms_arcsec,
-    residual_rms_arcsec,
-)
 from service.contract import runs as records
 from service.contract.answers import StarCounts
 from service.observations.batch import ObservationBatch
 from service.storage.queries.compare_runs import cell_width_s
 from service.storage.recording.answer import StarRow, star_rows
 from service.times import HOUR_S, unix_seconds, utc_of_unix
+from service.trends.measures import rms_arcsec
+from service.trends.quantities import QUANTITIES
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 MAX_SHOWN = 100
@@ -37,7 +34,6 @@ MOST_AT_ONCE, PORTION_S = 512, 0.1
 RunManyAgain = Callable[[Sequence[ObservationBatch]], Sequence[Acquisition]]
 
 
-_OF_THE_RATIO = residual_rms_arcsec, predicted_rms_arcsec
 _OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
 
 
@@ -63,8 +59,9 @@ class _Side:
         self.counts.update(acquisition.counts)
         self.counts["solved"] += solution is not None
         self.counts["suspect"] += solution is not None and solution.suspect
-        rms_arcsec = {each.__name__: each(acquisition) for each in _OF_THE_RATIO}
-        ratio = QUANTITIES["residual_ratio"].value_of(rms_arcsec)
+        residual, predicted = rms_arcsec(acquisition)
+        rms = {"residual_rms_arcsec": residual, "predicted_rms_arcsec": predicted}
+        ratio = QUANTITIES["residual_ratio"].value_of(rms)
         if ratio is not None:
             self.ratios.append(ratio)
         self.work_us.append(sum(acquisition.timings_us.values()))

@@ -6,13 +6,13 @@ import pytest
 from msgspec import structs
 from sqlalchemy import select, update
 
-from service.alarms.limits import Bounds, LimitSettings
 from service.errors import NotFound, WrongState
 from service.observations.schema import OptionsIn, submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.storage.sql.alarm_tables import watches
 from service.times import shifted, utc_now
+from service.trends.limits import Bounds, LimitSettings
 
 TIGHT = LimitSettings.model_validate(
     {

@@ -5,8 +5,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.alarms.limits import LimitSettings, SampleWindow, Severity
-from service.alarms.quantities import default_limits, limited_names
+from service.trends.limits import LimitSettings, SampleWindow, Severity
+from service.trends.quantities import default_limits, limited_names
 
 S = 10**9
 

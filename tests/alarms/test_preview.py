@@ -4,8 +4,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.alarms.limits import LimitSettings, SampleWindow, Severity, preview_of, preview_of_gaps
 from service.errors import BadInput
+from service.trends.limits import LimitSettings, SampleWindow, Severity, preview_of, preview_of_gaps
 from tests.storage.twin import SECOND, submission, twin
 
 S = 10**9

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from service.alarms import state_machine
-from service.alarms.limits import LimitSettings, Point, Severity
 from service.errors import WrongState
+from service.trends.limits import LimitSettings, Point, Severity
 
 LIMITS = LimitSettings.model_validate(
     {

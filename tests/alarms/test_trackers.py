@@ -2,8 +2,8 @@
 
 import pytest
 
-from service.alarms.limits import LimitSettings
 from service.errors import BadInput
+from service.trends.limits import LimitSettings
 from tests.storage.twin import FIRST, SECOND, submission, twin
 
 QUICK = LimitSettings.model_validate(

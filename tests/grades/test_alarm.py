@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from service.alarms.limits import above
 from service.filtering.inputs import AttitudeMeasurements
+from service.trends.limits import above
 from tests.filtering.simulated import ARCSEC
 from tests.grades.passes import NOON
 from tests.grades.records import put_pass

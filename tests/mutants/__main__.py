@@ -46,7 +46,7 @@ from tests.torture import digest_of
 
 ROOT = Path(__file__).parents[2]
 AREAS = {
-    "alarms": ("service/alarms",),
+    "alarms": ("service/alarms", "service/trends"),
     "access": ("service/access.py",),
     "webhooks": ("service/features/webhooks",),
     "recording": ("service/storage/recording",),

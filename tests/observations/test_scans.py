@@ -9,7 +9,6 @@ import pytest
 
 from service.acquire import acquire
 from service.acquire.result import Path
-from service.alarms.quantities import a_priori_angle_deg
 from service.errors import BadBatch, BadConfiguration, BadFile
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
@@ -23,6 +22,7 @@ from service.simulate.sightings import readings
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.ephemeris import sun_direction
+from service.trends.measures import a_priori_angle_deg
 from service.vectors import matrix_from_quaternion, rotate_about, unit
 from studies.star_image_report.scanning import by_two_scans, sigmas
 from studies.star_image_report.sun_tracker import SunTracker as Screen

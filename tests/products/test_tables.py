@@ -13,7 +13,6 @@ import pandas as pd
 import pyarrow.parquet
 import pytest
 
-from service.alarms.quantities import QUANTITIES
 from service.app import spacecraft
 from service.errors import NotAvailable
 from service.products.attitudes import COLUMNS, ESTIMATED_COLUMNS
@@ -23,6 +22,7 @@ from service.products.tables import Column, Table, write_csv
 from service.storage import gyro
 from service.storage.queries import result_tables
 from service.times import parse_utc
+from service.trends.quantities import QUANTITIES
 from tests.products.series import GOLDEN, random_quaternions, rows, whole, written
 
 QUATERNION, RATE = ("q1", "q2", "q3", "qc"), ("rate_x", "rate_y", "rate_z")

@@ -20,13 +20,13 @@ from sqlalchemy import MetaData, create_engine, inspect, select, text
 from sqlalchemy.pool import NullPool
 
 from service.access import add_token, new_secret
-from service.alarms.quantities import trend_names
 from service.app.factory import open_app
 from service.settings import Settings
 from service.storage.sql import migrations
 from service.storage.sql.columns import unpack
 from service.storage.sql.engines import database_url
 from service.storage.upkeep.verify import earlier_results, verify
+from service.trends.quantities import trend_names
 from service.web.app import create_app
 from service.web.requests.problems import types_with_pages
 from tests.databases.make import FOLDER, restore_postgresql, restore_sqlite

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from service.alarms.quantities import QUANTITIES, Rate, trend_names
 from service.storage.queries import time_buckets
 from service.times import parse_utc, shifted, unix_seconds, utc_of_unix
+from service.trends.measures import Rate
+from service.trends.quantities import QUANTITIES, trend_names
 from tests.storage.bulk import put, result_row
 
 pytestmark = pytest.mark.both_databases

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from sqlalchemy import delete, func, insert, select, update
 
-from service.alarms.limits import LimitSettings
 from service.app.factory import open_app
 from service.errors import Busy
 from service.observations.schema import OptionsIn
@@ -37,6 +36,7 @@ from service.storage.upkeep.forget import ForgetFilter, forget
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted
+from service.trends.limits import LimitSettings
 from tests.fresh_databases import sqlite_at
 from tests.storage.recount import assert_equal_to_a_recount
 from tests.storage.samples import START

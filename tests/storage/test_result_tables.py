@@ -8,7 +8,6 @@ import duckdb
 import pyarrow.parquet
 import pytest
 
-from service.alarms.quantities import QUANTITIES
 from service.app.factory import open_app
 from service.cli import main
 from service.products.formats import write_table
@@ -16,6 +15,7 @@ from service.settings import Settings
 from service.storage.queries import result_tables
 from service.storage.sql.tables import MEASURED
 from service.times import parse_utc
+from service.trends.quantities import QUANTITIES
 from tests.storage.samples import KINDS, submission
 
 pytestmark = pytest.mark.both_databases

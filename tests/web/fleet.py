@@ -10,7 +10,6 @@ from typing import Any
 
 from sqlalchemy import Connection, insert
 
-from service.alarms.quantities import QUANTITIES
 from service.app.factory import App
 from service.missions.mission import load_missions
 from service.storage.recording.ids import Ulids
@@ -18,6 +17,7 @@ from service.storage.sql.alarm_tables import alarm_actions, alarms
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import solutions, star_results
 from service.times import DAY_S, Utc, parse_utc, shifted, utc_now
+from service.trends.quantities import QUANTITIES
 from tests.storage.bulk import put, result_row
 
 END = parse_utc("1999-03-02T00:00:00.000Z")

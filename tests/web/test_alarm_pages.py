@@ -6,8 +6,8 @@ from pathlib import Path
 import httpx
 import pytest
 
-from service.alarms.quantities import QUANTITIES, limited_names
 from service.app.factory import open_app
+from service.trends.quantities import QUANTITIES, limited_names
 from service.web.app import create_app
 from service.web.console.formatting import with_day_of_year
 from tests.fresh_databases import sqlite_at

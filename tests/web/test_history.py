@@ -6,8 +6,8 @@ import json
 
 import pytest
 
-from service.alarms.quantities import trend_names
 from service.times import parse_utc, shifted
+from service.trends.quantities import trend_names
 from tests.web.serving import ended
 
 ROUTE = "/api/v1/spacecraft/XTE/history"

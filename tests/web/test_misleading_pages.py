@@ -9,13 +9,13 @@ import httpx
 import pytest
 from msgspec import structs
 
-from service.alarms import quantities
 from service.app.factory import open_app
 from service.contract.spacecraft import WindowCounts
 from service.observations.telemetry import read_lines
 from service.storage.queries.fleet import DayCounts, FleetRow, TrackerCounts
 from service.storage.queries.results import answer_from_json
 from service.times import parse_utc, shifted
+from service.trends import quantities
 from service.web.app import create_app
 from service.web.console import formatting
 from service.web.console.formatting import arcsec

@@ -7,11 +7,11 @@ from urllib.parse import quote
 import httpx
 import pytest
 
-from service.alarms.limits import LimitSettings
 from service.app.products import open_products
 from service.errors import BadBatch, BadInput
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import submission_from_json
+from service.trends.limits import LimitSettings
 from service.web.app import create_app
 from tests.storage import twin
 from tests.storage.conftest import opened

@@ -12,10 +12,10 @@ from typing import Literal
 
 import msgspec
 
-from service.alarms.limits import Severity
 from service.features.webhooks.records import Registered
 from service.storage.recording.events import Event
 from service.storage.sql.columns import Row
+from service.trends.limits import Severity
 
 log = logging.getLogger(__name__)
 

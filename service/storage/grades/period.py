@@ -9,10 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
-from service.alarms.limits import Point, Sample, preview_of
-from service.alarms.quantities import REJECTED
-from service.contract.base import Page
-from service.contract.products import Innovation
 from service.errors import BadBatch, Fault, shown_value
 from service.filtering.result import Integers, Outcome, Status
 from service.grades.day import (
@@ -34,6 +30,8 @@ from service.storage.queries.pages import ResultFilter
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
 from service.times import DAY_S, Utc, shifted
+from service.trends.limits import Point, Sample, preview_of
+from service.trends.quantities import REJECTED
 
 PARTS = 600
 """The parts of a period, of each of which one sample is kept: as many as a chart shows."""

@@ -12,8 +12,6 @@ import msgspec
 from sqlalchemy import Connection, bindparam, insert, select, update
 
 from service.alarms import state_machine
-from service.alarms.limits import BatchRef, LimitSettings, Point, Sample, SampleWindow, Severity
-from service.alarms.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 from service.missions.mission import Mission
 from service.storage.projections.rollups import RecordedResult
 from service.storage.queries.alarms import change, limits_of
@@ -25,6 +23,8 @@ from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
 from service.storage.sql.tables import batches, results, runs
 from service.times import Utc, recorded_utc
+from service.trends.limits import BatchRef, LimitSettings, Point, Sample, SampleWindow, Severity
+from service.trends.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 
 # Run with every batch of a live spacecraft, or with a few of them.
 _PLACE = (watches.c.spacecraft == bindparam("of_spacecraft"), watches.c.run == bindparam("of_run"))

@@ -11,9 +11,6 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, and_, bindparam, insert, or_, select, update
 
-from service.alarms import quantities
-from service.alarms.limits import LimitSettings, Sample, Severity
-from service.alarms.quantities import QuantityName, quantity_named
 from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
 from service.contract import alarms as models
 from service.contract.alarms import Limit, LimitHistory
@@ -28,6 +25,9 @@ from service.storage.sql.columns import Row
 from service.storage.sql.statements import prepared
 from service.storage.sql.tables import COUNTED, MEASURED, results, tracker_values
 from service.times import Utc, recorded_utc, utc_now
+from service.trends import quantities
+from service.trends.limits import LimitSettings, Sample, Severity
+from service.trends.quantities import QuantityName, quantity_named
 
 LimitsInForce = Mapping[quantities.Subject, LimitSettings]
 

@@ -8,7 +8,6 @@ import numpy as np
 from sqlalchemy import Select, select
 
 from service.acquire.result import METHOD
-from service.alarms.quantities import QUANTITIES
 from service.products.attitudes import AttitudeRows
 from service.products.tables import Column, Page, Table
 from service.storage.archive.reading import Archive
@@ -22,6 +21,7 @@ from service.storage.queries.pages import (
     all_rows,
 )
 from service.storage.sql.tables import COUNTED, MEASURED, batches, results, solutions, star_results
+from service.trends.quantities import QUANTITIES
 from service.vectors import Vector
 
 PAGE = 5_000

@@ -10,7 +10,6 @@ import numpy as np
 from msgspec import UNSET
 from sqlalchemy import ColumnElement, Connection, Select, bindparam, func, or_, select
 
-from service.alarms.quantities import QUANTITIES, value_names
 from service.contract import answers
 from service.contract.answers import Answer
 from service.contract.base import Page
@@ -33,6 +32,7 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, missions, results
 from service.times import Utc
+from service.trends.quantities import QUANTITIES, value_names
 
 OutcomeName = Literal["unique", "ambiguous", "unmatched"]
 StatusName = Literal["good", "suspect", "none"]

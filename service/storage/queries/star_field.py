@@ -24,6 +24,7 @@ from service.sky.model import SkyModel
 from service.sky.zones import SearchRegion
 from service.storage.recording.result_metrics import catalog_rows, tracker_rows
 from service.storage.sql.columns import Row
+from service.trends.measures import BatchStars
 from service.vectors import Matrix, Vector, read_only
 
 MARGIN = 1.25
@@ -262,7 +263,8 @@ def tracker_comparison(
         place = {id: row for row, id in enumerate(run_catalog.star_id)}
     corrected = correct(batch, mission)
     star = catalog_rows(answer, place)
-    rows = tracker_rows(answer.id or "", answer, batch, corrected, run_catalog, star)
+    stars = BatchStars(batch, corrected, star, run_catalog, answer.attitude is not None)
+    rows = tracker_rows(answer.id or "", answer, stars)
     return [
         row | {"sigma_arcsec": each.tracker.sigma_arcsec}
         for row, each in zip(rows, corrected, strict=True)

@@ -9,14 +9,6 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Case, ColumnElement, Connection, Select, Table, case, func, select, tuple_
 
-from service.alarms.quantities import (
-    QUANTITIES,
-    BatchShare,
-    QuantityName,
-    RankedName,
-    Rate,
-    StarShare,
-)
 from service.contract.spacecraft import History, Numbers, RankedBatch, Series
 from service.storage.queries import time_buckets
 from service.storage.queries.pages import PLACE, ResultFilter, latest_time, newest_first
@@ -27,6 +19,8 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
+from service.trends.measures import BatchShare, Rate, StarShare
+from service.trends.quantities import QUANTITIES, QuantityName, RankedName
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.intp]

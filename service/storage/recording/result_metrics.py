@@ -24,25 +24,45 @@ from sqlalchemy import (
 )
 
 from service.acquire import Acquisition
-from service.alarms.drift import alignment_offsets_arcsec, mean_stars, scale_offset_ppm
-from service.alarms.quantities import QUANTITIES, Measured, Quantity, Ratio, StarShare
 from service.contract.answers import Answer, Star
 from service.identify.identification import Integers
-from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations
-from service.sky.catalog.run_catalog import RunCatalog
 from service.storage.recording.identity import digest_of_row
 from service.storage.sql import tables
 from service.storage.sql.columns import Row
+from service.trends.measures import (
+    STORED,
+    BatchStars,
+    Measured,
+    MeasuredOfBatch,
+    MeasuredStars,
+    Ratio,
+    StarShare,
+)
+from service.trends.quantities import QUANTITIES, Quantity
 from service.vectors import Vector
 
 
-def metrics_of(acquisition: Acquisition) -> Row:
-    """The measured quantities of an acquisition by name, None where it has none."""
+def metrics_of(acquisition: Acquisition, stars: MeasuredStars | None = None) -> Row:
+    """The measured quantities of an acquisition by name, None where it has none.
+
+    `stars` are those of all its trackers, where they are at hand.
+    """
+    stars = stars or MeasuredStars.of_all(acquisition)
+    of_batch = {
+        name: source.measure(acquisition)
+        for name, source in STORED.items()
+        if isinstance(source, MeasuredOfBatch)
+    }
+    return of_batch | _measures(stars)
+
+
+def _measures(stars: MeasuredStars) -> Row:
+    """What is measured alike in the stars of a batch and of one tracker, by name."""
     return {
-        name: each.source.measure(acquisition)
-        for name, each in QUANTITIES.items()
-        if isinstance(each.source, Measured)
+        name: source.measure(stars)
+        for name, source in STORED.items()
+        if isinstance(source, Measured)
     }
 
 
@@ -148,18 +168,11 @@ OF_TRACKERS = tables.results.join(
 # ---- the trackers of a batch: stars by outcome, residuals, magnitudes -------------------------
 
 
-def values_of_trackers(acquisition: Acquisition, answer: Answer, batch_id: str) -> list[Row]:
+def values_of_trackers(
+    acquisition: Acquisition, answer: Answer, batch_id: str, stars: BatchStars
+) -> list[Row]:
     """The rows of an acquisition; none where its mission has one tracker."""
-    if len(acquisition.mission.trackers) == 1:
-        return []
-    return tracker_rows(
-        batch_id,
-        answer,
-        acquisition.batch,
-        [each.corrected for each in acquisition.trackers],
-        acquisition.run_catalog,
-        [each.identification.star for each in acquisition.trackers],
-    )
+    return [] if len(acquisition.mission.trackers) == 1 else tracker_rows(batch_id, answer, stars)
 
 
 def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
@@ -173,46 +186,28 @@ def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
     ]
 
 
-def tracker_rows(
-    batch_id: str,
-    answer: Answer,
-    batch: ObservationBatch,
-    corrected: Sequence[CorrectedObservations],
-    catalog: RunCatalog,
-    star: Sequence[Integers],
-) -> list[Row]:
-    """The rows of an answer, one a tracker, in the order of its observations.
-
-    `corrected` are the observations of `batch` that it was made from, and `star` the rows of
-    the catalog (n,) of their unique stars, -1 for others and where they are not known.
-    """
-    catalog_mag = [np.where(rows >= 0, catalog.magnitude_mag[rows], np.nan) for rows in star]
-    directions = catalog.direction_at(batch.time)
-    means = [] if answer.attitude is None else mean_stars(batch, corrected, star, directions)
-    alignment = alignment_offsets_arcsec(means) or [None] * len(corrected)
-    expected = [_expected_squares(answer, each) for each in corrected]
+def tracker_rows(batch_id: str, answer: Answer, stars: BatchStars) -> list[Row]:
+    """The rows of an answer, one a tracker, in the order of its observations."""
+    expected = [_expected_squares(answer, each) for each in stars.corrected]
     scale = _scale(answer, expected)
     rows = []
-    for k, (stars, seen, squares, magnitudes) in enumerate(
-        zip(answer.observations, corrected, expected, catalog_mag, strict=True)
-    ):
-        outcomes = [star.outcome for star in stars.stars]
-        used = list(_residuals(stars.stars))
-        predicted = scale * math.fsum(squares[k] for k, _ in used)
-        offsets = (seen.magnitude_mag - magnitudes)[np.isfinite(seen.magnitude_mag - magnitudes)]
+    for k, (observed, squares) in enumerate(zip(answer.observations, expected, strict=True)):
+        outcomes = [star.outcome for star in observed.stars]
+        used = list(_residuals(observed.stars))
+        predicted = scale * math.fsum(squares[place] for place, _ in used)
+        own = MeasuredStars(
+            stars,
+            range(k, k + 1),
+            _rms(math.fsum(each**2 for _, each in used), len(used)),
+            _rms(predicted, len(used)),
+        )
         row = dict.fromkeys(tables.MEASURED) | {
             "batch_id": batch_id,
-            "tracker": stars.tracker,
+            "tracker": observed.tracker,
             "observed": len(outcomes),
             **{name: outcomes.count(name) for name in ("unique", "ambiguous", "unmatched")},
-            "status": _status(answer, stars.tracker),
-            "residual_rms_arcsec": _rms(math.fsum(each**2 for _, each in used), len(used)),
-            "predicted_rms_arcsec": _rms(predicted, len(used)),
-            "magnitude_offset_mag": (
-                math.fsum(offsets.tolist()) / len(offsets) if len(offsets) else None
-            ),
-            "scale_offset_ppm": scale_offset_ppm(means[k : k + 1]) if means else None,
-            "alignment_offset_arcsec": alignment[k],
+            "status": _status(answer, observed.tracker),
+            **_measures(own),
         }
         rows.append(row | {"row_digest": digest_of_row(tables.tracker_values, row)})
     return rows

@@ -24,6 +24,7 @@ from service.storage.recording.identity import digest_of_encoded, encoded_rows
 from service.storage.recording.result_metrics import metrics_of, values_of_trackers
 from service.storage.sql.columns import Row
 from service.times import Utc
+from service.trends.measures import MeasuredStars
 
 LIVE = "live"
 """The run of batches that pipelines send."""
@@ -175,6 +176,7 @@ def _unsaved_result(
 ) -> UnsavedResult:
     batch, attitude = acquisition.batch, answer.attitude
     named = structs.asdict(batch.options)
+    stars = MeasuredStars.of_all(acquisition)
     result = {
         "id": answer.id,
         "batch_id": batch_id,
@@ -192,7 +194,7 @@ def _unsaved_result(
         **structs.asdict(answer.counts),
         "status": attitude and attitude.status,
         "reason": answer.reason,
-        **metrics_of(acquisition),
+        **metrics_of(acquisition, stars),
     }
     return UnsavedResult(
         identity=(batch.spacecraft, batch.run, batch.batch),
@@ -202,7 +204,7 @@ def _unsaved_result(
         stars=rows_of_stars(answer),
         solution=None if attitude is None else _solution_row(attitude, answer.id),
         key=None,
-        trackers=values_of_trackers(acquisition, answer, batch_id),
+        trackers=values_of_trackers(acquisition, answer, batch_id, stars.batch),
     )
 
 

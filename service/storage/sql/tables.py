@@ -31,7 +31,6 @@ TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
 
 import sqlalchemy as sa
 
-from service.alarms.quantities import QUANTITIES, Measured
 from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
 from service.storage.sql.columns import (
     CURRENT,
@@ -45,6 +44,7 @@ from service.storage.sql.columns import (
     metadata,
     rows_where,
 )
+from service.trends.measures import STORED, Measured, MeasuredOfBatch, StarShare
 
 access_tokens = sa.Table(
     "access_tokens",
@@ -88,10 +88,10 @@ audit = sa.Table(
 # Of spacecraft, and of the trackers of spacecraft that have several.
 
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
-_ROLLED_UP = [each for each in QUANTITIES.values() if each.rolled_up]
-SHARES = tuple(each.name for each in _ROLLED_UP if each.is_share)
+_ROLLED_UP = {name: source for name, source in STORED.items() if source.rolled_up}
+SHARES = tuple(name for name, source in _ROLLED_UP.items() if isinstance(source, StarShare))
 """Shares of a batch's stars; their means follow from the counts."""
-VALUES = tuple(each.name for each in _ROLLED_UP if not each.is_share)
+VALUES = tuple(name for name in _ROLLED_UP if name not in SHARES)
 SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
 MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
 MAXIMA = tuple(f"{name}_max" for name in (*SHARES, *VALUES))
@@ -251,7 +251,9 @@ frames = sa.Table(
     sa.Column("preview_step", sa.Integer, nullable=False),
 )
 
-MEASURED = tuple(n for n, each in QUANTITIES.items() if isinstance(each.source, Measured))
+MEASURED = tuple(
+    name for name, source in STORED.items() if isinstance(source, Measured | MeasuredOfBatch)
+)
 """The columns of measured quantities."""
 COUNTED = ("observed", "unique", "ambiguous", "unmatched")
 """The columns that count stars."""

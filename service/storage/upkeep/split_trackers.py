@@ -44,6 +44,7 @@ from service.storage.sql.tables import (
 )
 from service.storage.store import Store
 from service.times import HOUR_S, parse_utc
+from service.trends.measures import BatchStars
 
 log = logging.getLogger(__name__)
 
@@ -111,8 +112,10 @@ class TrackerSplitter:
             # `verify` tells of an input that cannot be read.
             return []
         catalog, place = self._catalog(answer, mission, row["time"])
-        star = catalog_rows(answer, place)
-        return tracker_rows(row["batch_id"], answer, batch, corrected, catalog, star)
+        stars = BatchStars(
+            batch, corrected, catalog_rows(answer, place), catalog, answer.attitude is not None
+        )
+        return tracker_rows(row["batch_id"], answer, stars)
 
     def _catalog(
         self, answer: Answer, mission: Mission, time: str

@@ -8,11 +8,11 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access import Caller
-from service.alarms.limits import LimitSettings
-from service.alarms.quantities import QuantityName, limited_names
 from service.contract import alarms as models
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key, Wire
+from service.trends.limits import LimitSettings
+from service.trends.quantities import QuantityName, limited_names
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (

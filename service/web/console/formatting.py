@@ -11,8 +11,9 @@ from typing import Any
 
 from markupsafe import Markup
 
-from service.alarms.quantities import Quantity, SmoothedShare, quantity_named
 from service.times import Utc, recorded_utc, shifted, utc_now
+from service.trends.measures import SmoothedShare
+from service.trends.quantities import Quantity, quantity_named
 
 DASH = "–"
 THIN = "\N{NARROW NO-BREAK SPACE}"

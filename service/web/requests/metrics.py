@@ -23,7 +23,6 @@ from prometheus_client.registry import Collector
 from starlette.types import Scope
 
 from service import __version__
-from service.alarms.limits import Severity
 from service.app.factory import App
 from service.contract.alarms import Alarm
 from service.contract.spacecraft import ZoneCache
@@ -33,6 +32,7 @@ from service.storage.progress import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.times import recorded_utc, unix_seconds
+from service.trends.limits import Severity
 
 log = logging.getLogger(__name__)
 

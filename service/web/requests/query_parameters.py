@@ -15,7 +15,6 @@ from pydantic import (
     model_validator,
 )
 
-from service.alarms.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.app.products import TableKind
 from service.errors import BadInput
 from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
@@ -28,6 +27,7 @@ from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
 from service.times import Utc, parse_utc
+from service.trends.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.web.requests.request_body import require_no_query
 
 MAX_LIMIT = 500

@@ -8,13 +8,12 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 from starlette.responses import Response
 
-from service.alarms.limits import Severity
-from service.alarms.quantities import limited_trackers, quantity_named, trend_names
-from service.contract.alarms import Alarm, AlarmWithActions, Annotation, Limit, SeverityName
 from service.errors import NotFound, shown_value
 from service.observations.schema import Key
 from service.storage.queries.alarms import TimeOut, present_rank
 from service.times import Utc, recorded_utc, shifted
+from service.trends.limits import Severity
+from service.trends.quantities import limited_trackers, quantity_named, trend_names
 from service.web.console.formatting import second_after, with_day_of_year
 from service.web.console.page import (
     ContextDep,

@@ -10,7 +10,6 @@ from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
 
-from service.alarms.quantities import QUANTITIES
 from service.app.context import ALL_RUNS
 from service.contract.answers import Answer, Summary
 from service.contract.answers import Star as FoundStar
@@ -23,6 +22,7 @@ from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, recorded_utc
+from service.trends.quantities import QUANTITIES
 from service.vectors import matrix_from_quaternion, to_ra_dec
 from service.web.console.charts.sky_chart import sky_chart
 from service.web.console.formatting import arcsec, share

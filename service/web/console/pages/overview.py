@@ -9,11 +9,12 @@ import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
-from service.alarms.limits import Severity
-from service.alarms.quantities import QUANTITIES, BatchShare, OneOf, StarShare
 from service.storage.queries.fleet import PERIODS_S, Fleet, FleetCells, FleetRow, Period
 from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, shifted
+from service.trends.limits import Severity
+from service.trends.measures import BatchShare, StarShare
+from service.trends.quantities import QUANTITIES, OneOf
 from service.vectors import Matrix
 from service.web.console import page
 from service.web.console.charts.sparkline import SparklineDrawing, common_top, packed, sparkline

@@ -9,17 +9,6 @@ from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
-from service.alarms.quantities import (
-    QUANTITIES,
-    RankedName,
-    limited_trackers,
-    ranked_names,
-    trend_names,
-)
-from service.contract.alarms import Annotation
-from service.contract.answers import Summary
-from service.contract.base import Page
-from service.contract.spacecraft import MissionThen, Ranking
 from service.observations.schema import Key
 from service.storage.recording.unsaved_result import LIVE
 from service.times import (
@@ -30,6 +19,13 @@ from service.times import (
     recorded_utc,
     shifted,
     utc_now,
+)
+from service.trends.quantities import (
+    QUANTITIES,
+    RankedName,
+    limited_trackers,
+    ranked_names,
+    trend_names,
 )
 from service.web.console.formatting import completed_utc, second_after
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page

@@ -5,9 +5,10 @@ import io
 
 import pytest
 
-from service.alarms.limits import LimitSettings, above
-from service.alarms.quantities import QUANTITIES, BatchShare, Quantity, StarShare
 from service.cli import main
+from service.trends.limits import LimitSettings, above
+from service.trends.measures import BatchShare, StarShare
+from service.trends.quantities import QUANTITIES, Quantity
 from service.web.app import bare_app
 from tests.web.conformance import checked
 from tests.web.markup import Markup

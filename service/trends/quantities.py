@@ -1,86 +1,34 @@
 """The registry of quantities: what trends show, limits apply to and batches are ranked by.
 
-Every list of quantities is derived from `QUANTITIES`: the columns of the tables
-and rollups, histories, limits, the ranking, query parameters and the OpenAPI
-document, the labels of the console, and the columns of CSV files.
+Every list of quantities is derived from `QUANTITIES`: histories, limits, the ranking, query
+parameters and the OpenAPI document, the labels of the console, and the columns of CSV files.
 
-A quantity that is derived from the counts of stars and batches is one entry
-here.  One that is measured anew (`Measured`) needs a migration as well: a column
-of its name in `results`; and for `rolled_up`, of a share or a value, the columns
-`_min` and `_max` in all four rollups, of a value also `_n` and `_sum`; and a column in
-`tracker_values`.  Results that
-were recorded before it have no value of it.
+A quantity that is derived from the counts of stars and batches is one entry here.  One that is
+measured, or that the rollups have columns of, has its source in `service.trends.measures`.
 """
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from operator import itemgetter
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
-import numpy as np
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler
 from pydantic_core import CoreSchema, PydanticKnownError, core_schema
 
-from service.alarms.limits import LimitSettings, Sample, about_zero, above
 from service.missions.mission import Band, Mission
-from service.vectors import separation_deg
-
-if TYPE_CHECKING:
-    from service.acquire import Acquisition
-    from service.alarms.drift import MeanStars
-
-
-Counts = Mapping[str, Any]
-"""`batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`: the counts of
-one result, columns of a rollup, or SQL."""
-
-
-@dataclass(frozen=True)
-class StarShare:
-    """A share of the observed stars; `part` gives the stars from counts."""
-
-    part: Callable[[Counts], Any]
-
-
-@dataclass(frozen=True)
-class BatchShare:
-    """A share of the batches; `part` gives the batches from counts, 0 or 1 for one batch."""
-
-    part: Callable[[Counts], Any]
-
-
-@dataclass(frozen=True)
-class Measured:
-    """A value that is measured as a result is recorded and stored in a column of its own."""
-
-    measure: Callable[["Acquisition"], float | None]
-
-
-@dataclass(frozen=True)
-class Ratio:
-    """The ratio of two measured quantities, by their names; None where either is missing."""
-
-    numerator: str
-    denominator: str
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Batches in an hour of batch time."""
-
-
-@dataclass(frozen=True)
-class Gap:
-    """Time without a batch; it has no history."""
-
-
-@dataclass(frozen=True)
-class SmoothedShare:
-    """A share of the attitudes that the filter met, of days that are smoothed; it has no history.
-
-    Batches have no value of it as they are recorded: `acquire smooth` has.
-    """
+from service.trends.limits import LimitSettings, Sample, about_zero, above
+from service.trends.measures import (
+    STORED,
+    BatchShare,
+    Gap,
+    Measured,
+    MeasuredOfBatch,
+    Rate,
+    Ratio,
+    SmoothedShare,
+    Source,
+    StarShare,
+)
 
 
 @dataclass(frozen=True)
@@ -101,21 +49,28 @@ class Quantity:
     unit: str
     label: str
     """The name that pages show."""
-    source: StarShare | BatchShare | Measured | Ratio | Rate | Gap | SmoothedShare
+    source: Source
     limits: Callable[[Mission], LimitSettings] | None = None
     """The limits of a mission until others are set; None: limits do not apply."""
     worse: Literal["high", "size"] = "high"
     """`high` if a greater value is worse, `size` if one further from zero is."""
     description: str = ""
     """The description of its value in `measures`, in the OpenAPI document."""
-    rolled_up: bool = False
-    """True if the rollups have columns of it.  Without, buckets have no extremes of a share of
-    stars, and no values of a ratio; and batches are not ranked by it."""
     by_tracker: bool = False
     """True if each tracker of a spacecraft with several has a value of it.  A tracker is suspect
     where it is the one that disagrees with the others."""
     cause: Cause | None = None
     """The cause of a value out of its limits; docs/operators.md has the table of all."""
+
+    def __post_init__(self) -> None:
+        of_trackers = StarShare | BatchShare | Measured | Ratio
+        if self.by_tracker and not isinstance(self.source, of_trackers):
+            raise ValueError(f"{self.name}: no tracker has a value of {self.source}")
+
+    @property
+    def rolled_up(self) -> bool:
+        """True if the rollups have columns of it; see `Source`."""
+        return getattr(self.source, "rolled_up", False)
 
     @property
     def is_share(self) -> bool:
@@ -126,7 +81,7 @@ class Quantity:
     def value_of(self) -> Callable[[Mapping[str, Any]], float | None]:
         """The function that gives the value of one result, a row; None where it has none."""
         match self.source:
-            case Measured():
+            case Measured() | MeasuredOfBatch():
                 return itemgetter(self.name)
             case Ratio(numerator, denominator):
                 return lambda row: _over(row[numerator], row[denominator])
@@ -184,98 +139,6 @@ SILENCE = "silence_s"
 REJECTED = "innovation_rejected_share"
 
 
-def residual_rms_arcsec(acquisition: "Acquisition") -> float | None:
-    """The rms of the attitude's residuals; None without an attitude from stars."""
-    solution = acquisition.solution
-    return None if solution is None else _known(solution.residual_rms_arcsec)
-
-
-def predicted_rms_arcsec(acquisition: "Acquisition") -> float | None:
-    """The residual rms that the covariance predicts; None without an attitude from stars."""
-    solution = acquisition.solution
-    return None if solution is None else _known(solution.predicted_rms_arcsec)
-
-
-def _known(value: float) -> float | None:
-    return None if math.isnan(value) else value
-
-
-def magnitude_offset_mag(acquisition: "Acquisition") -> float | None:
-    """The mean of observed less catalog magnitude over the unique stars.
-
-    None where no unique star has a magnitude.
-    """
-    catalog_mag = acquisition.run_catalog.magnitude_mag
-    offsets = []
-    for each in acquisition.trackers:
-        star, observed_mag = each.identification.star, each.corrected.magnitude_mag
-        # Row -1, no star, reads the last star's magnitude; it is left out.
-        known = zip(star.tolist(), observed_mag.tolist(), catalog_mag[star].tolist(), strict=True)
-        offsets += [mag - known_mag for row, mag, known_mag in known if row >= 0 and mag == mag]
-    return math.fsum(offsets) / len(offsets) if offsets else None
-
-
-def scale_offset_ppm(acquisition: "Acquisition") -> float | None:
-    """How much larger the stars' distances are than the catalog's, in millionths.
-
-    None without an attitude, or where the stars are too close together.
-    """
-    from service.alarms import drift
-
-    means = _mean_stars(acquisition)
-    return drift.scale_offset_ppm(means) if means else None
-
-
-def alignment_offset_arcsec(acquisition: "Acquisition") -> float | None:
-    """How much larger the angles between trackers are than the catalog's, as a mean.
-
-    None without an attitude, or where fewer than two trackers have unique stars.
-    """
-    from service.alarms import drift
-
-    if len(acquisition.trackers) == 1:
-        return None
-    offsets = [
-        each
-        for each in drift.alignment_offsets_arcsec(_mean_stars(acquisition))
-        if each is not None
-    ]
-    return math.fsum(offsets) / len(offsets) if offsets else None
-
-
-def _mean_stars(acquisition: "Acquisition") -> list["MeanStars"]:
-    """The mean directions of every tracker; none without an attitude."""
-    # Only what records an acquisition needs the ephemeris.
-    from service.alarms.drift import mean_stars
-
-    if acquisition.solution is None:
-        return []
-    return mean_stars(
-        acquisition.batch,
-        [each.corrected for each in acquisition.trackers],
-        [each.identification.star for each in acquisition.trackers],
-        acquisition.run_catalog.direction_at(acquisition.batch.time),
-    )
-
-
-def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:
-    """The angle from the a priori attitude to the one found; None without either.
-
-    Where the a priori gives an axis alone, the pole of a band or the boresight
-    of a cap, the angle between that axis and where it was found to be.
-    """
-    if acquisition.solution is None or acquisition.prior is None:
-        return None
-    prior = acquisition.prior
-    attitude = acquisition.solution.matrix
-    if prior.known_axis is not None:
-        axis = np.dot(prior.axis_body(acquisition.mission), attitude)
-        return separation_deg(axis, prior.known_axis)
-    # The Frobenius norm of A - B is 2 sqrt(2) sin(angle / 2).
-    apart = math.dist(attitude.ravel().tolist(), prior.attitude.ravel().tolist())
-    return math.degrees(2.0 * math.asin(min(1.0, apart / math.sqrt(8.0))))
-
-
 QUANTITIES: dict[str, Quantity] = {
     each.name: each
     for each in (
@@ -283,9 +146,8 @@ QUANTITIES: dict[str, Quantity] = {
             "ambiguous_share",
             "1",
             "ambiguous stars",
-            StarShare(itemgetter("ambiguous")),
+            STORED["ambiguous_share"],
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
-            rolled_up=True,
             by_tracker=True,
             cause=Cause(
                 "Fewer or fainter stars than usual, or a crowded or sparse region of the sky.",
@@ -297,9 +159,8 @@ QUANTITIES: dict[str, Quantity] = {
             "unmatched_share",
             "1",
             "unmatched stars",
-            StarShare(itemgetter("unmatched")),
+            STORED["unmatched_share"],
             lambda mission: above(0.15, 0.25, 0.5, hysteresis=0.03),
-            rolled_up=True,
             by_tracker=True,
             cause=Cause(
                 "The a priori attitude drifts, so that stars lie beyond the edge of the zone; "
@@ -339,10 +200,9 @@ QUANTITIES: dict[str, Quantity] = {
             "residual_rms_arcsec",
             "arcsec",
             "residual rms",
-            Measured(residual_rms_arcsec),
+            STORED["residual_rms_arcsec"],
             # The normal value depends on the tracker; the ratio below takes that into account.
             lambda mission: LimitSettings(),
-            rolled_up=True,
             by_tracker=True,
             cause=_SIGMA,
         ),
@@ -350,18 +210,16 @@ QUANTITIES: dict[str, Quantity] = {
             "predicted_rms_arcsec",
             "arcsec",
             "predicted residual rms",
-            Measured(predicted_rms_arcsec),
-            rolled_up=True,
+            STORED["predicted_rms_arcsec"],
             by_tracker=True,
         ),
         Quantity(
             "residual_ratio",
             "1",
             "residual over predicted",
-            Ratio("residual_rms_arcsec", "predicted_rms_arcsec"),
+            STORED["residual_ratio"],
             lambda mission: above(1.5, 2.0, 3.0, hysteresis=0.1),
             description="Residual rms divided by the predicted rms; about 1.",
-            rolled_up=True,
             by_tracker=True,
             cause=_SIGMA,
         ),
@@ -369,11 +227,10 @@ QUANTITIES: dict[str, Quantity] = {
             "magnitude_offset_mag",
             "mag",
             "magnitude offset",
-            Measured(magnitude_offset_mag),
+            STORED["magnitude_offset_mag"],
             lambda mission: about_zero(0.2, 0.35, 0.6, hysteresis=0.03),
             worse="size",
             description="Observed minus catalog magnitude, mean over the unique stars.",
-            rolled_up=True,
             by_tracker=True,
             cause=Cause(
                 "Instrument drift: the tracker's magnitudes have shifted.",
@@ -387,11 +244,10 @@ QUANTITIES: dict[str, Quantity] = {
             "a_priori_angle_deg",
             "deg",
             "angle from the a priori attitude",
-            Measured(a_priori_angle_deg),
+            STORED["a_priori_angle_deg"],
             _a_priori_limits,
             description="Angle from the a priori attitude to the found one; without a priori roll, "
             "from the a priori boresight or pole.",
-            rolled_up=True,
             cause=Cause(
                 "The a priori attitude drifts, or a slew was not announced.",
                 "Check where the a priori attitude comes from. Until it is corrected, send the "
@@ -402,13 +258,12 @@ QUANTITIES: dict[str, Quantity] = {
             "scale_offset_ppm",
             "ppm",
             "scale offset",
-            Measured(scale_offset_ppm),
+            STORED["scale_offset_ppm"],
             # The normal value depends on the tracker; docs/alarms.md says how to set limits.
             lambda mission: LimitSettings(),
             worse="size",
             description="Distances of the unique stars from each other within a tracker, observed "
             "over catalog, less 1, in millionths: the error of the focal length.",
-            rolled_up=True,
             by_tracker=True,
             cause=Cause(
                 "Instrument drift: the focal length has changed.",
@@ -421,12 +276,11 @@ QUANTITIES: dict[str, Quantity] = {
             "alignment_offset_arcsec",
             "arcsec",
             "alignment offset",
-            Measured(alignment_offset_arcsec),
+            STORED["alignment_offset_arcsec"],
             lambda mission: LimitSettings(),
             worse="size",
             description="Angle between the unique stars of two trackers, observed minus catalog; "
             "of a tracker, the mean over the others. Null with one tracker.",
-            rolled_up=True,
             by_tracker=True,
             cause=Cause(
                 "Instrument drift: a tracker has turned against the others. Of three trackers, "
@@ -500,7 +354,7 @@ def ranked_names() -> tuple[str, ...]:
 
 def value_names() -> tuple[str, ...]:
     """The quantities that are values of one batch: measured, or the ratio of such."""
-    return _names(lambda each: isinstance(each.source, Measured | Ratio))
+    return _names(lambda each: isinstance(each.source, Measured | MeasuredOfBatch | Ratio))
 
 
 def default_limits(mission: Mission) -> dict[str, LimitSettings]:

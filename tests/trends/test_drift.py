@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.alarms.drift import MeanStars, alignment_offsets_arcsec, scale_offset_ppm
-from service.alarms.quantities import QUANTITIES
 from service.app.factory import open_app
 from service.missions.mission import parse_mission
 from service.observations.schema import submission_from_json
@@ -19,6 +17,8 @@ from service.sky.catalog.star_catalog import load_embedded
 from service.sky.ephemeris import apparent, observer_velocity
 from service.sky.model import SkyModel
 from service.storage.recording.result_metrics import metrics_of
+from service.trends.drift import MeanStars, alignment_offsets_arcsec, scale_offset_ppm
+from service.trends.quantities import QUANTITIES
 from service.vectors import unit
 from service.web.app import create_app
 from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
