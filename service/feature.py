@@ -4,6 +4,12 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 `FEATURE`, which says which modules the feature brings; the rest of the service asks for these:
 
 - `tables`: importing it declares its tables of the database; they stay where the feature is off.
+  A table whose rows the record's chain binds says so in its `info` (`storage.sql.columns.BOUND`).
+  Another package also lists its tables as `TABLES`: they are made where the database lacks them,
+  while those of the service are made by its migrations.
+- `projection`: `apply(connection, results)` is called with results in the order of the record,
+  each once, in the transaction that notes how far projections have come; `wants(connection, run)`
+  tells if it needs those of a reprocessed run, which come in order of time and without answers.
 - `part`: `open_part(app)` makes what the feature adds to an open `App`, which has it by its class
   (`App.part`) and closes it by its `close()`.
 - `command`: `add(commands)` declares its commands, as a module of `service.cli.commands` does.
@@ -36,6 +42,7 @@ SHIPPED = ("advice", "follow", "tracks", "webhooks")
 
 KINDS = (
     "tables",
+    "projection",
     "part",
     "command",
     "serving",
@@ -95,6 +102,12 @@ def feature_modules(kind: str, off: str) -> list[ModuleType]:
         for feature in features_on(off)
         if kind in feature.brings
     ]
+
+
+def brought_modules(kind: str) -> list[ModuleType]:
+    """The module of a kind from each feature that another package brings, imported now."""
+    brought = (each for name, each in known_features().items() if name not in SHIPPED)
+    return [import_module(f"{each.package}.{kind}") for each in brought if kind in each.brings]
 
 
 def feature_folders(name: str) -> list[str]:

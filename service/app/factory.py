@@ -174,6 +174,7 @@ def open_app(
         create=create,
         serving=serving,
         archive_folder=settings.archive_folder,
+        features_off=settings.features_off,
     )
     with store.reading() as connection:
         context = Context(settings, missions, sky, store, retired(connection, missions))

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
     from service.missions.mission import Mission
     from service.sky.catalog.star_catalog import Catalog
+    from service.storage.store import Store
     from service.times import Utc
 
 
@@ -327,6 +328,14 @@ def settings_of_existing(parsed: Namespace) -> Settings:
     settings = settings_of(parsed)
     require_records(settings.database)
     return settings
+
+
+def existing_store(parsed: Namespace) -> "Store":
+    """The database of a command that changes records, open; see `settings_of_existing`."""
+    from service.storage.store import Store
+
+    settings = settings_of_existing(parsed)
+    return Store(settings.database, create=False, features_off=settings.features_off)
 
 
 def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":

@@ -28,6 +28,7 @@ class Store(Readers):
         create: bool = True,
         serving: bool = False,
         archive_folder: Path | None = None,
+        features_off: str = "",
     ) -> None:
         """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
 
@@ -36,8 +37,10 @@ class Store(Readers):
         One process at a time writes to a SQLite file, from its first write on; with `serving`,
         from the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL
         lets one service alone project.
+        Features that are not in the list `features_off` take part in what follows from the record.
         Raises `BadConfiguration` with what to do.
         """
+        self.features_off = features_off
         self.archive = Archive(archive_folder)
         url = engines.database_url(database)
         file = engines.database_file(url)

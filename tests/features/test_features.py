@@ -1,11 +1,14 @@
 """What is promised of every feature: it can be switched off, and another package can bring one."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from service.cli import build_parser
 from service.errors import BadConfiguration
@@ -111,11 +114,60 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
 DWELL = {
     "dwell/__init__.py": """
 from service.feature import Feature
-FEATURE = Feature("dwell", __name__, ("part", "command", "routes", "pages"))
+FEATURE = Feature(
+    "dwell", __name__, ("tables", "projection", "part", "command", "routes", "pages")
+)
+""",
+    "dwell/tables.py": """
+import sqlalchemy as sa
+from service.storage.sql.columns import BOUND, Name, RunName, metadata
+
+dwell_bands = sa.Table(
+    "dwell_bands",
+    metadata,
+    sa.Column("spacecraft", Name, primary_key=True),
+    sa.Column("run", RunName, primary_key=True),
+    # Of 30 degrees of declination each, from the south pole on.
+    sa.Column("band", sa.SmallInteger, primary_key=True, autoincrement=False),
+    sa.Column("batches", sa.BigInteger, nullable=False),
+    info={BOUND: "made again from results"},
+)
+TABLES = (dwell_bands,)
+""",
+    "dwell/projection.py": """
+import json
+import math
+from collections import Counter
+
+import sqlalchemy as sa
+
+from dwell.tables import dwell_bands
+from service.storage.sql.columns import unpack
+from service.vectors import matrix_from_quaternion
+
+def apply(connection, results):
+    counted = Counter()
+    for each in results:
+        attitude = json.loads(unpack(each.result["answer"]))["attitude"]
+        if each.is_first and attitude is not None:
+            # Body axis +Z in inertial axes.
+            z = float(matrix_from_quaternion(attitude["quaternion"])[2, 2])
+            run, spacecraft = each.owner
+            counted[spacecraft, run, int((math.degrees(math.asin(z)) + 90.0) // 30.0)] += 1
+    for (spacecraft, run, band), batches in counted.items():
+        c = dwell_bands.c
+        place = c.spacecraft == spacecraft, c.run == run, c.band == band
+        more = sa.update(dwell_bands).where(*place).values(batches=c.batches + batches)
+        if not connection.execute(more).rowcount:
+            row = {"spacecraft": spacecraft, "run": run, "band": band, "batches": batches}
+            connection.execute(sa.insert(dwell_bands), row)
+
+def wants(connection, run):
+    return False
 """,
     "dwell/part.py": """
-from sqlalchemy import func, select
-from service.storage.sql.tables import results
+from sqlalchemy import select
+from dwell.tables import dwell_bands
 
 class Dwell:
     def __init__(self, context):
@@ -124,30 +176,35 @@ class Dwell:
     def close(self):
         pass
 
-    def of(self, spacecraft):
+    def of(self, spacecraft, run):
         self._context.mission(spacecraft)
-        time = results.c.time_ns
-        asked = select(func.count(), func.max(time) - func.min(time))
+        c = dwell_bands.c
+        asked = select(c.band, c.batches).where(c.spacecraft == spacecraft, c.run == run)
         with self._context.reading() as connection:
-            count, span_ns = connection.execute(
-                asked.where(results.c.spacecraft == spacecraft, results.c.current)
-            ).one()
-        return {"batches": count, "span_s": (span_ns or 0) / 1e9}
+            found = dict(map(tuple, connection.execute(asked)))
+        return [found.get(band, 0) for band in range(6)]
 
 def open_part(app):
     return Dwell(app.context)
 """,
     "dwell/command.py": """
+from contextlib import closing
+from dwell.part import Dwell
+from service.app.factory import open_app
 from service.cli import arguments
 
 def add(commands):
-    arguments.add_command(commands, "dwell", run)
+    parser = arguments.add_command(commands, "dwell", run)
+    parser.add_argument("spacecraft")
+    arguments.add_database(parser)
 
 def run(parsed):
-    \"\"\"Tell how long a spacecraft was observed.
+    \"\"\"Tell how often the axis +Z of a spacecraft was in each band of declination.
 
-    acquire dwell
+    acquire dwell XTE
     \"\"\"
+    with closing(open_app(arguments.settings_of_existing(parsed))) as app:
+        print(*app.part(Dwell).of(parsed.spacecraft, "live"))
     return 0
 """,
     "dwell/routes.py": """
@@ -155,22 +212,21 @@ from dwell.part import Dwell
 from service.contract.base import Record
 from service.web.openapi import ApiRouter, Returns
 from service.web.requests.access import AppDep, Policy, json_response
-from service.web.requests.query_parameters import SpacecraftPath
+from service.web.requests.query_parameters import FromQuery, RunQuery, SpacecraftPath
 
 class DwellOut(Record, frozen=True, kw_only=True):
-    \"\"\"How long a spacecraft was observed.\"\"\"
+    \"\"\"How often the axis +Z was in each band of declination.\"\"\"
 
-    batches: int
-    span_s: float
+    batches: list[int]
 
 router = ApiRouter("dwell")
 ROUTERS = (router,)
 POLICIES = {"get_dwell": Policy("read", "path")}
 
 @router.serves("GET /spacecraft/{name}/dwell", Returns("The dwell.", DwellOut))
-def get_dwell(name: SpacecraftPath, app: AppDep):
-    \"\"\"How long a spacecraft was observed.\"\"\"
-    return json_response(app.part(Dwell).of(name))
+def get_dwell(name: SpacecraftPath, query: FromQuery[RunQuery], app: AppDep):
+    \"\"\"How often the axis +Z of a spacecraft was in each band of declination.\"\"\"
+    return json_response({"batches": app.part(Dwell).of(name, query.run or "live")})
 """,
     "dwell/pages.py": """
 from dwell.part import Dwell
@@ -179,36 +235,110 @@ from service.web.requests.access import READ
 
 @console_page("/dwell", "Dwell", READ, position=95)
 def dwell_page(query: FromQuery[PageQuery], context: ContextDep):
-    return context.rendered("dwell.html.jinja", query.run, dwell=context.app.part(Dwell).of("XTE"))
+    dwell = context.app.part(Dwell).of("XTE", query.run)
+    return context.rendered("dwell.html.jinja", query.run, dwell=dwell)
 """,
     "dwell/templates/dwell.html.jinja": """
 {% extends "layout.html.jinja" %}
 {% block scripts %}<script type="module" src="/static/dwell.js"></script>{% endblock %}
-{% block main %}<p>{{ dwell.batches }} batches</p>{% endblock %}
+{% block main %}<p>{{ dwell | sum }} batches</p>{% endblock %}
 """,
     "dwell/static/dwell.js": "// dwell",
     "dwell-1.dist-info/METADATA": "Metadata-Version: 2.1\nName: dwell\nVersion: 1\n",
     "dwell-1.dist-info/entry_points.txt": "[acquire.features]\ndwell = dwell:FEATURE\n",
 }
-"""A package that brings a feature."""
+"""A package that brings a feature: how often an axis of the body dwells where in the sky."""
 
 
-def test_another_package_brings_a_feature_without_a_change_of_the_service(tmp_path):
+def bands_of(answers):
+    """How often body +Z was in each 30 degrees of declination, by scipy."""
+    found = [0] * 6
+    for answer in answers:
+        if answer["attitude"] is not None:
+            z = Rotation.from_quat(answer["attitude"]["quaternion"]).apply([0.0, 0.0, 1.0])
+            found[int((np.degrees(np.arcsin(z[2])) + 90.0) // 30.0)] += 1
+    return found
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """A folder with the package, as an installation has it."""
+    folder = tmp_path_factory.mktemp("site")
     for name, text in DWELL.items():
-        file = tmp_path / "site" / name
+        file = folder / name
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
-    route, site = "/api/v1/spacecraft/XTE/dwell", (tmp_path / "site",)
+    return folder
+
+
+def test_another_package_brings_a_feature_without_a_change_of_the_service(tmp_path, site):
+    route = "/api/v1/spacecraft/XTE/dwell"
     asked = (route, "/dwell", "/static/dwell.js", "/", "/api/v1/openapi.json")
-    commands, _, found = served(tmp_path, "", *asked, path=site)
+    commands, _, found = served(tmp_path, "", *asked, path=(site,))
     assert "dwell" in commands
-    assert found[route] == (200, '{"batches":0,"span_s":0.0}')
+    assert found[route] == (200, '{"batches":[0,0,0,0,0,0]}')
     assert found["/dwell"][0] == 200
     assert "<p>0 batches</p>" in found["/dwell"][1]
     assert found["/static/dwell.js"] == (200, "// dwell")
     assert 'href="/dwell"' in found["/"][1]
     assert '"DwellOut"' in found["/api/v1/openapi.json"][1]
-    commands, modules, found = served(tmp_path, "dwell", route, "/dwell", path=site)
+    commands, modules, found = served(tmp_path, "dwell", route, "/dwell", path=(site,))
     assert "dwell" not in commands
     assert [status for status, _ in found.values()] == [404, 404]
-    assert {each for each in modules if each.startswith("dwell.")} == set()
+    # Its tables stay in the database.
+    loaded = {each for each in modules if each.startswith("dwell.")}
+    assert loaded <= {"dwell.tables"}
+
+
+SENT = """
+import json, sys
+from service.app.factory import open_app
+from service.cli import main
+from service.observations.schema import submission_from_json
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import draw_pass
+from service.storage.sql import migrations
+
+file, first, last = sys.argv[1], *map(int, sys.argv[2:4])
+settings = Settings(database="sqlite:///" + file, replay_processes=0)
+app = open_app(settings)
+drawn = draw_pass(app.missions["XTE"], app.sky, Pass(batches=12, seed=5))
+for each in drawn[first:last]:
+    print(app.submissions.submit(submission_from_json(json.dumps(each.batch))).body.decode())
+app.close()
+print(json.dumps(migrations.check(settings.database)))
+if sys.argv[4:]:
+    sys.exit(main([*sys.argv[4:], "--database", settings.database]))
+"""
+
+
+def sent(file, first, last, *command, path=()):
+    """The answers of a process that records some batches, how the schema differs, and what a
+    command prints then."""
+    run = subprocess.run(
+        [sys.executable, "-c", SENT, str(file), str(first), str(last), *command],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    lines = run.stdout.splitlines()
+    answers, differs = lines[: last - first], lines[last - first]
+    return [json.loads(each) for each in answers], json.loads(differs), lines[last - first + 1 :]
+
+
+def test_a_brought_feature_has_its_tables_and_follows_the_record(tmp_path, site):
+    """The database was there before the package, and is given its tables as it is opened."""
+    file = tmp_path / "acquire.db"
+    sent(file, 0, 4)
+    answers, differs, printed = sent(file, 4, 12, "dwell", "XTE", path=(site,))
+    assert differs == []
+    bands = bands_of(answers)
+    assert sum(bands) >= 6
+    assert printed == [" ".join(map(str, bands))]
+    # Without the package the service goes on, and the numbers stay for its return.
+    sent(file, 0, 0)
+    *_, printed = sent(file, 0, 0, "dwell", "XTE", path=(site,))
+    assert printed == [" ".join(map(str, bands))]

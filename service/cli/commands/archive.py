@@ -6,7 +6,13 @@ from pathlib import Path
 from typing import Any
 
 from service.cli import arguments
-from service.cli.arguments import period_of, progress_bar, settings_of, settings_of_existing
+from service.cli.arguments import (
+    existing_store,
+    period_of,
+    progress_bar,
+    settings_of,
+    settings_of_existing,
+)
 from service.errors import BadConfiguration, BadInput, Fault
 
 FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
@@ -43,7 +49,6 @@ def archive(parsed: Namespace) -> int:
     acquire archive restore --archive /archive --spacecraft XTE --start 1996-010T00:00:00Z
     """
     from service.extras import require_extra
-    from service.storage.store import Store
     from service.times import parse_utc, utc_now
 
     if parsed.before is None:
@@ -56,7 +61,7 @@ def archive(parsed: Namespace) -> int:
     from service.storage.projections.projector import projected
     from service.storage.upkeep import archiving
 
-    with closing(Store(settings_of_existing(parsed).database, create=False)) as store:
+    with closing(existing_store(parsed)) as store:
         store.require_writing()
         with projected(store), progress_bar("batches", "archiving") as bar:
             done = archiving.archive(

@@ -11,7 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from service.cli import arguments
-from service.cli.arguments import progress_bar, settings_of, settings_of_existing
+from service.cli.arguments import (
+    existing_store,
+    progress_bar,
+    settings_of,
+    settings_of_existing,
+)
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -249,10 +254,9 @@ def rebuild(parsed: Namespace) -> int:
     acquire database rebuild
     """
     from service.storage.projections.projector import projected, rebuild_trends
-    from service.storage.store import Store
 
     with (
-        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        closing(existing_store(parsed)) as store,
         projected(store),
         progress_bar("hours", "counting") as bar,
     ):
@@ -288,13 +292,12 @@ def prune(parsed: Namespace) -> int:
     acquire database prune --before 1996-001T00:00:00Z --run pass-7
     """
     from service.storage.projections.projector import projected
-    from service.storage.store import Store
     from service.storage.upkeep.prune import prune as prune_records
     from service.times import parse_utc
 
     before = parse_utc(parsed.before, "--before")
     with (
-        closing(Store(settings_of_existing(parsed).database, create=False)) as store,
+        closing(existing_store(parsed)) as store,
         projected(store),
         progress_bar("batches", "deleting") as bar,
     ):

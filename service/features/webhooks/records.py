@@ -25,12 +25,12 @@ from service.contract.base import (
     page_record,
 )
 from service.errors import BadBatch, BadInput, NotFound, shown_value
+from service.features.webhooks.tables import webhook_deliveries, webhook_sender, webhooks
 from service.storage.recording import chain
 from service.storage.recording.events import EventKind
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing
 from service.storage.sql.tables import access_tokens
-from service.storage.sql.webhook_tables import webhook_deliveries, webhook_sender, webhooks
 
 _row = webhook_deliveries.c
 _SHOWN = (

@@ -27,7 +27,7 @@ from sqlalchemy import (
 )
 
 from service.storage.recording import chain
-from service.storage.recording.chain import BOUND, Statement
+from service.storage.recording.chain import Statement
 from service.storage.recording.identity import encoded_rows
 from service.storage.sql.chain_tables import record_facts, record_heads, record_leaves
 from service.storage.sql.columns import Row
@@ -120,7 +120,7 @@ class HeadMaker:
     def _find_facts(self, connection: Connection) -> None:
         """Add a fact for each row of the bound tables that is new, or closed since."""
         now = time.monotonic()
-        for table, bound in BOUND.items():
+        for table, bound in chain.bound_tables().items():
             chosen = self._not_seen(table) if bound.rises and not bound.closed_by else None
             if "row_digest" in table.c:
                 # Of an earlier version: it is given a digest first.

@@ -22,6 +22,7 @@ from typing import TypeVar
 from sqlalchemy import Connection, select, update
 
 from service.errors import BadConfiguration, Busy
+from service.feature import feature_modules
 from service.storage.projections import alarms, rollups, seals
 from service.storage.projections.heads import NOTHING, HeadMaker
 from service.storage.projections.rollups import RecordedResult, lock_position, recorded_after
@@ -97,7 +98,10 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
     _add_events,
     alarms.apply,
 )
-"""Each adds new results, in the order of the record, to tables that it alone fills."""
+"""Each adds new results, in the order of the record, to tables that it alone fills.
+
+Those of features follow.
+"""
 MOST_AT_ONCE = 500
 LONGEST_S = 0.05
 """The duration of one transaction; the next one takes fewer results where this one took longer."""
@@ -143,6 +147,8 @@ class Projector:
         """
         self._store, self._progress = store, store.progress
         self._head_maker = head_maker
+        modules = feature_modules("projection", store.features_off)
+        self._of_features = [module.apply for module in modules]
         self._closing = threading.Event()
         self._most = MOST_AT_ONCE
         self._position = 0
@@ -268,7 +274,7 @@ class Projector:
         if new:
             position = new[-1].seq
             connection.execute(update(projector).values(seq=position))
-            for apply in PROJECTIONS:
+            for apply in (*PROJECTIONS, *self._of_features):
                 apply(connection, new)
             took_s = time.monotonic() - begun_s
             self._most = max(1, min(MOST_AT_ONCE, int(2 * len(new) * LONGEST_S / took_s)))

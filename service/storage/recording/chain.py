@@ -7,14 +7,16 @@ a Merkle tree over them (RFC 6962, section 2.1, with SHA-256), and the hash of t
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from typing import Any
 
 import msgspec
 from sqlalchemy import Connection, Double, LargeBinary, Table, insert, select
 
-from service.storage.sql import alarm_tables, grade_tables, tables, webhook_tables
+from service.storage.sql import alarm_tables, grade_tables, tables
 from service.storage.sql.chain_tables import record_facts
-from service.storage.sql.columns import Row
+from service.storage.sql.columns import BOUND, Bound, Row
+from service.storage.sql.migrations import all_tables
 from service.storage.sql.statements import rows_of
 
 LEAF_BYTES = 16
@@ -153,31 +155,14 @@ def _above(level: Sequence[bytes]) -> list[bytes]:
 # ---- facts of other tables ---------------------------------------------------------------------
 
 
-class Bound(msgspec.Struct, frozen=True):
-    """How the rows of a table are facts."""
-
-    free: frozenset[str] = frozenset()
-    """Columns that no fact has, because the service changes them."""
-    closed_by: str | None = None
-    """The column that is set once; a further fact then has all columns that are not `free`."""
-    open_free: frozenset[str] = frozenset()
-    """Columns that may change until then."""
-    rises: bool = True
-    """True if new keys are greater than old ones."""
-
-
-_OF_DELIVERIES = frozenset(
-    ("previous_secret", "previous_until", "position", "missed", "gone_at")
-) | frozenset(("held_until", "failing_since", "last_attempt", "last_delivered", "last_status"))
 _OF_PROGRESS = frozenset(("state", "done", "total", "result", "covariance", "fault"))
 _DIGESTED = Bound(frozenset({"row_digest"}), rises=False)
-BOUND: Mapping[Table, Bound] = {
+_OWN: Mapping[Table, Bound] = {
     tables.missions: _DIGESTED,
     tables.catalogs: _DIGESTED,
     tables.mission_uses: Bound(frozenset({"row_digest"})),
     tables.audit: Bound(),
     tables.access_tokens: Bound(closed_by="revoked"),
-    webhook_tables.webhooks: Bound(_OF_DELIVERIES | {"last_fault"}),
     tables.calibrations: Bound(closed_by="ended", open_free=_OF_PROGRESS),
     tables.calibration_adoptions: Bound(),
     alarm_tables.limits: Bound(closed_by="until"),
@@ -186,11 +171,20 @@ BOUND: Mapping[Table, Bound] = {
     grade_tables.graded_days: Bound(frozenset({"current"})),
     grade_tables.gyro_blocks: Bound(),
 }
-"""The tables whose rows are facts when they are added, and when `closed_by` is set.
 
-What changes or removes such a row otherwise calls `note_changed` or `note_removed`.  Texts and
-numbers are in a fact; binary columns are not, since another column has their digest.
-"""
+
+@cache
+def bound_tables() -> Mapping[Table, Bound]:
+    """The tables whose rows are facts when they are added, and when `closed_by` is set.
+
+    Those of features say so themselves, in their `info`.  What changes or removes such a row
+    otherwise calls `note_changed` or `note_removed`.  Texts and numbers are in a fact; binary
+    columns are not, since another column has their digest.
+    """
+    declared = {each: each.info.get(BOUND) for each in all_tables()}
+    return {**_OWN, **{table: one for table, one in declared.items() if isinstance(one, Bound)}}
+
+
 RESULTS, REMOVED = "results", "results.removed"
 
 
@@ -201,7 +195,7 @@ def key_of(table: Table, row: Row) -> str:
 
 def content_of(table: Table, row: Row, *, closed: bool = False) -> str:
     """The SHA-256 of what a fact has of a row, in hexadecimal digits."""
-    bound = BOUND[table]
+    bound = bound_tables()[table]
     left_out = bound.free if closed else bound.free | bound.open_free | {bound.closed_by}
     content = {
         column.name: float(value) + 0.0 if isinstance(column.type, Double) else value

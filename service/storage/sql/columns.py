@@ -5,6 +5,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import zstandard
 from sqlalchemy import Dialect, MetaData, String, Text, text
 from sqlalchemy.types import TypeDecorator
@@ -22,6 +23,23 @@ metadata = MetaData(
 )
 HAS_FIRST_ROW = "has_first_row"
 """The key in the `info` of a table that has a row in a new database."""
+
+BOUND = "bound"
+"""The key in the `info` of a table of a feature: its `Bound`, or why no rows of it are facts."""
+
+
+class Bound(msgspec.Struct, frozen=True):
+    """How the rows of a table are facts of the record's chain."""
+
+    free: frozenset[str] = frozenset()
+    """Columns that no fact has, because the service changes them."""
+    closed_by: str | None = None
+    """The column that is set once; a further fact then has all columns that are not `free`."""
+    open_free: frozenset[str] = frozenset()
+    """Columns that may change until then."""
+    rises: bool = True
+    """True if new keys are greater than old ones."""
+
 
 Id = String(26)
 Name = String(128)

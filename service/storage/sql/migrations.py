@@ -17,7 +17,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from service import __version__
 from service.errors import BadConfiguration
-from service.feature import feature_modules
+from service.feature import brought_modules, feature_modules
 from service.resources import shipped
 from service.storage.sql import engines
 from service.storage.sql.columns import metadata, unpack
@@ -111,12 +111,16 @@ def all_tables() -> list[Table]:
         chain_tables,
         grade_tables,
         tables,
-        webhook_tables,
     )
 
     # A feature that is off keeps its tables.
     feature_modules("tables", off="")
     return metadata.sorted_tables
+
+
+def brought_tables() -> list[Table]:
+    """The tables of features that other packages bring: no migration of the service makes them."""
+    return [table for module in brought_modules("tables") for table in module.TABLES]
 
 
 def check_fresh() -> list[str]:
@@ -132,6 +136,10 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
     with reported(engine.url), engine.begin() as connection:
         found = revision_in(connection)
         if found == HEAD:
+            missing = _missing(connection)
+            if missing:
+                before()
+                metadata.create_all(connection, tables=missing)
             return
         before()
         from alembic import command
@@ -142,6 +150,7 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
         try:
             command.upgrade(config, "head")
             what = "made with" if found is None else f"brought from {found} to"
+            metadata.create_all(connection, tables=_missing(connection))
             log.info("%s: %s the schema %s", engines.shown_url(engine.url), what, HEAD)
         except CommandError:
             differs = _difference(connection)
@@ -198,6 +207,9 @@ def _difference(connection: Connection) -> str | None:
     """How the revision of the schema differs from this version's, and what to do; None: not."""
     found = revision_in(connection)
     if found == HEAD:
+        if missing := [table.name for table in _missing(connection)]:
+            names = ", ".join(missing)
+            return f"lacks the tables {names} of a feature: run `acquire database upgrade`"
         return None
     if found is None:
         return "holds no tables of this service: run `acquire database upgrade` to make them"
@@ -214,6 +226,12 @@ def _difference(connection: Connection) -> str | None:
         f"its schema is at {found}, of a newer version of the service ({_writer(connection)}); "
         f"this version, {__version__}, knows those up to {HEAD}: use the newer one"
     )
+
+
+def _missing(connection: Connection) -> list[Table]:
+    """The tables of brought features that the database does not have."""
+    brought = brought_tables()
+    return [each for each in brought if not inspect(connection).has_table(each.name)]
 
 
 def _writer(connection: Connection) -> str:

@@ -16,6 +16,7 @@ from sqlalchemy import Connection, select
 from sqlalchemy.exc import IntegrityError
 
 from service.errors import BadConfiguration
+from service.feature import feature_modules
 from service.storage.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
 from service.storage.archive.rows import Rows, read_part
 from service.storage.projections import alarms, rollups
@@ -107,12 +108,15 @@ def merge(store: Store, folder: Path, path: str, made: RunPart) -> None:
     Raises `BadConfiguration` where the run has other batches of the same names.
     """
     try:
-        store.writer.change(partial(_merge, folder=folder, path=path, made=made))
+        off = store.features_off
+        store.writer.change(partial(_merge, folder=folder, path=path, made=made, features_off=off))
     except IntegrityError as error:
         raise _taken(made, str(error.orig)) from None
 
 
-def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> None:
+def _merge(
+    connection: Connection, folder: Path, path: str, made: RunPart, features_off: str
+) -> None:
     spacecraft, run = made.spacecraft, made.part.run
     # A batch that another process records in the run holds this row until its commit, and waits
     # for it: the table of archived batches and that of recorded ones have no unique key together.
@@ -132,9 +136,14 @@ def _merge(connection: Connection, folder: Path, path: str, made: RunPart) -> No
     # Whoever counts an hour anew locks its rollup and then reads the shares.
     rollups.add_shares(connection, spacecraft, run, made.shares)
     insert_share(connection, number, spacecraft, run, made.shares)
+    of_features = feature_modules("projection", features_off)
+    projections = [each.apply for each in of_features if each.wants(connection, run)]
     if alarms.runs_with_alarms(connection, {run}):
+        projections.append(alarms.apply)
+    if projections:
         for some_results in _as_recorded(read_part(folder, path, made.part.sha256)):
-            alarms.apply(connection, some_results)
+            for apply in projections:
+                apply(connection, some_results)
     fields = {"spacecraft": spacecraft, "run": run, "batches": made.part.batches}
     fields |= {"latest": made.latest}
     events.add_event(connection, "batches", fields, run=run, spacecraft=spacecraft)

@@ -17,7 +17,7 @@ import sqlalchemy as sa
 from service.errors import BadConfiguration
 from service.storage.projections import heads
 from service.storage.recording import chain
-from service.storage.recording.chain import BOUND, Statement
+from service.storage.recording.chain import Statement
 from service.storage.recording.signing import PublicKey
 from service.storage.sql.chain_tables import record_facts, record_heads, record_leaves
 from service.storage.sql.columns import Row
@@ -50,10 +50,8 @@ UNBOUND = {
     "tracker_splits": "how far an upgrade is",
     "tracker_values": "verified against the stars, and by a digest",
     "watches": "how far the evaluation of limits is",
-    "webhook_deliveries": "what waits for receivers",
-    "webhook_sender": "which process delivers",
 }
-"""The tables that the chain does not bind, and why."""
+"""The tables that the chain does not bind, and why; those of features say so themselves."""
 BY_LEAVES = frozenset({"batches", "results", "star_results", "solutions", "frames"})
 """The tables whose rows are in leaves of results."""
 OF_OTHERS = frozenset({"graded_blocks"})
@@ -256,7 +254,7 @@ def _of_the_facts(connection: sa.Connection) -> Iterator[str]:
     c = record_facts.c
     for kind, key, sha256 in connection.execute(sa.select(c.kind, c.key, c.sha256).order_by(c.id)):
         latest.setdefault(kind, {})[key] = sha256
-    for table, bound in BOUND.items():
+    for table, bound in chain.bound_tables().items():
         facts = latest.get(table.name, {})
         closed = latest.get(f"{table.name}.{bound.closed_by}", {})
         columns = [each for each in table.columns if not isinstance(each.type, sa.LargeBinary)]

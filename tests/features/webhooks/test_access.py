@@ -9,9 +9,9 @@ from sqlalchemy import select
 
 from service import access as sessions
 from service.features.webhooks.records import read_sender
+from service.features.webhooks.tables import webhooks
 from service.storage.recording.ids import Ulids
 from service.storage.sql.tables import audit
-from service.storage.sql.webhook_tables import webhooks
 from tests.features.webhooks.conftest import HERE, serving
 from tests.waiting import wait_until
 from tests.web.conformance import check

@@ -11,8 +11,8 @@ from standardwebhooks.webhooks import Webhook, WebhookVerificationError
 
 from service.features.webhooks import sender
 from service.features.webhooks.sender import retry_delay_s
+from service.features.webhooks.tables import webhooks
 from service.storage.recording import events
-from service.storage.sql.webhook_tables import webhooks
 from tests.features.webhooks.conftest import HERE, receiving, serving
 from tests.waiting import wait_until
 

@@ -2,8 +2,24 @@
 
 import sqlalchemy as sa
 
-from service.storage.sql.columns import HAS_FIRST_ROW, Id, Moment, Name, RunName, metadata
+from service.storage.sql.columns import (
+    BOUND,
+    HAS_FIRST_ROW,
+    Bound,
+    Id,
+    Moment,
+    Name,
+    RunName,
+    metadata,
+)
 from service.storage.sql.tables import access_tokens
+
+_OF_DELIVERIES = frozenset(
+    (
+        *("previous_secret", "previous_until", "position", "missed", "gone_at", "held_until"),
+        *("failing_since", "last_attempt", "last_delivered", "last_status", "last_fault"),
+    )
+)
 
 webhooks = sa.Table(
     "webhooks",
@@ -35,6 +51,7 @@ webhooks = sa.Table(
     sa.Column("last_delivered", Moment),
     sa.Column("last_status", sa.SmallInteger),
     sa.Column("last_fault", sa.Text),
+    info={BOUND: Bound(_OF_DELIVERIES)},
 )
 
 webhook_deliveries = sa.Table(
@@ -59,6 +76,7 @@ webhook_deliveries = sa.Table(
     sa.Index(
         "ix_webhook_deliveries_queue", "webhook_id", "dead", "again", "spacecraft", "event_id"
     ),
+    info={BOUND: "what waits for receivers"},
 )
 
 webhook_sender = sa.Table(
@@ -68,5 +86,5 @@ webhook_sender = sa.Table(
     sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
     sa.Column("holder", Id),
     sa.Column("beat", sa.BigInteger, nullable=False),
-    info={HAS_FIRST_ROW: True},
+    info={HAS_FIRST_ROW: True, BOUND: "which process delivers"},
 )
