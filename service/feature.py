@@ -10,6 +10,10 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 - `projection`: `apply(connection, results)` is called with results in the order of the record,
   each once, in the transaction that notes how far projections have come; `wants(connection, run)`
   tells if it needs those of a reprocessed run, which come in order of time and without answers.
+- `state`: `active_alarms(connection, run, now)` gives what the overview and the badges of pages
+  show as alarms, the one that is worst now first.
+- `shares`: `evaluate_day(connection, mission, day)` is called with a quantity of a smoothed day
+  (`trends.limits.SampledDay`), in the transaction that records the day.
 - `part`: `open_part(app)` makes what the feature adds to an open `App`, which has it by its class
   (`App.part`) and closes it by its `close()`.
 - `command`: `add(commands)` declares its commands, as a module of `service.cli.commands` does.
@@ -37,12 +41,14 @@ from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("advice", "follow", "tracks", "webhooks")
+SHIPPED = ("advice", "alarms", "follow", "tracks", "webhooks")
 """The features that come with the service, in the order of their routes and commands."""
 
 KINDS = (
     "tables",
     "projection",
+    "state",
+    "shares",
     "part",
     "command",
     "serving",

@@ -23,6 +23,7 @@ from tqdm import tqdm
 
 from benchmarks.speed.fill_database import CADENCE_S
 from service.app.factory import App, open_app
+from service.features.alarms.part import Alarms
 from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.times import DAY_S, HOUR_S, Utc, parse_utc, shifted
@@ -127,8 +128,8 @@ def asked_of(app: App) -> list[Asked]:
             lambda: app.results.what_if(newest, OptionsIn(solver="triad")).body.decode(),
             lambda found: '"recorded":false' in found,
         ),
-        Asked("Alarms", "active ones", PAGE_MS, lambda: app.alarms.page().items, _is_list),
-        Asked("Alarms", "limits", PAGE_MS, lambda: app.limits.all(SPACECRAFT), bool),
+        Asked("Alarms", "active ones", PAGE_MS, lambda: app.part(Alarms).page().items, _is_list),
+        Asked("Alarms", "limits", PAGE_MS, lambda: app.part(Alarms).limits.all(SPACECRAFT), bool),
         Asked(
             "Runs",
             "every run",

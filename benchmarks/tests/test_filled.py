@@ -7,6 +7,7 @@ from sqlalchemy import event
 
 from benchmarks.speed.fill_database import fill
 from service.app.factory import open_app
+from service.features.alarms.part import Alarms
 from service.settings import Settings
 from service.times import parse_utc, shifted
 from tests.storage.recount import assert_equal_to_a_recount
@@ -51,8 +52,8 @@ def pages(app):
         "across runs": lambda: app.results.page(run="*", limit=10),
         "one": lambda: app.results.get(newest),
         "attitudes": lambda: app.spacecraft.attitudes("XTE", limit=10, **stretch),
-        "alarms": app.alarms.page,
-        "limits": lambda: app.limits.all("XTE"),
+        "alarms": app.part(Alarms).page,
+        "limits": lambda: app.part(Alarms).limits.all("XTE"),
         "events": lambda: app.events.after(0, 10),
         "last event": app.events.last,
     }

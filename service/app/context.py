@@ -11,7 +11,10 @@ from pydantic import TypeAdapter, ValidationError
 from sqlalchemy import Connection
 
 from service.access import Entry
+from service.contract.alarms import Alarm
+from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.feature import feature_modules
 from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
@@ -21,7 +24,7 @@ from service.storage.queries.histories import Retired
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.store import Store
-from service.times import Utc
+from service.times import Utc, utc_now
 from service.trends.quantities import limited_trackers
 
 ALL_RUNS = "*"
@@ -68,6 +71,12 @@ class Context:
     def reading(self) -> AbstractContextManager[Connection]:
         """A connection that sees one moment of the record and its projections; see `Store`."""
         return self.store.reading()
+
+    def active_alarms(self, connection: Connection, run: str) -> list[Alarm]:
+        """The alarms of a run that are not cleared, the one that is worst now first."""
+        modules = feature_modules("state", self.settings.features_off)
+        now = utc_now().text
+        return [each for one in modules for each in one.active_alarms(connection, run, now)]
 
     def reading_record(self) -> AbstractContextManager[Connection]:
         """A connection for what reads no projection, and so waits for none."""

@@ -4,7 +4,7 @@ from typing import Protocol, TypeVar
 
 from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
-from service.app.alarms import Alarms, Annotations, Limits
+from service.app.annotations import Annotations
 from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
 from service.app.frames import Frames
@@ -85,8 +85,6 @@ class App:
         self.grades = Grades(context)
         self.definitive = DefinitiveAttitudes(context, self.grades, kernels)
         self.live_filter = LiveFilter(context, kernels)
-        self.limits = Limits(context)
-        self.alarms = Alarms(context)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
         self.replays = Replays(context, self.submissions, self.gyro.record_many)

@@ -151,7 +151,8 @@ class Grades:
             recorded_day = recorded_days.record_day(connection, key, rows)
             # Another process may have recorded the same meanwhile.
             if recorded_day.id == rows[0]["id"]:
-                period.evaluate_day(connection, mission, key, recorded_day)
+                off = self._context.settings.features_off
+                period.evaluate_day(connection, mission, key, recorded_day, off)
             return recorded_day
 
         row = self._context.change(change)

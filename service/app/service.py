@@ -20,7 +20,7 @@ from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
-from service.storage.projections.alarms import latest_inputs
+from service.storage.queries.fleet import latest_inputs
 from service.storage.recording import events
 from service.storage.recording.events import Event
 from service.storage.recording.ids import Ulids
@@ -160,7 +160,7 @@ class Service:
         are few, several times, because code runs slowly at first.
         """
         with self._context.reading_record() as connection:
-            inputs = latest_inputs(connection, self._context.missions)
+            inputs = latest_inputs(connection, self._context.missions, utc_now())
         for text in inputs:
             try:
                 sent = submission_from_json(text)

@@ -13,6 +13,7 @@ from sqlalchemy import Connection
 
 from service.app.context import Context, PageOfPeriod, known_id
 from service.contract import spacecraft as records
+from service.contract.alarms import Alarm
 from service.contract.base import Page
 from service.contract.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.errors import AcquisitionError, BadBatch, Fault, shown_value
@@ -45,8 +46,9 @@ class Spacecraft:
     ) -> Overview:
         """Every spacecraft in a run at a glance, or some; see `fleet.overview`."""
         with self._context.reading() as connection:
-            missions = self._context.known.values()
-            return fleet.overview(connection, missions, run or LIVE, utc_now(), spacecraft)
+            missions, name = self._context.known.values(), run or LIVE
+            active = self._context.active_alarms(connection, name)
+            return fleet.overview(connection, missions, name, utc_now(), active, spacecraft)
 
     def fleet(
         self,
@@ -58,7 +60,13 @@ class Spacecraft:
         """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
         missions = [self._context.known[name] for name in names]
         with self._context.reading() as connection:
-            return fleet.fleet(connection, missions, run, period, utc_now(), spacecraft)
+            active = self._context.active_alarms(connection, run)
+            return fleet.fleet(connection, missions, run, period, utc_now(), active, spacecraft)
+
+    def alarms(self, run: str) -> list[Alarm]:
+        """The alarms of a run that are not cleared, the one that is worst now first."""
+        with self._context.reading() as connection:
+            return self._context.active_alarms(connection, run)
 
     def states(self, run: str | None = None) -> list[records.SpacecraftRow]:
         """Every spacecraft, retired ones included, with its state in a run."""

@@ -14,8 +14,8 @@ from service.observations.schema import APrioriIn, prior_of
 from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
-from service.storage.queries.alarms import latest_samples
 from service.storage.queries.pages import ResultFilter, latest_time
+from service.storage.queries.trends import latest_samples
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 

@@ -24,7 +24,7 @@ from service.errors import AcquisitionError
 from service.feature import feature_folders, feature_modules
 from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
-    alarms,
+    annotations,
     batches,
     calibrations,
     events,
@@ -63,8 +63,7 @@ ROUTERS: tuple[APIRouter, ...] = (
     zones.router,
     runs.router,
     spacecraft.overview_router,
-    alarms.router,
-    alarms.annotations_router,
+    annotations.router,
     events.router,
     access.router,
     probes.router,

@@ -65,7 +65,6 @@ class Live:
         self._tasks: list[asyncio.Task[None]] = []
         self._listeners: set[Listener] = set()
         self._stopping = False
-        self._swept_s = 0.0
         self._threads = CapacityLimiter(4)
 
     async def start(self) -> None:
@@ -181,7 +180,6 @@ class Live:
                 pass
             self._poke.clear()
             try:
-                await self._sweep()
                 await self._take()
             except Exception as error:
                 # The records are out of reach for a while: nothing is lost, it comes later.
@@ -206,13 +204,6 @@ class Live:
                     # Nothing is known of anybody while the records are out of reach.
                     log.warning("listeners could not be looked up: %s", error)
                     break
-
-    async def _sweep(self) -> None:
-        now_s = asyncio.get_running_loop().time()
-        if now_s >= self._swept_s + POLL_S:
-            self._swept_s = now_s
-            if self._app.single_projector.is_projecting:
-                await self._read(self._app.alarms.evaluate_by_clock)
 
     async def _take(self) -> None:
         while found := await self._read(self._app.events.after, self._last, READ_AT_ONCE):

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from service.features.alarms.part import Alarms
 from service.filtering.inputs import AttitudeMeasurements
 from service.trends.limits import above
 from tests.filtering.simulated import ARCSEC
@@ -24,14 +25,14 @@ def turned(attitudes, rows, arcsec=300.0):
 
 
 def alarms_of(app, run="live"):
-    found = app.alarms.page(run=run, state="all").items
+    found = app.part(Alarms).page(run=run, state="all").items
     return [each for each in found if each.quantity == "innovation_rejected_share"]
 
 
 @pytest.fixture
 def put(app, half_hour):
     """Records the half hour with some attitudes wrong, and smooths it."""
-    app.limits.set("XTE", "innovation_rejected_share", QUICK, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "innovation_rejected_share", QUICK, who="jb", comment=None)
 
     def put_with(rows, run="live"):
         recorded = half_hour[1]
@@ -73,7 +74,7 @@ def test_the_same_record_again_and_runs_without_alarms_raise_nothing(app, put):
 
 def test_the_preview_evaluates_the_smoothed_days(app, put):
     put(range(60, 70))
-    told = app.limits.preview("XTE", "innovation_rejected_share", QUICK)
+    told = app.part(Alarms).limits.preview("XTE", "innovation_rejected_share", QUICK)
     assert told.batches == 226
     assert told.proposed.alarms == 1
     (excursion,) = told.proposed.excursions

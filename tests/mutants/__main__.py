@@ -3,7 +3,7 @@
     make mutants                                       60 faults of seed 1
     make mutants MUTANTS_ARGS="--seed 2 --suite sitting"
     python -m tests.mutants --list                     the faults alone, nothing is run
-    python -m tests.mutants --area alarms --count 10 tests/alarms
+    python -m tests.mutants --area alarms --count 10 tests/features/alarms
 
 It decides whether `make test` became weaker than `make full`:
 
@@ -46,7 +46,7 @@ from tests.torture import digest_of
 
 ROOT = Path(__file__).parents[2]
 AREAS = {
-    "alarms": ("service/alarms", "service/trends"),
+    "alarms": ("service/features/alarms", "service/trends"),
     "access": ("service/access.py",),
     "webhooks": ("service/features/webhooks",),
     "recording": ("service/storage/recording",),

@@ -29,6 +29,7 @@ from sqlalchemy.pool import NullPool
 
 from service.app.factory import open_app
 from service.errors import BadConfiguration
+from service.features.alarms.part import Alarms
 from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.storage.sql.columns import HAS_FIRST_ROW
@@ -82,7 +83,7 @@ def filled(app, make, count=24):
     ]
     app.results.what_if(ids[0], TIGHT, adopt=True)
     app.results.what_if(ids[-1], TIGHT, record=True)
-    app.limits.set("XTE", "residual_ratio", None, who="me")
+    app.part(Alarms).limits.set("XTE", "residual_ratio", None, who="me")
 
 
 @pytest.fixture
@@ -182,7 +183,7 @@ def test_a_copy_goes_on_recording_where_its_source_ended(recorded, database, ope
     assert rows_of(recorded)["batches"] == rows_of(database)["batches"]
     assert known.id in str(rows_of(recorded)["results"])
     app.submissions.submit(make("new", after_s=90_000.0))
-    app.limits.set("XTE", "unmatched_share", None, who="me")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", None, who="me")
     app.close()
     with connected(database) as connection:
         newest, position = (

@@ -11,13 +11,14 @@ from sqlalchemy import delete, func, insert, select, update
 
 from service.app.factory import open_app
 from service.errors import Busy
+from service.features.alarms.part import Alarms
+from service.features.alarms.tables import alarm_actions, alarms, limits, watches
 from service.observations.schema import OptionsIn
 from service.settings import Settings
 from service.storage import progress
 from service.storage.projections import projector as projecting
 from service.storage.projections.projector import Projector, rebuild_trends
 from service.storage.recording.results import next_seqs
-from service.storage.sql.alarm_tables import alarm_actions, alarms, limits, watches
 from service.storage.sql.tables import (
     batches,
     catalogs,
@@ -97,7 +98,7 @@ def rebuilt(store, file, sizes=1):
 @pytest.fixture
 def watched(opened):
     app = opened()
-    app.limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="for the test")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="for the test")
     return app
 
 
@@ -186,7 +187,7 @@ def test_alarms_are_the_same_however_results_are_grouped(opened, make, tmp_path,
         wanted = {"warning": {"high": high}, "critical": {"high": 3 * high}, "hysteresis": 0.02}
         wanted |= {"minimum_count": int(rng.integers(1, 5)), "duration_s": 60.0}
         limits = LimitSettings.model_validate(wanted)
-        app.limits.set("XTE", name, limits, who="jb", comment="for the test")
+        app.part(Alarms).limits.set("XTE", name, limits, who="jb", comment="for the test")
     kinds = rng.choice(["good", "suspect", "one_star", "spurious"], 40, p=[0.4, 0.1, 0.2, 0.3])
     places = np.arange(40) + rng.normal(0.0, 2.0, 40)
     for k in np.argsort(places):

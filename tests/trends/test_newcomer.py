@@ -58,6 +58,7 @@ QUANTITIES["faintest_mag"] = Quantity(
 
 USED = """
 from service.app.factory import open_app
+from service.features.alarms.part import Alarms
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.sky.cache import LruCache
@@ -81,9 +82,12 @@ series = {
     for of in ("", FIRST, SECOND)
 }
 day = app.spacecraft.history("XTE", quantities=[name], size=1).series[name].mean
-limits = {each.quantity: each.settings["critical"]["high"] for each in app.limits.all("XTE", FIRST)}
-alarms = sorted(each.tracker or "" for each in app.alarms.active() if each.quantity == name)
-ranked = app.spacecraft.worst("XTE", by=name)
+limits = {
+    each.quantity: each.settings["critical"]["high"]
+    for each in app.part(Alarms).limits.all("XTE", FIRST)
+}
+alarms = sorted(each.tracker or "" for each in app.part(Alarms).active() if each.quantity == name)
+ranked = app.spacecraft.ranking("XTE", by=name)
 app.close()
 found = {"answers": answers, "series": series, "day": day, "limit": limits[name]}
 found |= {"alarms": alarms, "worst": len(ranked.items), "schema": migrations.check(database)}

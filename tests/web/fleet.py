@@ -11,9 +11,9 @@ from typing import Any
 from sqlalchemy import Connection, insert
 
 from service.app.factory import App
+from service.features.alarms.tables import alarm_actions, alarms
 from service.missions.mission import load_missions
 from service.storage.recording.ids import Ulids
-from service.storage.sql.alarm_tables import alarm_actions, alarms
 from service.storage.sql.statements import insert_all
 from service.storage.sql.tables import solutions, star_results
 from service.times import DAY_S, Utc, parse_utc, shifted, utc_now

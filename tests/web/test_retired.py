@@ -9,6 +9,7 @@ import pytest
 
 from service.app.products import open_products
 from service.errors import BadBatch, BadInput
+from service.features.alarms.part import Alarms
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import submission_from_json
 from service.trends.limits import LimitSettings
@@ -58,10 +59,10 @@ def submission(app, name, after_s, **wanted):
 def file(folder, opened):
     """The mission's file; each tracker of the spacecraft has an alarm that is out of its limits."""
     app = opened(missions=folder)
-    app.limits.set(NAME, "residual_ratio", QUICK, who="jb")
+    app.part(Alarms).limits.set(NAME, "residual_ratio", QUICK, who="jb")
     for k in range(4):
         app.submissions.submit(submission(app, f"b{k}", 30.0 * k, noise_arcsec=(30.0, 30.0)))
-    assert {each.tracker for each in app.alarms.active()} >= {None, twin.FIRST, twin.SECOND}
+    assert {each.tracker for each in app.part(Alarms).active()} >= {None, twin.FIRST, twin.SECOND}
     app.close()
     return folder / "surveyor.toml"
 
@@ -120,7 +121,7 @@ def test_the_commands_export_a_removed_mission_s_record(file, opened, database):
 def test_a_renamed_tracker_keeps_its_history_and_its_alarm_can_be_closed(file, opened):
     file.write_text(file.read_text().replace(twin.SECOND, "AFT"))
     app = opened(missions=file.parent)
-    (alarm,) = (each for each in app.alarms.active() if each.tracker == twin.SECOND)
+    (alarm,) = (each for each in app.part(Alarms).active() if each.tracker == twin.SECOND)
     old = app.spacecraft.history(NAME, tracker=twin.SECOND, quantities=["residual_ratio"])
     assert old.series
     with pytest.raises(BadInput, match="tracker: SURVEYOR has AFT, STARTRACKER_1"):
@@ -131,9 +132,9 @@ def test_a_renamed_tracker_keeps_its_history_and_its_alarm_can_be_closed(file, o
         query = f"?tracker={quote(twin.SECOND)}"
         pages = [f"/spacecraft/{NAME}{query}", f"/spacecraft/{NAME}/period{query}"]
         assert set(crawled(client, [f"/alarms/{alarm.id}", *pages]).values()) == {200}
-        assert app.alarms.acknowledge(alarm.id, "jb").state == "cleared"
-        (live,) = (each for each in app.alarms.active() if each.tracker == twin.FIRST)
-        assert app.alarms.acknowledge(live.id, "jb").state == "acknowledged"
+        assert app.part(Alarms).acknowledge(alarm.id, "jb").state == "cleared"
+        (live,) = (each for each in app.part(Alarms).active() if each.tracker == twin.FIRST)
+        assert app.part(Alarms).acknowledge(live.id, "jb").state == "acknowledged"
 
 
 def test_the_page_of_missions_says_that_a_file_was_changed(file, opened):

@@ -9,7 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from sqlalchemy import Connection, select, tuple_
 
+from service.contract.base import Page
+from service.contract.products import Innovation
 from service.errors import BadBatch, Fault, shown_value
+from service.feature import feature_modules
 from service.filtering.result import Integers, Outcome, Status
 from service.grades.day import (
     GRADES,
@@ -24,13 +27,12 @@ from service.gyro import texts_of
 from service.missions.mission import Mission
 from service.storage.grades.days import BLOCKS, PLACE, DayKey, GradedDayRow, block_conditions, shown
 from service.storage.grades.inputs import inside
-from service.storage.projections.alarms import ActiveAlarms, runs_with_alarms
-from service.storage.queries.alarms import limits_of
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.time_buckets import buckets_between
+from service.storage.recording.results import runs_with_alarms
 from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days
-from service.times import DAY_S, Utc, shifted
-from service.trends.limits import Point, Sample, preview_of
+from service.times import DAY_S, Utc
+from service.trends.limits import Sample, SampledDay
 from service.trends.quantities import REJECTED
 
 PARTS = 600
@@ -259,42 +261,23 @@ def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sam
     return sorted(found)
 
 
-def evaluate_day(connection: Connection, mission: Mission, key: DayKey, row: GradedDayRow) -> None:
-    """Evaluate the limits of the share for a day that was recorded now.
+def evaluate_day(
+    connection: Connection, mission: Mission, key: DayKey, row: GradedDayRow, features_off: str
+) -> None:
+    """Have limits of the share evaluated for a day that was recorded now.
 
-    Its measurements are evaluated in the order of their time, as batches that arrive are: what
-    was out of limits within the day raises an alarm, and returns.  Of a later revision of the
-    day the state at its end counts alone.  Days before the latest one raise nothing, and neither
-    do runs without alarms.
+    Days before the latest one raise nothing, and neither do runs without alarms.
     """
-    if key.run not in runs_with_alarms(connection, {key.run}) or not _is_latest(connection, key):
+    modules = feature_modules("shares", features_off)
+    if not modules or not runs_with_alarms(connection, {key.run}):
+        return
+    if not _is_latest(connection, key):
         return
     start, end = day_bounds(key.day)
     samples = rejected_samples(connection, ResultFilter(key.run, key.spacecraft, start, end))
-    limits = limits_of(connection, mission)[REJECTED]
-    if len(samples) < limits.minimum_count:
-        return
-    active = ActiveAlarms(connection, key.spacecraft, key.run)
-    excursions = preview_of(samples, limits).excursions
-    last_ns = samples[-1][0]
-
-    def at(time_ns: int, value: float | None = None) -> Point:
-        """The value at a time; by default the share over the latest until then."""
-        if value is None:
-            parts = [part for at_ns, part, _ in samples if at_ns <= time_ns]
-            value = sum(parts[-limits.minimum_count :]) / limits.minimum_count
-        return Point(value, shifted(start, (time_ns - start.tai_ns) * 1e-9).text, None)
-
-    for each in excursions:
-        if row.revision > 1 and each.end_ns is not None:
-            continue
-        worst = at(each.start_ns, each.worst)
-        active.observe(REJECTED, each.severity, limits, worst, row.created, worst)
-        if each.end_ns is not None:
-            active.observe(REJECTED, None, limits, at(each.end_ns), row.created)
-    if not excursions or excursions[-1].end_ns is not None:
-        active.observe(REJECTED, None, limits, at(last_ns), row.created)
-    active.save()
+    day = SampledDay(REJECTED, key.run, start, samples, row.revision, row.created)
+    for module in modules:
+        module.evaluate_day(connection, mission, day)
 
 
 def _is_latest(connection: Connection, key: DayKey) -> bool:

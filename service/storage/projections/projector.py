@@ -23,7 +23,7 @@ from sqlalchemy import Connection, select, update
 
 from service.errors import BadConfiguration, Busy
 from service.feature import feature_modules
-from service.storage.projections import alarms, rollups, seals
+from service.storage.projections import rollups, seals
 from service.storage.projections.heads import NOTHING, HeadMaker
 from service.storage.projections.rollups import RecordedResult, lock_position, recorded_after
 from service.storage.queries.pages import newest_first
@@ -96,7 +96,6 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
     seals.apply,
     rollups.apply,
     _add_events,
-    alarms.apply,
 )
 """Each adds new results, in the order of the record, to tables that it alone fills.
 

@@ -15,7 +15,6 @@ from service.contract.answers import Summary
 from service.contract.spacecraft import Overview, OverviewRow, Sparkline, WindowCounts
 from service.missions.mission import Mission
 from service.storage.queries import time_buckets
-from service.storage.queries.alarms import active_alarms, summary
 from service.storage.queries.histories import live_state
 from service.storage.queries.pages import newest_first
 from service.storage.queries.results import summary_of, summary_query
@@ -27,6 +26,7 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import COUNTS, batches, results
 from service.times import DAY_S, HOUR_S, UNIX_DAY, Utc, recorded_utc, shifted, unix_seconds
+from service.trends.limits import Severity
 from service.vectors import Matrix
 
 Period = Literal["hour", "day", "week"]
@@ -152,15 +152,17 @@ def fleet(
     run: str,
     period: Period,
     now: Utc,
+    active: Sequence[Alarm],
     spacecraft: Collection[str] | None = None,
 ) -> Fleet:
     """Every mission in a run; the last hour and the period end with the run's latest batch.
 
-    With `spacecraft`, that of these.
+    `active` are the alarms of the run that are not cleared.  With `spacecraft`, the latest batch
+    is that of these.
     """
     named = {mission.name: mission for mission in missions}
     as_of = latest_time_of(connection, run, spacecraft, now=now)
-    active = [each for each in active_alarms(connection, run, now.text) if each.spacecraft in named]
+    active = [each for each in active if each.spacecraft in named]
     if as_of is None:
         rows = tuple(_row(each, None, now, active) for each in named.values())
         return Fleet(run, None, summary(active), rows, None)
@@ -168,6 +170,22 @@ def fleet(
     rows = tuple(_row(each, facts, now, active) for each in named.values())
     cells = _cells(connection, list(named), run, as_of, period)
     return Fleet(run, as_of, summary(active), rows, cells)
+
+
+def present_rank(alarm: Alarm) -> tuple[bool, int]:
+    """How bad an alarm is now: unshelved ones by present severity, which is 0 back in limits."""
+    severity = alarm.current_severity
+    return alarm.state != "shelved", 0 if severity is None else Severity[severity.upper()]
+
+
+def summary(found: Sequence[Alarm]) -> AlarmSummary:
+    """How many active alarms there are by state, and the present severity of the worst one."""
+    states = ("open", "acknowledged", "shelved")
+    worst = max(found, key=present_rank, default=None)
+    return AlarmSummary(
+        **{state: sum(each.state == state for each in found) for state in states},
+        worst=None if worst is None or worst.state == "shelved" else worst.current_severity,
+    )
 
 
 class _Facts:
@@ -247,6 +265,13 @@ def _newest_query(solved: bool) -> Select[Any]:
         newest = newest.where(results.c.status.is_not(None))
     newest = newest_first(newest).limit(1).correlate(asked)
     return select(asked.c.name, newest.scalar_subquery())
+
+
+def latest_inputs(connection: Connection, names: Iterable[str], now: Utc) -> Sequence[str]:
+    """The latest live batch of each of these spacecraft, as it was sent."""
+    ids = _latest_ids(connection, list(names), LIVE, now)
+    query = select(batches.c.input).join_from(results, batches, results.c.batch_id == batches.c.id)
+    return connection.scalars(query.where(results.c.id.in_(list(ids.values())))).all()
 
 
 def _summaries(connection: Connection, ids: Mapping[str, str]) -> dict[str, Summary]:
@@ -429,6 +454,7 @@ def overview(
     missions: Iterable[Mission],
     run: str,
     now: Utc,
+    active: Sequence[Alarm],
     spacecraft: Collection[str] | None = None,
 ) -> Overview:
     """Every mission in a run; the last hour and day end with the run's latest batch.
@@ -438,16 +464,15 @@ def overview(
     if spacecraft is not None:
         missions = [each for each in missions if each.name in spacecraft]
     as_of = latest_time_of(connection, run, spacecraft, now=now)
-    found = active_alarms(connection, run, now.text)
     if spacecraft is not None:
-        found = [each for each in found if each.spacecraft in spacecraft]
+        active = [each for each in active if each.spacecraft in spacecraft]
     return Overview(
         run=run,
         default_run=default_run(connection, spacecraft),
         as_of=None if as_of is None else as_of.text,
         now=now.text,
-        alarms=summary(found),
-        items=[_item(connection, each, run, as_of, now, found) for each in missions],
+        alarms=summary(active),
+        items=[_item(connection, each, run, as_of, now, active) for each in missions],
     )
 
 

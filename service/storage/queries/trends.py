@@ -19,8 +19,16 @@ from service.storage.sql import tables
 from service.storage.sql.columns import Row
 from service.storage.sql.tables import batches, results, tracker_values
 from service.times import DAY_S, HOUR_S, Utc, bucket_start, shifted, unix_seconds, utc_now
+from service.trends.limits import Sample
 from service.trends.measures import BatchShare, Rate, StarShare
-from service.trends.quantities import QUANTITIES, QuantityName, RankedName
+from service.trends.quantities import (
+    QUANTITIES,
+    QuantityName,
+    RankedName,
+    Subject,
+    quantity_and_tracker,
+    sampler,
+)
 from service.vectors import Vector
 
 Integers = npt.NDArray[np.intp]
@@ -437,3 +445,22 @@ def _shown(
         values = {row["id"]: dict(row) for row in connection.execute(own).mappings()}
     value_of: Any = QUANTITIES[by].value_of
     return [RankedBatch(**summary_fields(rows[id]), value=value_of(values[id])) for id in ids]
+
+
+def latest_samples(
+    connection: Connection, selected: ResultFilter, subject: Subject, limit: int
+) -> tuple[list[int], list[Sample]]:
+    """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
+    _, tracker = quantity_and_tracker(subject)
+    values = tracker_values if tracker else results
+    columns = [values.c[name] for name in (*tables.COUNTED, "status", *tables.MEASURED)]
+    query = select(results.c.time_ns, *columns).where(*selected.conditions())
+    if tracker:
+        same_batch = tracker_values.c.batch_id == results.c.batch_id
+        of_tracker = tracker_values.c.tracker == tracker
+        query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
+    query = newest_first(query).limit(limit)
+    sample_of = sampler(subject)
+    rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
+    samples = [sample_of(row, {tracker: row}) for row in rows]
+    return [row["time_ns"] for row in rows], [each for each in samples if each is not None]

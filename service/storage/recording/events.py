@@ -23,11 +23,10 @@ from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
 from service.storage.recording import chain
 from service.storage.recording.ids import is_ulid
-from service.storage.sql.alarm_tables import annotations
 from service.storage.sql.columns import Row
 from service.storage.sql.dialects import dialect_of
 from service.storage.sql.statements import execute, insert_all, rows_of
-from service.storage.sql.tables import event_counter, events
+from service.storage.sql.tables import annotations, event_counter, events
 from service.times import Utc, utc_now
 
 log = logging.getLogger(__name__)

@@ -18,7 +18,7 @@ from service.storage.recording.identity import (
     stored_answers,
 )
 from service.storage.recording.result_metrics import split_anew
-from service.storage.recording.unsaved_result import Answered, UnsavedResult
+from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
 from service.storage.sql import tables
 from service.storage.sql.chain_tables import record_leaves
 from service.storage.sql.columns import Row
@@ -66,6 +66,16 @@ def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) ->
     """Let limits be held against a run, or no longer; the run is made where there is none."""
     insert_runs(connection, {run: now}, alarms=watched)
     connection.execute(update(tables.runs).where(tables.runs.c.name == run).values(alarms=watched))
+
+
+def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
+    """The runs whose limits are evaluated: the live one, and others that ask for it."""
+    others = names - {LIVE}
+    if not others:
+        return names
+    c = tables.runs.c
+    query = select(c.name).where(c.name.in_(sorted(others)), c.alarms)
+    return set(connection.scalars(query)) | (names & {LIVE})
 
 
 def record(

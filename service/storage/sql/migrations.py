@@ -107,7 +107,6 @@ def all_tables() -> list[Table]:
     """All tables of the code, each after those that it refers to."""
     # A table is known to the metadata when its module is loaded.
     from service.storage.sql import (  # noqa: F401
-        alarm_tables,
         chain_tables,
         grade_tables,
         tables,

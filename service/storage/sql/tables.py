@@ -9,8 +9,7 @@
     tracker_values ── batches                      its current result, tracker by tracker
     rollups_hourly, rollups_daily                  of current results
     projector                                      how far projections have come
-    limits, watches, alarms ── alarm_actions       limits and alarms (alarm_tables.py)
-    annotations                                    notes of people (alarm_tables.py)
+    annotations                                    notes of people
     archived_parts, archived_batches, ...          batches that left it (see their figure below)
     events, event_counter                          recent events in order of commit
     calibrations ── calibration_adoptions          of trackers, and what holds of them
@@ -31,7 +30,6 @@ TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
 
 import sqlalchemy as sa
 
-from service.storage.sql.alarm_tables import alarm_actions, alarms, watches
 from service.storage.sql.columns import (
     CURRENT,
     HAS_FIRST_ROW,
@@ -441,13 +439,26 @@ WRITTEN_BY_POSTS = (
     tracker_rollups_hourly,
     tracker_rollups_daily,
     idempotency_keys,
-    watches,
-    alarms,
-    alarm_actions,
     events,
     event_counter,
 )
-"""The tables that a batch is written to, by its post and by the projector."""
+"""The tables that a batch is written to, by its post and by the projector; features have more."""
+
+annotations = sa.Table(
+    "annotations",
+    metadata,
+    sa.Column("id", Id, primary_key=True),
+    # Null: about every spacecraft.
+    sa.Column("spacecraft", Name),
+    # In telemetry time, as a batch has it; without an end it is about a moment.
+    sa.Column("start", Moment, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end", Moment),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("text", sa.Text, nullable=False),
+    sa.Column("who", sa.String(64), nullable=False),
+    sa.Column("created", Moment, nullable=False),
+)
 
 
 # The tables of the archive: which batches left the database, and where they are.

@@ -19,7 +19,7 @@ from service.errors import BadConfiguration
 from service.feature import feature_modules
 from service.storage.archive.folder import Part, manifest_of, parts_of, path_of, write_manifest
 from service.storage.archive.rows import Rows, read_part
-from service.storage.projections import alarms, rollups
+from service.storage.projections import rollups
 from service.storage.projections.rollups import WHOLE, RecordedResult, insert_share
 from service.storage.recording import events
 from service.storage.recording.identity import look_up
@@ -138,8 +138,6 @@ def _merge(
     insert_share(connection, number, spacecraft, run, made.shares)
     of_features = feature_modules("projection", features_off)
     projections = [each.apply for each in of_features if each.wants(connection, run)]
-    if alarms.runs_with_alarms(connection, {run}):
-        projections.append(alarms.apply)
     if projections:
         for some_results in _as_recorded(read_part(folder, path, made.part.sha256)):
             for apply in projections:

@@ -31,7 +31,6 @@ _ANCHOR = re.compile(r"\b(\d+) ([0-9a-f]{64})\b")
 
 UNBOUND = {
     "access_sessions": "ends by itself, after hours at most",
-    "alarms": "made again from results, limits and actions",
     "archived_batches": "of the archive, which `archive verify` checks",
     "archived_hours": "of the archive",
     "archived_parts": "of the archive, which `archive verify` checks",
@@ -49,7 +48,6 @@ UNBOUND = {
     "tracker_rollups_hourly": "verified against a recount",
     "tracker_splits": "how far an upgrade is",
     "tracker_values": "verified against the stars, and by a digest",
-    "watches": "how far the evaluation of limits is",
 }
 """The tables that the chain does not bind, and why; those of features say so themselves."""
 BY_LEAVES = frozenset({"batches", "results", "star_results", "solutions", "frames"})

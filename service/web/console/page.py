@@ -236,7 +236,7 @@ class PageContext:
 
     def _layout(self, run: str) -> Layout:
         batches = {each.run: each.batches for each in self.app.runs.all(self.caller.spacecraft)}
-        active = self.app.alarms.active(run)
+        active = self.app.spacecraft.alarms(run)
         alarms = alarm_counts([each for each in active if self.caller.may_see(each.spacecraft)])
         names = sorted({LIVE, run, *batches}, key=lambda name: (name != LIVE, name))
         return Layout(

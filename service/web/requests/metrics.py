@@ -1,11 +1,9 @@
 """Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
 
-import collections
 import logging
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from itertools import product
 from typing import Any
 
 from prometheus_client import (
@@ -24,7 +22,6 @@ from starlette.types import Scope
 
 from service import __version__
 from service.app.factory import App
-from service.contract.alarms import Alarm
 from service.contract.spacecraft import ZoneCache
 from service.feature import feature_modules
 from service.ingest.queue import OUTCOMES, Backlog, RecordedCounts
@@ -32,14 +29,12 @@ from service.storage.progress import Lag
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.upkeep.expiries import Expiries
 from service.times import recorded_utc, unix_seconds
-from service.trends.limits import Severity
 
 log = logging.getLogger(__name__)
 
 WAIT_S = 1.0
 """The deadline of all reads: the scrape is due within two seconds."""
 RESULTS = ("attitude", "no_attitude")
-ALARM_STATES = ("open", "acknowledged", "shelved")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
@@ -91,7 +86,6 @@ class _GaugeCollector(Collector):
         self._reads = _TimedReads(
             zones=app.zones.state,
             processes=app.replays.processes,
-            alarms=app.alarms.active,
             backlog=app.submissions.backlog,
             lag=app.store.progress.lag,
             expiries=app.expiries.dates,
@@ -109,8 +103,6 @@ class _GaugeCollector(Collector):
                 "Processes that are ready to compute replays, each with a cache of its own.",
                 value=found["processes"],
             )
-        if "alarms" in found:
-            yield _of_alarms(self._app, found["alarms"])
         if "backlog" in found:
             yield from _of_backlog(found["backlog"], found.get("lag"))
         if "expiries" in found:
@@ -139,21 +131,6 @@ def _of_zones(cache: ZoneCache) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "starid_zone_cache_bytes", "Memory that the cache holds.", value=cache.bytes
     )
-
-
-def _of_alarms(app: App, active: Sequence[Alarm]) -> Metric:
-    family = GaugeMetricFamily(
-        "starid_alarms",
-        "Alarms of live batches that are not cleared.",
-        labels=("spacecraft", "severity", "state"),
-    )
-    found = collections.Counter[tuple[str, str, str]](
-        (each.spacecraft, each.severity, each.state) for each in active
-    )
-    severities = [each.word for each in Severity]
-    for labels in product(app.missions, severities, ALARM_STATES):
-        family.add_metric(labels, found[labels])
-    return family
 
 
 def _of_backlog(backlog: Backlog, lag: Lag | None) -> Iterator[Metric]:

@@ -22,7 +22,6 @@ from service.observations.schema import Key, RunName
 from service.products.attitudes import ProductGrade, StatusWanted
 from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
 from service.products.moment import AtMethod
-from service.storage.queries.alarms import StateFilter
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
@@ -235,18 +234,6 @@ class WorstQuery(PeriodQuery):
     limit: Annotated[int, Field(ge=1, le=100, description="Maximum number of items.")] = 20
 
 
-class AlarmQuery(Query):
-    """Which alarms."""
-
-    run: RunOrAll = "live"
-    spacecraft: SpacecraftFilter = None
-    state: Annotated[
-        StateFilter, Field(description="`active`: all alarms that are not cleared.")
-    ] = "active"
-    limit: PageLimit = 100
-    cursor: Cursor = None
-
-
 class AnnotationQuery(Query):
     """Which annotations."""
 
@@ -297,22 +284,6 @@ class StatementQuery(AuthorQuery):
     """Who makes a change, and a comment on it."""
 
     comment: Comment = None
-
-
-class LimitQuery(Query):
-    """Whose limits."""
-
-    tracker: Annotated[
-        Key | None,
-        Field(
-            description="Of this tracker, if the spacecraft has several; default: of the "
-            "spacecraft as a whole. A tracker without limits of its own has the spacecraft's."
-        ),
-    ] = None
-
-
-class LimitStatementQuery(StatementQuery, LimitQuery):
-    """Whose limits change, who changes them, and a comment on it."""
 
 
 NO_QUERY = Depends(require_no_query)

@@ -5,10 +5,13 @@ from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
-from msgspec import structs
 from pydantic import Field, ValidationInfo, field_validator
 from starlette.responses import Response
 
+from service.contract.alarms import Annotation, Limit
+from service.contract.answers import Summary
+from service.contract.base import Page
+from service.contract.spacecraft import MissionThen, Ranking
 from service.observations.schema import Key
 from service.storage.recording.unsaved_result import LIVE
 from service.times import (
@@ -23,7 +26,6 @@ from service.times import (
 from service.trends.quantities import (
     QUANTITIES,
     RankedName,
-    limited_trackers,
     ranked_names,
     trend_names,
 )
@@ -140,16 +142,27 @@ class ShownPeriod:
         }
 
 
+@dataclass(frozen=True)
+class DrawnLimits:
+    """The limits that charts show, and when quantities were out of them, for the bars below."""
+
+    limits: list[Limit]
+    out: list[dict[str, Any]]
+
+
 @console_page("/spacecraft/{name}", "Spacecraft", Policy("read", "path"), section="/")
 def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
     """Trends of one spacecraft in a run, its worst batches, and its latest ones."""
     state = context.app.spacecraft.state(name, query.run)
     latest = context.app.results.page(spacecraft=name, run=query.run, limit=LATEST).items
     stretch = shown_period(context, name, query, latest)
-    mission, trackers = context.app.context.known[name], context.app.context.trackers(name)
+    trackers = context.app.context.trackers(name)
     ranking = _worst(context, name, query, stretch)
     notes = _annotations(context, name, stretch)
     ranked = [each for each in ranked_names() if not query.tracker or QUANTITIES[each].by_tracker]
+    drawn_limits: list[DrawnLimits] = context.panels(
+        "spacecraft_page", name, query.run, query.tracker, stretch
+    )
     return context.rendered(
         "spacecraft.html.jinja",
         query.run,
@@ -167,11 +180,9 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         not_split=ranking.not_split is True,
         quantities=ranked,
         charts=charts(query.tracker),
-        alarms=_alarms(context, name, query, stretch),
+        alarms=[span for drawn in drawn_limits for span in drawn.out],
         worst=ranking.items,
-        limits=context.app.limits.all(
-            name, query.tracker if query.tracker in limited_trackers(mission) else None
-        ),
+        limits=[limit for drawn in drawn_limits for limit in drawn.limits],
         query=query,
         before=_before(name, query, stretch),
         vertical=VERTICAL,
@@ -249,20 +260,6 @@ def _worst(
         if found[-1].items and found[-1].items[0].value:
             return found[-1]
     return found[0]
-
-
-def _alarms(
-    context: PageContext, name: str, query: SpacecraftQuery, stretch: ShownPeriod | None
-) -> list[dict[str, Any]]:
-    """When alarms were out of their limits; with a tracker, its own and those of all trackers."""
-    if stretch is None:
-        return []
-    found = context.app.alarms.of_period(name, query.run, stretch.start, stretch.end)
-    return [
-        structs.asdict(each)
-        for each in found
-        if query.tracker is None or each.tracker in (None, query.tracker)
-    ]
 
 
 def _attitude(context: PageContext, latest: list[Summary]) -> Any:

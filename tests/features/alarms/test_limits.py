@@ -5,7 +5,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from service.trends.limits import LimitSettings, SampleWindow, Severity
+from service.features.alarms.windows import SampleWindow
+from service.trends.limits import LimitSettings, Severity
 from service.trends.quantities import default_limits, limited_names
 
 S = 10**9

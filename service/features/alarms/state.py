@@ -11,22 +11,22 @@ from typing import Any, Literal
 
 from sqlalchemy import ColumnElement, Connection, and_, bindparam, insert, or_, select, update
 
-from service.alarms.state_machine import AlarmActionName, AlarmUpdate, Changes, state_of
 from service.contract import alarms as models
-from service.contract.alarms import Limit, LimitHistory
+from service.contract.alarms import AlarmActionName, Limit
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
+from service.features.alarms import records
+from service.features.alarms.state_machine import AlarmUpdate, Changes, state_of
+from service.features.alarms.tables import alarm_actions, alarms, limits
 from service.missions.mission import Mission
-from service.storage.queries.pages import ResultFilter, newest_first
+from service.storage.queries.fleet import present_rank
 from service.storage.recording import events
 from service.storage.recording.ids import is_ulid
-from service.storage.sql.alarm_tables import alarm_actions, alarms, limits
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import prepared
-from service.storage.sql.tables import COUNTED, MEASURED, results, tracker_values
 from service.times import Utc, recorded_utc, utc_now
 from service.trends import quantities
-from service.trends.limits import LimitSettings, Sample, Severity
+from service.trends.limits import LimitSettings
 from service.trends.quantities import QuantityName, quantity_named
 
 LimitsInForce = Mapping[quantities.Subject, LimitSettings]
@@ -76,13 +76,13 @@ def list_limits(connection: Connection, mission: Mission, tracker: str = "") -> 
 
 def limit_history(
     connection: Connection, mission: Mission, quantity: QuantityName, tracker: str = ""
-) -> LimitHistory:
+) -> records.LimitHistory:
     """The limit in force for a quantity, the shipped one, and every one set, newest first."""
     shipped = _inherited(connection, mission, tracker)[quantity]
     query = select(limits).where(*_place(mission, quantity, tracker)).order_by(limits.c.id.desc())
     rows = [dict(row) for row in connection.execute(query).mappings()]
     latest = next((row for row in rows if row["until"] is None), None)
-    return LimitHistory(
+    return records.LimitHistory(
         limit=shown_limit(mission.name, quantity, shipped, latest, tracker),
         default=shipped.model_dump(mode="json"),
         history=[shown_limit(mission.name, quantity, shipped, row, tracker) for row in rows],
@@ -162,25 +162,6 @@ def _in_force(connection: Connection, spacecraft: str) -> list[Row]:
     return _IN_FORCE.read(connection, {"of_spacecraft": spacecraft})
 
 
-def latest_samples(
-    connection: Connection, selected: ResultFilter, subject: quantities.Subject, limit: int
-) -> tuple[list[int], list[Sample]]:
-    """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
-    _, tracker = quantities.quantity_and_tracker(subject)
-    values = tracker_values if tracker else results
-    columns = [values.c[name] for name in (*COUNTED, "status", *MEASURED)]
-    query = select(results.c.time_ns, *columns).where(*selected.conditions())
-    if tracker:
-        same_batch = tracker_values.c.batch_id == results.c.batch_id
-        of_tracker = tracker_values.c.tracker == tracker
-        query = query.join_from(results, tracker_values, same_batch).where(of_tracker)
-    query = newest_first(query).limit(limit)
-    sample_of = quantities.sampler(subject)
-    rows = [dict(row) for row in connection.execute(query).mappings()][::-1]
-    samples = [sample_of(row, {tracker: row}) for row in rows]
-    return [row["time_ns"] for row in rows], [each for each in samples if each is not None]
-
-
 StateFilter = Literal["open", "acknowledged", "shelved", "active", "cleared", "all"]
 
 _ACTIVE = alarms.c.cleared_at.is_(None)
@@ -223,32 +204,16 @@ def active_alarms(connection: Connection, run: str, now: str) -> list[models.Ala
     return sorted(found, key=present_rank, reverse=True)
 
 
-def present_rank(alarm: models.Alarm) -> tuple[bool, int]:
-    """How bad an alarm is now: unshelved ones by present severity, which is 0 back in limits."""
-    severity = alarm.current_severity
-    return alarm.state != "shelved", 0 if severity is None else Severity[severity.upper()]
-
-
-def summary(found: Sequence[models.Alarm]) -> models.AlarmSummary:
-    """How many active alarms there are by state, and the present severity of the worst one."""
-    states = ("open", "acknowledged", "shelved")
-    worst = max(found, key=present_rank, default=None)
-    return models.AlarmSummary(
-        **{state: sum(each.state == state for each in found) for state in states},
-        worst=None if worst is None or worst.state == "shelved" else worst.current_severity,
-    )
-
-
-def read_alarm(connection: Connection, id: str, now: str) -> models.AlarmWithActions:
+def read_alarm(connection: Connection, id: str, now: str) -> records.AlarmWithActions:
     """An alarm with all that was noted of it, oldest first; raises `NotFound`."""
     alarm = _stored(connection, id)
     query = select(alarm_actions).where(alarm_actions.c.alarm_id == id).order_by(alarm_actions.c.id)
     shown = ("at", "action", "who", "comment", "severity", "value", "time")
     actions = [
-        models.AlarmAction(**{name: row[name] for name in shown})
+        records.AlarmAction(**{name: row[name] for name in shown})
         for row in connection.execute(query).mappings()
     ]
-    return models.AlarmWithActions(**_fields(alarm, now), actions=actions)
+    return records.AlarmWithActions(**_fields(alarm, now), actions=actions)
 
 
 def act(
@@ -259,7 +224,7 @@ def act(
     who: str,
     comment: str | None,
     now: str,
-) -> models.AlarmWithActions:
+) -> records.AlarmWithActions:
     """Apply a step of the state machine to an alarm, and note who did it and their comment."""
     alarm = _stored(connection, id, lock=True)
     changes, actions = step(alarm)
@@ -376,7 +341,7 @@ TimeOut = tuple[str, str | None]
 
 def alarm_spans(
     connection: Connection, run: str, spacecraft: str, start: Utc, end: Utc
-) -> list[models.AlarmSpan]:
+) -> list[records.AlarmSpan]:
     """The spans of telemetry time in which alarms were out of their limits, oldest first.
 
     Those that touch the period from `start` to before `end`, of the newest alarms.
@@ -395,7 +360,7 @@ def alarm_spans(
     )
     found = [shown_alarm(row, utc_now().text) for row in connection.execute(chosen).mappings()]
     spans = [
-        models.AlarmSpan(
+        records.AlarmSpan(
             id=alarm.id,
             quantity=alarm.quantity,
             tracker=alarm.tracker,
@@ -438,6 +403,6 @@ def _times_out(alarm: models.Alarm, actions: Sequence[tuple[str, str | None]]) -
     return spans
 
 
-def _touches(span: models.AlarmSpan, start: Utc, end: Utc) -> bool:
+def _touches(span: records.AlarmSpan, start: Utc, end: Utc) -> bool:
     is_over = span.end is not None and recorded_utc(span.end).tai_ns < start.tai_ns
     return not is_over and recorded_utc(span.start).tai_ns < end.tai_ns

@@ -15,25 +15,13 @@ note; nothing is changed in place.
 """
 
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any
 
+from service.contract.alarms import AlarmActionName, AlarmState
 from service.errors import WrongState
-from service.trends.limits import LimitSettings, Point, Severity
+from service.features.alarms.windows import Point
+from service.trends.limits import LimitSettings, Severity
 
-AlarmState = Literal["open", "acknowledged", "shelved", "cleared"]
-AlarmActionName = Literal[
-    "raised",
-    "escalated",
-    "eased",
-    "returned",
-    "left_again",
-    "acknowledged",
-    "shelved",
-    "unshelved",
-    "shelf_expired",
-    "commented",
-    "cleared",
-]
 AlarmColumns = Mapping[str, Any]
 Changes = dict[str, Any]
 AlarmUpdate = tuple[Changes, list[AlarmActionName]]

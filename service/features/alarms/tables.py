@@ -1,8 +1,17 @@
-"""The tables of limits, alarms and annotations: what the service watches and what people note."""
+"""The tables of limits and alarms: what the service watches."""
 
 import sqlalchemy as sa
 
-from service.storage.sql.columns import Id, Moment, Name, RunName, metadata, rows_where
+from service.storage.sql.columns import (
+    BOUND,
+    Bound,
+    Id,
+    Moment,
+    Name,
+    RunName,
+    metadata,
+    rows_where,
+)
 
 limits = sa.Table(
     "limits",
@@ -25,6 +34,7 @@ limits = sa.Table(
         **rows_where("until IS NULL"),
     ),
     sa.Index("ix_limits_history", "spacecraft", "quantity", "tracker", "id"),
+    info={BOUND: Bound(closed_by="until")},
 )
 
 watches = sa.Table(
@@ -39,6 +49,7 @@ watches = sa.Table(
     sa.Column("received", Moment, nullable=False),
     # The latest batches' values, and since when each quantity is out of its limits.
     sa.Column("state", sa.Text, nullable=False),
+    info={BOUND: "how far the evaluation of limits is"},
 )
 
 alarms = sa.Table(
@@ -74,6 +85,7 @@ alarms = sa.Table(
         **rows_where("cleared_at IS NULL"),
     ),
     sa.Index("ix_alarms_run", "run", "id"),
+    info={BOUND: "made again from results, limits and actions"},
 )
 
 alarm_actions = sa.Table(
@@ -88,20 +100,5 @@ alarm_actions = sa.Table(
     sa.Column("severity", sa.String(16)),
     sa.Column("value", sa.Double),
     sa.Column("time", Moment),
-)
-
-annotations = sa.Table(
-    "annotations",
-    metadata,
-    sa.Column("id", Id, primary_key=True),
-    # Null: about every spacecraft.
-    sa.Column("spacecraft", Name),
-    # In telemetry time, as a batch has it; without an end it is about a moment.
-    sa.Column("start", Moment, nullable=False),
-    sa.Column("start_ns", sa.BigInteger, nullable=False),
-    sa.Column("end", Moment),
-    sa.Column("end_ns", sa.BigInteger, nullable=False),
-    sa.Column("text", sa.Text, nullable=False),
-    sa.Column("who", sa.String(64), nullable=False),
-    sa.Column("created", Moment, nullable=False),
+    info={BOUND: Bound()},
 )

@@ -15,7 +15,7 @@ from tests.web import fleet
 from tests.web.serving import Server, in_process_settings
 
 SIZE = 12
-OPERATORS = Path(__file__).parents[2] / "docs" / "operators.md"
+OPERATORS = Path(__file__).parents[3] / "docs" / "operators.md"
 
 
 @pytest.fixture(scope="module")

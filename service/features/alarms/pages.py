@@ -1,16 +1,19 @@
-"""The pages of alarms: lists, one with its history, a spacecraft's limits, and annotations."""
+"""The pages of alarms: lists, one with its history, and a spacecraft's limits."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
-from pydantic import Field
 from starlette.responses import Response
 
+from service.contract.alarms import Alarm, Limit, SeverityName
 from service.errors import NotFound, shown_value
+from service.features.alarms.part import Alarms
+from service.features.alarms.records import AlarmWithActions
+from service.features.alarms.state import TimeOut
 from service.observations.schema import Key
-from service.storage.queries.alarms import TimeOut, present_rank
+from service.storage.queries.fleet import present_rank
 from service.times import Utc, recorded_utc, shifted
 from service.trends.limits import Severity
 from service.trends.quantities import limited_trackers, quantity_named, trend_names
@@ -22,7 +25,6 @@ from service.web.console.page import (
     PageQuery,
     SortedQuery,
     console_page,
-    typed_utc,
 )
 from service.web.console.pages.spacecraft import charts_by_quantity, history_address
 from service.web.requests.access import Policy
@@ -110,7 +112,7 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
     found, next_cursor = _found(context, query)
     lines = [
         AlarmLine(alarm, times)
-        for alarm, times in zip(found, context.app.alarms.times_out(found), strict=True)
+        for alarm, times in zip(found, context.app.part(Alarms).times_out(found), strict=True)
     ]
     lines = _sorted(lines, query)
     return context.rendered(
@@ -124,7 +126,7 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
         severities=[each.word for each in Severity],
         groupings=GROUPINGS,
         spacecraft=context.spacecraft,
-        is_retired=context.app.alarms.is_retired,
+        is_retired=context.app.part(Alarms).is_retired,
     )
 
 
@@ -132,7 +134,7 @@ def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str |
     """The alarms that match: every one that is not cleared, or a page of the history."""
     next_cursor = None
     if query.state in ("cleared", "all"):
-        page = context.app.alarms.page(
+        page = context.app.part(Alarms).page(
             run=query.run,
             spacecraft=query.spacecraft or None,
             state=query.state,
@@ -141,7 +143,7 @@ def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str |
         )
         found, next_cursor = page.items, page.next_cursor
     else:
-        found = context.app.alarms.active(query.run)
+        found = context.app.part(Alarms).active(query.run)
     return [each for each in found if _matches(each, query)], next_cursor
 
 
@@ -211,15 +213,15 @@ class AlarmQuery(Query):
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
 def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Response:
     """One alarm: how it was raised, its usual cause, and what operators did about it."""
-    alarm = context.app.alarms.get(id)
+    alarm = context.app.part(Alarms).get(id)
     if not context.caller.may_see(alarm.spacecraft):
         # As if it did not exist: probing for ids of others must tell nothing.
         raise NotFound(f"there is no alarm with the id {shown_value(id)}")
     raised = recorded_utc(alarm.raised.time)
     around = {"start": shifted(raised, -BEFORE_S).text, "end": shifted(raised, AFTER_S).text}
     of_tracker = {"tracker": alarm.tracker} if _has_tracker(context, alarm) else {}
-    is_retired = context.app.alarms.is_retired(alarm.spacecraft, alarm.tracker)
-    (times,) = context.app.alarms.times_out([alarm])
+    is_retired = context.app.part(Alarms).is_retired(alarm.spacecraft, alarm.tracker)
+    (times,) = context.app.part(Alarms).times_out([alarm])
     return context.rendered(
         "alarm.html.jinja",
         alarm.run,
@@ -265,7 +267,7 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
         apart_ns = abs(recorded_utc(other.raised.time).tai_ns - raised_ns)
         return apart_ns <= TOGETHER_S * 1e9
 
-    return [other for other in context.app.alarms.active(alarm.run) if is_related(other)]
+    return [other for other in context.app.part(Alarms).active(alarm.run) if is_related(other)]
 
 
 @dataclass(frozen=True)
@@ -288,7 +290,9 @@ def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
     tracker = alarm.tracker
     start, end = shifted(recorded_utc(alarm.raised.time), -TREND_BEFORE_S), _end(alarm)
     limited = limited_trackers(context.app.context.known[alarm.spacecraft])
-    limits = context.app.limits.all(alarm.spacecraft, tracker if tracker in limited else None)
+    limits = context.app.part(Alarms).limits.all(
+        alarm.spacecraft, tracker if tracker in limited else None
+    )
     return AlarmTrend(
         start,
         end,
@@ -312,68 +316,16 @@ class LimitsQuery(PageQuery):
 def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -> Response:
     """The bounds of every quantity, which can be previewed and changed, with their history."""
     app, tracker = context.app, query.tracker
-    limits = app.limits.all(name, tracker)
+    limits = app.part(Alarms).limits.all(name, tracker)
     return context.rendered(
         "limits.html.jinja",
         query.run,
         name=name,
         tracker=tracker,
         trackers=limited_trackers(app.context.known[name]),
-        limits=[app.limits.get(name, each.quantity, tracker) for each in limits],
+        limits=[app.part(Alarms).limits.get(name, each.quantity, tracker) for each in limits],
         severities=SEVERITIES,
         days=PREVIEW_DAYS,
         charts=charts_by_quantity(),
         may_write=context.may_operate,
     )
-
-
-ANNOTATION_ROWS = 50
-AROUND_S = 1800.0
-"""Before and after an annotation: what the link to the trends shows."""
-
-
-class AnnotationsQuery(PageQuery):
-    """Which annotations; an empty field of the form stands for any value."""
-
-    spacecraft: Key | Literal[""] = ""
-    start: Annotated[str, Field(max_length=40)] = ""
-    end: Annotated[str, Field(max_length=40)] = ""
-    cursor: Cursor = None
-
-    @property
-    def filters(self) -> dict[str, str | None]:
-        """The filters, without the run and the cursor."""
-        return {name: getattr(self, name) or None for name in ("spacecraft", "start", "end")}
-
-
-@console_page("/annotations", "Annotations", Policy("read", "nothing"), position=25)
-def annotations_page(query: FromQuery[AnnotationsQuery], context: ContextDep) -> Response:
-    """The annotations of a period, the latest written first."""
-    if query.spacecraft:
-        context.caller.require(query.spacecraft)
-    elif context.caller.spacecraft is not None:
-        query = query.model_copy(update={"spacecraft": context.first_spacecraft})
-    page = context.app.annotations.page(
-        spacecraft=query.spacecraft or None,
-        start=typed_utc(query.start, "start") if query.start else None,
-        end=typed_utc(query.end, "end") if query.end else None,
-        limit=ANNOTATION_ROWS,
-        cursor=query.cursor,
-    )
-    return context.rendered(
-        "annotations.html.jinja",
-        query.run,
-        query=query,
-        page=page,
-        around=_around,
-        spacecraft=context.spacecraft,
-    )
-
-
-def _around(annotation: Annotation) -> dict[str, str]:
-    """The period of the trends about an annotation."""
-    end = annotation.end or annotation.start
-    return {
-        "start": shifted(recorded_utc(annotation.start), -AROUND_S).text,
-        "end": shifted(recorded_utc(end), AROUND_S).text,
-    }

@@ -7,9 +7,10 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from service.alarms import state_machine
 from service.errors import WrongState
-from service.trends.limits import LimitSettings, Point, Severity
+from service.features.alarms import state_machine
+from service.features.alarms.windows import Point
+from service.trends.limits import LimitSettings, Severity
 
 LIMITS = LimitSettings.model_validate(
     {

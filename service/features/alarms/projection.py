@@ -5,25 +5,27 @@ both are stored or neither.  The row in `watches` is locked, so that several
 processes evaluate one after the other.
 """
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
 from sqlalchemy import Connection, bindparam, insert, select, update
 
-from service.alarms import state_machine
+from service.features.alarms import state_machine
+from service.features.alarms.state import change, limits_of
+from service.features.alarms.tables import alarms, watches
+from service.features.alarms.windows import BatchRef, Point, SampleWindow
 from service.missions.mission import Mission
 from service.storage.projections.rollups import RecordedResult
-from service.storage.queries.alarms import change, limits_of
 from service.storage.queries.results import recorded_mission
 from service.storage.recording.ids import Ulids
+from service.storage.recording.results import runs_with_alarms
 from service.storage.recording.unsaved_result import LIVE
-from service.storage.sql.alarm_tables import alarms, watches
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
-from service.storage.sql.tables import batches, results, runs
+from service.storage.sql.tables import batches, results
 from service.times import Utc, recorded_utc
-from service.trends.limits import BatchRef, LimitSettings, Point, Sample, SampleWindow, Severity
+from service.trends.limits import LimitSettings, Sample, Severity
 from service.trends.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 
 # Run with every batch of a live spacecraft, or with a few of them.
@@ -33,6 +35,11 @@ _COLUMNS = ("time", "time_ns", "batch_id", "received", "state")
 _SAVE = prepared(
     update(watches).where(*_PLACE).values({name: bindparam(name) for name in _COLUMNS})
 )
+
+
+def wants(connection: Connection, run: str) -> bool:
+    """True if the limits of a run are evaluated."""
+    return bool(runs_with_alarms(connection, {run}))
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
@@ -45,22 +52,6 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
     for run, spacecraft in sorted(groups):
         if run in evaluated:
             LimitEvaluator(connection, spacecraft, run, groups[run, spacecraft]).evaluate()
-
-
-def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
-    """The runs whose limits are evaluated: the live one, and others that ask for it."""
-    others = names - {LIVE}
-    if not others:
-        return names
-    query = select(runs.c.name).where(runs.c.name.in_(sorted(others)), runs.c.alarms)
-    return set(connection.scalars(query)) | (names & {LIVE})
-
-
-def latest_inputs(connection: Connection, spacecraft: Collection[str]) -> Sequence[str]:
-    """The latest live batch of each of these spacecraft, as it was sent."""
-    query = select(batches.c.input).join_from(watches, batches, watches.c.batch_id == batches.c.id)
-    chosen = watches.c.run == LIVE, watches.c.spacecraft.in_(spacecraft)
-    return connection.scalars(query.where(*chosen)).all()
 
 
 class LimitEvaluator:

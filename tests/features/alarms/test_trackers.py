@@ -3,6 +3,7 @@
 import pytest
 
 from service.errors import BadInput
+from service.features.alarms.part import Alarms
 from service.trends.limits import LimitSettings
 from tests.storage.twin import FIRST, SECOND, submission, twin
 
@@ -21,7 +22,7 @@ def mission(missions):
 @pytest.fixture
 def twins(opened, mission):
     app = opened(mission)
-    app.limits.set("XTE", "residual_ratio", QUICK, who="jb")
+    app.part(Alarms).limits.set("XTE", "residual_ratio", QUICK, who="jb")
     return app
 
 
@@ -32,7 +33,7 @@ def send(app, sky, mission, numbers, **wanted):
 
 
 def of_ratio(app, state="active"):
-    found = app.alarms.page(state=state).items
+    found = app.part(Alarms).page(state=state).items
     return {each.tracker: each for each in found if each.quantity == "residual_ratio"}
 
 
@@ -102,7 +103,7 @@ def test_limits_of_what_has_none_are_refused(twins, opened):
     app = opened()
     (lone,) = app.missions["XTE"].trackers
     with pytest.raises(BadInput, match="tracker: XTE has one tracker"):
-        app.limits.all("XTE", lone.name)
+        app.part(Alarms).limits.all("XTE", lone.name)
 
 
 def test_limits_of_a_tracker_are_set_for_the_quantities_that_it_has(twins):

@@ -5,7 +5,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from service.errors import BadInput
-from service.trends.limits import LimitSettings, SampleWindow, Severity, preview_of, preview_of_gaps
+from service.features.alarms.part import Alarms
+from service.features.alarms.windows import SampleWindow, preview_of, preview_of_gaps
+from service.trends.limits import LimitSettings, Severity
 from tests.storage.twin import SECOND, submission, twin
 
 S = 10**9
@@ -79,22 +81,22 @@ def test_it_foretells_the_alarms_that_the_limit_then_raises(opened, make):
     app = opened()
     for k, kind in enumerate(KINDS):
         app.submissions.submit(make(f"b{k}", kind=kind, after_s=30.0 * k, run="tried"))
-    told = app.limits.preview("XTE", "unmatched_share", TIGHT, run="tried")
+    told = app.part(Alarms).limits.preview("XTE", "unmatched_share", TIGHT, run="tried")
     assert (told.batches, told.is_cut) == (len(KINDS), False)
-    app.limits.set("XTE", "unmatched_share", TIGHT, who="jb")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb")
     app.runs.watch("watched")
     raised = []
     for k, kind in enumerate(KINDS):
         app.submissions.submit(make(f"b{k}", kind=kind, after_s=30.0 * k, run="watched"))
-        for alarm in app.alarms.page(run="watched").items:
+        for alarm in app.part(Alarms).page(run="watched").items:
             if alarm.quantity == "unmatched_share":
                 if alarm.raised.time not in [time for time, _ in raised]:
                     raised.append((alarm.raised.time, alarm.raised.bound))
                 if alarm.state == "open":
-                    app.alarms.acknowledge(alarm.id, "jb")
+                    app.part(Alarms).acknowledge(alarm.id, "jb")
     assert told.proposed.alarms == len(raised) > 1
     assert [each.start for each in told.proposed.excursions] == [time for time, _ in raised]
-    again = app.limits.preview("XTE", "unmatched_share", TIGHT, run="watched")
+    again = app.part(Alarms).limits.preview("XTE", "unmatched_share", TIGHT, run="watched")
     assert again.in_force == again.proposed == told.proposed
 
 
@@ -109,14 +111,14 @@ def test_a_tracker_is_previewed_by_its_own_values(opened, sky, missions):
     tight = LimitSettings.model_validate(
         {"warning": {"high": 2.5}, "minimum_count": 2, "duration_s": 0}
     )
-    whole = app.limits.preview("XTE", "residual_ratio", tight)
-    second = app.limits.preview("XTE", "residual_ratio", tight, tracker=SECOND)
+    whole = app.part(Alarms).limits.preview("XTE", "residual_ratio", tight)
+    second = app.part(Alarms).limits.preview("XTE", "residual_ratio", tight, tracker=SECOND)
     assert second.tracker == SECOND
     assert second.proposed.alarms == 1
     assert second.proposed.excursions[0].worst > 2.5
     assert whole.proposed != second.proposed
     with pytest.raises(BadInput):
-        app.limits.preview("XTE", "silence_s", tight, tracker=SECOND)
+        app.part(Alarms).limits.preview("XTE", "silence_s", tight, tracker=SECOND)
 
 
 def test_a_run_without_batches_has_a_preview_without_values(opened):

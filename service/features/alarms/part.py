@@ -1,31 +1,26 @@
-"""Limits, alarms and what operators do about them, and annotations."""
+"""Limits, alarms and what operators do about them."""
 
-import dataclasses
 from collections.abc import Callable, Sequence
 from typing import cast
 
-import msgspec
-from sqlalchemy import Connection
-
 from service.access import Entry
-from service.alarms import state_machine
 from service.app.context import ALL_RUNS, Context, known_id
-from service.contract import alarms as records
+from service.app.factory import App
+from service.contract.alarms import Alarm, Limit, SeverityName
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, shown_value
-from service.ingest.solver_pool import mission_in_input
+from service.features.alarms import records, state, state_machine
+from service.features.alarms.projection import evaluate_by_clock, is_due_by_clock
+from service.features.alarms.state import StateFilter, TimeOut, alarm_spans, list_alarms, times_out
+from service.features.alarms.windows import Preview, preview_of, preview_of_gaps
 from service.missions.mission import Mission, mission_named
 from service.storage.grades.period import rejected_samples
-from service.storage.projections.alarms import evaluate_by_clock, is_due_by_clock
-from service.storage.queries import alarms
-from service.storage.queries.alarms import TimeOut, alarm_spans, times_out
 from service.storage.queries.pages import ResultFilter, latest_time
-from service.storage.recording import events
-from service.storage.recording.ids import Ulids
+from service.storage.queries.trends import latest_samples
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.times import DAY_S, Utc, shifted, utc_now
-from service.trends.limits import LimitSettings, Preview, Sample, preview_of, preview_of_gaps
+from service.trends.limits import LimitSettings, Sample
 from service.trends.quantities import (
     REJECTED,
     SILENCE,
@@ -37,23 +32,30 @@ from service.trends.quantities import (
 
 
 class Alarms:
-    """Reads alarms and changes their state.  `entry` goes to the audit list with a change."""
+    """Reads alarms and changes their state.  `entry` goes to the audit list with a change.
+
+    `limits` are those that raise them.
+    """
 
     def __init__(self, context: Context) -> None:
         self._context = context
+        self.limits = Limits(context)
+
+    def close(self) -> None:
+        """Nothing runs by itself here."""
 
     def page(
         self,
         *,
         run: str | None = None,
         spacecraft: str | None = None,
-        state: alarms.StateFilter = "active",
+        state: StateFilter = "active",
         limit: int = 100,
         cursor: str | None = None,
-    ) -> Page[records.Alarm]:
+    ) -> Page[Alarm]:
         """Alarms, newest first; the run `*` stands for every run."""
         with self._context.reading() as connection:
-            return alarms.list_alarms(
+            return list_alarms(
                 connection,
                 run=None if run == ALL_RUNS else run or LIVE,
                 spacecraft=spacecraft,
@@ -63,17 +65,17 @@ class Alarms:
                 now=utc_now().text,
             )
 
-    def active(self, run: str = LIVE) -> list[records.Alarm]:
+    def active(self, run: str = LIVE) -> list[Alarm]:
         """Every alarm of a run that is not cleared, the one that is worst now first."""
         with self._context.reading() as connection:
-            return alarms.active_alarms(connection, run, utc_now().text)
+            return state.active_alarms(connection, run, utc_now().text)
 
     def of_period(self, spacecraft: str, run: str, start: Utc, end: Utc) -> list[records.AlarmSpan]:
         """When alarms of a spacecraft were out of their limits; see `alarm_spans`."""
         with self._context.reading() as connection:
             return alarm_spans(connection, run, spacecraft, start, end)
 
-    def times_out(self, found: Sequence[records.Alarm]) -> list[list[TimeOut]]:
+    def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
         """For each alarm, when it was out of its limits; see `period.alarms.times_out`."""
         with self._context.reading() as connection:
             return times_out(connection, found)
@@ -81,7 +83,7 @@ class Alarms:
     def get(self, id: str) -> records.AlarmWithActions:
         """One alarm with its history."""
         with self._context.reading() as connection:
-            return alarms.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
+            return state.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
 
     def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
         """True if no mission file has the spacecraft, or the tracker with limits of its own."""
@@ -160,7 +162,7 @@ class Alarms:
     ) -> records.AlarmWithActions:
         known = known_id(id, "alarm")
         return self._context.change_audited(
-            lambda connection: alarms.act(
+            lambda connection: state.act(
                 connection, known, step, who=who, comment=comment, now=moment
             ),
             entry,
@@ -179,12 +181,12 @@ class Limits:
     def __init__(self, context: Context) -> None:
         self._context = context
 
-    def all(self, name: str, tracker: str | None = None) -> list[records.Limit]:
+    def all(self, name: str, tracker: str | None = None) -> list[Limit]:
         """The limit of every quantity of a spacecraft, or of one of its trackers."""
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker)
         with self._context.reading() as connection:
-            return alarms.list_limits(connection, mission, own)
+            return state.list_limits(connection, mission, own)
 
     def get(
         self, name: str, quantity: QuantityName, tracker: str | None = None
@@ -193,7 +195,7 @@ class Limits:
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
         with self._context.reading() as connection:
-            return alarms.limit_history(connection, mission, quantity, own)
+            return state.limit_history(connection, mission, quantity, own)
 
     def set(
         self,
@@ -205,7 +207,7 @@ class Limits:
         comment: str | None = None,
         entry: Entry | None = None,
         tracker: str | None = None,
-    ) -> records.Limit:
+    ) -> Limit:
         """Set a limit, which holds from the next batch on; None restores the shipped one.
 
         `entry` goes to the audit list with the change.
@@ -213,7 +215,7 @@ class Limits:
         mission, moment = mission_named(self._context.missions, name), utc_now().text
         own = _checked_tracker(mission, tracker, quantity)
         return self._context.change_audited(
-            lambda connection: alarms.set_limit(
+            lambda connection: state.set_limit(
                 connection,
                 mission,
                 quantity,
@@ -245,7 +247,7 @@ class Limits:
         own = _checked_tracker(mission, tracker, quantity)
         subject = subject_of(quantity, own)
         with self._context.reading() as connection:
-            in_force = alarms.limits_of(connection, mission)[subject]
+            in_force = state.limits_of(connection, mission)[subject]
             last = latest_time(connection, ResultFilter(run or LIVE, name), utc_now())
             time_ns: list[int] = []
             samples: list[Sample] = []
@@ -257,9 +259,7 @@ class Limits:
                     samples = rejected_samples(connection, period)[-MOST_PREVIEWED:]
                     time_ns = [at_ns for at_ns, _, _ in samples]
                 else:
-                    time_ns, samples = alarms.latest_samples(
-                        connection, period, subject, MOST_PREVIEWED
-                    )
+                    time_ns, samples = latest_samples(connection, period, subject, MOST_PREVIEWED)
 
         def moment(at_ns: int) -> str:
             assert last is not None
@@ -292,13 +292,12 @@ def _trial(
         settings=tried.model_dump(mode="json"),
         evaluated=found.evaluated,
         beyond={
-            cast(records.SeverityName, severity.word): count
-            for severity, count in found.beyond.items()
+            cast(SeverityName, severity.word): count for severity, count in found.beyond.items()
         },
         alarms=len(found.excursions),
         excursions=[
             records.LimitExcursion(
-                severity=cast(records.SeverityName, each.severity.word),
+                severity=cast(SeverityName, each.severity.word),
                 start=moment(each.start_ns),
                 end=None if each.end_ns is None else moment(each.end_ns),
                 worst=each.worst,
@@ -328,73 +327,6 @@ def _checked_tracker(
     return tracker
 
 
-class Annotations:
-    """Reads, writes and deletes annotations.  `entry` goes to the audit list with a change."""
-
-    def __init__(self, context: Context) -> None:
-        self._context = context
-        self._ids = Ulids()
-
-    def page(
-        self,
-        *,
-        spacecraft: str | None = None,
-        start: Utc | None = None,
-        end: Utc | None = None,
-        limit: int = 100,
-        cursor: str | None = None,
-    ) -> Page[records.Annotation]:
-        """Annotations of a period, the latest written first; see `list_annotations`."""
-        with self._context.reading() as connection:
-            return events.list_annotations(
-                connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
-            )
-
-    def get(self, id: str) -> records.Annotation:
-        """One annotation."""
-        with self._context.reading() as connection:
-            return events.read_annotation(connection, known_id(id, "annotation"))
-
-    def add(
-        self,
-        text: str,
-        *,
-        start: Utc,
-        who: str,
-        end: Utc | None = None,
-        spacecraft: str | None = None,
-        entry: Entry | None = None,
-    ) -> records.Annotation:
-        """Write an annotation; without an end about a moment, without a spacecraft about all.
-
-        Raises `BadInput` for a spacecraft without a mission file.
-        """
-        if spacecraft is not None:
-            mission_in_input(self._context.missions, spacecraft)
-        row = {
-            "id": self._ids.new(),
-            "spacecraft": spacecraft,
-            "start": start.text,
-            "start_ns": start.tai_ns,
-            "end": None if end is None else end.text,
-            "end_ns": (end or start).tai_ns,
-            "text": text,
-            "who": who,
-            "created": utc_now().text,
-        }
-        return self._context.change_audited(
-            lambda connection: events.add_annotation(connection, row), entry
-        )
-
-    def delete(self, id: str, entry: Entry | None = None) -> records.Annotation:
-        """Delete an annotation; the audit list keeps what it said."""
-        known = known_id(id, "annotation")
-
-        def change(connection: Connection) -> records.Annotation:
-            deleted = events.delete_annotation(connection, known)
-            if entry is not None:
-                body = msgspec.json.encode(deleted).decode()
-                dataclasses.replace(entry, body=body).add_to(connection)
-            return deleted
-
-        return self._context.change(change)
+def open_part(app: App) -> Alarms:
+    """Alarms and limits of an open app."""
+    return Alarms(app.context)

@@ -4,6 +4,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.cli import main
+from service.features.alarms.part import Alarms
 from service.web.app import create_app
 from tests.fresh_databases import sqlite_at
 from tests.web.serving import Server, in_process_settings
@@ -24,7 +25,7 @@ def app(tmp_path):
 
 
 def raised(app, run):
-    return {each.quantity for each in app.alarms.page(run=run, state="all").items}
+    return {each.quantity for each in app.part(Alarms).page(run=run, state="all").items}
 
 
 @pytest.mark.parametrize("way", [(), ("--concurrency", "4")], ids=["as a file", "batch by batch"])

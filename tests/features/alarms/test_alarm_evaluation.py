@@ -7,10 +7,11 @@ from msgspec import structs
 from sqlalchemy import select, update
 
 from service.errors import NotFound, WrongState
+from service.features.alarms.part import Alarms
+from service.features.alarms.tables import watches
 from service.observations.schema import OptionsIn, submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import draw_pass
-from service.storage.sql.alarm_tables import watches
 from service.times import shifted, utc_now
 from service.trends.limits import Bounds, LimitSettings
 
@@ -28,7 +29,7 @@ TIGHT = LimitSettings.model_validate(
 
 @pytest.fixture
 def tight(app):
-    app.limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="for the test")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="for the test")
     return app
 
 
@@ -38,12 +39,12 @@ def send(app, make, kinds, start=0, **wanted):
 
 
 def only(app, state="active", **wanted):
-    (alarm,) = app.alarms.page(state=state, **wanted).items
+    (alarm,) = app.part(Alarms).page(state=state, **wanted).items
     return alarm
 
 
 def actions(app, alarm):
-    return [each.action for each in app.alarms.get(alarm.id).actions]
+    return [each.action for each in app.part(Alarms).get(alarm.id).actions]
 
 
 def test_an_alarm_stays_until_it_is_acknowledged_and_back_in_limits(tight, make):
@@ -218,7 +219,7 @@ def test_a_shelf_has_an_end(tight, make, monkeypatch):
     }
     assert not tight.alarms.evaluate_by_clock()
     later = shifted(utc_now(), 31 * 60)
-    monkeypatch.setattr("service.app.alarms.utc_now", lambda: later)
+    monkeypatch.setattr("service.features.alarms.part.utc_now", lambda: later)
     assert only(tight, "open").id == alarm.id
     assert tight.alarms.evaluate_by_clock()
     assert actions(tight, alarm)[-1] == "shelf_expired"
@@ -245,12 +246,14 @@ def test_who_comes_late_to_an_alarm_is_told_so(tight, make):
 
 def test_live_silence_is_an_alarm_that_the_next_batch_ends(app, make, monkeypatch):
     send(app, make, ["good"])
-    assert not app.alarms.evaluate_by_clock()
+    assert not app.part(Alarms).evaluate_by_clock()
     began = utc_now()
     for hours, severity in ((2, "warning"), (7, "critical")):
-        monkeypatch.setattr("service.app.alarms.utc_now", lambda h=hours: shifted(began, h * 3600))
-        assert app.alarms.evaluate_by_clock()
-        assert not app.alarms.evaluate_by_clock()
+        monkeypatch.setattr(
+            "service.features.alarms.part.utc_now", lambda h=hours: shifted(began, h * 3600)
+        )
+        assert app.part(Alarms).evaluate_by_clock()
+        assert not app.part(Alarms).evaluate_by_clock()
         assert only(app).severity == severity
     silent = only(app)
     assert (silent.quantity, silent.spacecraft) == ("silence_s", "XTE")
@@ -265,7 +268,7 @@ def test_a_low_bound_of_silence_is_held_as_well(app, make):
     """Batches that come too close after each other."""
     settings = {"watch": {"low": 5.0}, "minimum_count": 1, "duration_s": 0.0}
     limits = LimitSettings.model_validate(settings)
-    app.limits.set("XTE", "silence_s", limits, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "silence_s", limits, who="jb", comment=None)
     app.runs.watch("r")
     for k, after_s in enumerate((0.0, 30.0, 31.0)):
         app.submissions.submit(make(f"b{k}", run="r", after_s=after_s))
@@ -279,7 +282,7 @@ def test_in_a_run_silence_is_a_gap_in_the_batches_own_time(app, make):
     app.runs.watch("r")
     app.submissions.submit(make("b1", run="r"))
     app.submissions.submit(make("b2", run="r", after_s=30))
-    assert app.alarms.page(run="r").items == []
+    assert app.part(Alarms).page(run="r").items == []
     app.submissions.submit(make("b3", run="r", after_s=5000))
     gap = only(app, run="r")
     assert (gap.quantity, gap.raised.value) == ("silence_s", 4970.0)
@@ -305,19 +308,19 @@ def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
 
 @pytest.mark.both_databases
 def test_every_limit_that_was_set_stays_in_the_history(app):
-    shipped = app.limits.get("XTE", "unmatched_share")
+    shipped = app.part(Alarms).limits.get("XTE", "unmatched_share")
     assert shipped.limit.is_default
     assert shipped.history == []
-    app.limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="one")
-    app.limits.set("XTE", "unmatched_share", None, who="mk", comment="two")
-    found = app.limits.get("XTE", "unmatched_share")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="one")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", None, who="mk", comment="two")
+    found = app.part(Alarms).limits.get("XTE", "unmatched_share")
     assert [(each.who, each.comment) for each in found.history] == [
         ("mk", "two"),
         ("jb", "one"),
     ]
     assert found.history[1].settings == TIGHT.model_dump(mode="json")
     assert found.limit.settings == found.default
-    assert app.limits.get("SWAS", "unmatched_share").history == []
+    assert app.part(Alarms).limits.get("SWAS", "unmatched_share").history == []
 
 
 def test_what_happens_to_alarms_and_limits_is_told(tight, make):
@@ -353,7 +356,7 @@ def send_stars(app, make, stars, start=0, **wanted):
 
 def test_an_escalation_keeps_the_worst_value_that_was_seen(app, make):
     """The share passes the critical bound once; a minute later it is within the hysteresis."""
-    app.limits.set("XTE", "unmatched_share", STEEP, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "unmatched_share", STEEP, who="jb", comment=None)
     send_stars(app, make, [5, 5, 5, 3, 4, 4])
     alarm = only(app)
     assert actions(app, alarm) == ["raised", "escalated"]
@@ -368,7 +371,7 @@ def test_an_escalation_keeps_the_worst_value_that_was_seen(app, make):
 def test_the_worst_value_of_a_new_alarm_lies_beyond_its_bound(app, make):
     """The value that passed the bound counts, not the one at which the minute was over."""
     limits = STEEP.model_copy(update={"critical": Bounds()})
-    app.limits.set("XTE", "unmatched_share", limits, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "unmatched_share", limits, who="jb", comment=None)
     send_stars(app, make, [3, 8, 8])
     alarm = only(app)
     assert (alarm.raised.value, alarm.raised.bound) == (pytest.approx(1 / 8), 0.15)
@@ -385,11 +388,11 @@ def test_the_worst_value_of_a_new_alarm_lies_beyond_its_bound(app, make):
 def test_a_bound_that_was_widened_is_out_only_beyond_it(app, make):
     """The hysteresis is of a bound that was passed; a value inside a new one is in limits."""
     at_once = STEEP.model_copy(update={"critical": Bounds(), "duration_s": 0.0})
-    app.limits.set("XTE", "unmatched_share", at_once, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "unmatched_share", at_once, who="jb", comment=None)
     send_stars(app, make, [5])
     assert not only(app).in_limits
     wider = at_once.model_copy(update={"warning": Bounds(high=0.25)})
-    app.limits.set("XTE", "unmatched_share", wider, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "unmatched_share", wider, who="jb", comment=None)
     send_stars(app, make, [5], start=1)
     assert only(app).in_limits
 
@@ -423,8 +426,8 @@ def test_an_alarm_that_a_late_batch_raises_is_of_the_latest_batch(tight, make):
 def test_an_older_batch_ends_a_silence_without_becoming_the_latest(app, make, monkeypatch):
     send(app, make, ["good"], start=5)
     began = utc_now()
-    monkeypatch.setattr("service.app.alarms.utc_now", lambda: shifted(began, 2 * 3600))
-    assert app.alarms.evaluate_by_clock()
+    monkeypatch.setattr("service.features.alarms.part.utc_now", lambda: shifted(began, 2 * 3600))
+    assert app.part(Alarms).evaluate_by_clock()
     before = only(app).latest
     monkeypatch.undo()
     send(app, make, ["good"])
@@ -436,14 +439,14 @@ def test_an_older_batch_ends_a_silence_without_becoming_the_latest(app, make, mo
 def test_an_older_batch_of_a_run_is_no_gap_of_less_than_nothing(app, make):
     settings = {"watch": {"low": 5.0}, "minimum_count": 1, "duration_s": 0.0}
     limits = LimitSettings.model_validate(settings)
-    app.limits.set("XTE", "silence_s", limits, who="jb", comment=None)
+    app.part(Alarms).limits.set("XTE", "silence_s", limits, who="jb", comment=None)
     app.runs.watch("r")
     app.submissions.submit(make("b1", run="r"))
-    cleared = app.alarms.acknowledge(only(app, run="r").id, "jb")
+    cleared = app.part(Alarms).acknowledge(only(app, run="r").id, "jb")
     assert cleared.state == "cleared"
     app.submissions.submit(make("b2", run="r", after_s=600))
     app.submissions.submit(make("b3", run="r", after_s=300))
-    assert app.alarms.page(run="r").items == []
+    assert app.part(Alarms).page(run="r").items == []
 
 
 # ---- the sample telemetry ------------------------------------------------------------------------
@@ -463,7 +466,7 @@ def submitted(app, spacecraft, run, wanted):
             strict=True,
         )
     )
-    found = app.alarms.page(run=run, state="all").items
+    found = app.part(Alarms).page(run=run, state="all").items
     return [(each, stretches[each.raised.time]) for each in found]
 
 
@@ -480,7 +483,7 @@ def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacec
     ((alarm, stretch),) = angle
     assert stretch == "attitude_error"
     assert alarm.in_limits, "after the stretch it is back"
-    assert app.alarms.acknowledge(alarm.id, "jb", "seen").state == "cleared"
+    assert app.part(Alarms).acknowledge(alarm.id, "jb", "seen").state == "cleared"
     nominal = Pass(batches=120, seed=seed % 1000 + 1, troubles=NO_TROUBLES)
     # Where a pass meets a part of the sky with one star, alarms about missing attitudes are right.
     raised = {alarm.quantity for alarm, _ in submitted(app, spacecraft, "nominal", nominal)}
@@ -489,10 +492,12 @@ def test_the_sample_raises_an_alarm_in_its_growing_attitude_error(opened, spacec
 
 def test_a_limit_that_is_set_closes_no_limit_of_another_spacecraft(app):
     """Nor one of another quantity."""
-    before = app.limits.set("SWAS", "unmatched_share", TIGHT, who="jb", comment="theirs")
-    other = app.limits.set("XTE", "ambiguous_share", TIGHT, who="jb", comment="other")
-    app.limits.set("XTE", "unmatched_share", TIGHT, who="mk", comment="first")
-    app.limits.set("XTE", "unmatched_share", None, who="mk", comment="second")
-    assert app.limits.get("SWAS", "unmatched_share").limit == before
-    assert app.limits.get("XTE", "ambiguous_share").limit == other
-    assert app.limits.get("XTE", "unmatched_share").limit.comment == "second"
+    before = app.part(Alarms).limits.set(
+        "SWAS", "unmatched_share", TIGHT, who="jb", comment="theirs"
+    )
+    other = app.part(Alarms).limits.set("XTE", "ambiguous_share", TIGHT, who="jb", comment="other")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="mk", comment="first")
+    app.part(Alarms).limits.set("XTE", "unmatched_share", None, who="mk", comment="second")
+    assert app.part(Alarms).limits.get("SWAS", "unmatched_share").limit == before
+    assert app.part(Alarms).limits.get("XTE", "ambiguous_share").limit == other
+    assert app.part(Alarms).limits.get("XTE", "unmatched_share").limit.comment == "second"

@@ -1,1 +1,0 @@
-"""Alarms: the states of an alarm."""

@@ -1,0 +1,87 @@
+"""Annotations: notes that people write on times and periods."""
+
+import dataclasses
+
+import msgspec
+from sqlalchemy import Connection
+
+from service.access import Entry
+from service.app.context import Context, known_id
+from service.contract.alarms import Annotation
+from service.contract.base import Page
+from service.ingest.solver_pool import mission_in_input
+from service.storage.recording import events
+from service.storage.recording.ids import Ulids
+from service.times import Utc, utc_now
+
+
+class Annotations:
+    """Reads, writes and deletes annotations.  `entry` goes to the audit list with a change."""
+
+    def __init__(self, context: Context) -> None:
+        self._context = context
+        self._ids = Ulids()
+
+    def page(
+        self,
+        *,
+        spacecraft: str | None = None,
+        start: Utc | None = None,
+        end: Utc | None = None,
+        limit: int = 100,
+        cursor: str | None = None,
+    ) -> Page[Annotation]:
+        """Annotations of a period, the latest written first; see `list_annotations`."""
+        with self._context.reading() as connection:
+            return events.list_annotations(
+                connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
+            )
+
+    def get(self, id: str) -> Annotation:
+        """One annotation."""
+        with self._context.reading() as connection:
+            return events.read_annotation(connection, known_id(id, "annotation"))
+
+    def add(
+        self,
+        text: str,
+        *,
+        start: Utc,
+        who: str,
+        end: Utc | None = None,
+        spacecraft: str | None = None,
+        entry: Entry | None = None,
+    ) -> Annotation:
+        """Write an annotation; without an end about a moment, without a spacecraft about all.
+
+        Raises `BadInput` for a spacecraft without a mission file.
+        """
+        if spacecraft is not None:
+            mission_in_input(self._context.missions, spacecraft)
+        row = {
+            "id": self._ids.new(),
+            "spacecraft": spacecraft,
+            "start": start.text,
+            "start_ns": start.tai_ns,
+            "end": None if end is None else end.text,
+            "end_ns": (end or start).tai_ns,
+            "text": text,
+            "who": who,
+            "created": utc_now().text,
+        }
+        return self._context.change_audited(
+            lambda connection: events.add_annotation(connection, row), entry
+        )
+
+    def delete(self, id: str, entry: Entry | None = None) -> Annotation:
+        """Delete an annotation; the audit list keeps what it said."""
+        known = known_id(id, "annotation")
+
+        def change(connection: Connection) -> Annotation:
+            deleted = events.delete_annotation(connection, known)
+            if entry is not None:
+                body = msgspec.json.encode(deleted).decode()
+                dataclasses.replace(entry, body=body).add_to(connection)
+            return deleted
+
+        return self._context.change(change)

@@ -1,0 +1,44 @@
+"""Alarms that the clock raises, and shelving that ends, while the service serves."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from anyio import CapacityLimiter
+from anyio.to_thread import run_sync
+
+from service.app.factory import App
+from service.features.alarms.part import Alarms
+from service.settings import Settings
+from service.web.requests.metrics import Metrics
+
+log = logging.getLogger(__name__)
+
+EVERY_S = 1.0
+
+
+def check(settings: Settings) -> None:
+    """Alarms have no settings."""
+
+
+@asynccontextmanager
+async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
+    """Look every second for spacecraft that are silent, in the service that projects."""
+    task = asyncio.create_task(_evaluate(app))
+    yield
+    task.cancel()
+
+
+async def _evaluate(app: App) -> None:
+    # Handlers may all wait for a database that hangs; this must not take one of their threads.
+    thread = CapacityLimiter(1)
+    while True:
+        await asyncio.sleep(EVERY_S)
+        if not app.single_projector.is_projecting:
+            continue
+        try:
+            await run_sync(app.part(Alarms).evaluate_by_clock, limiter=thread)
+        except Exception as error:
+            # The records are out of reach for a while; it is looked for again.
+            log.warning("silent spacecraft could not be looked for: %s", error)
