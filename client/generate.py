@@ -63,7 +63,6 @@ def all_records() -> Mapping[str, type[Record]]:
     """Every record of the contract and of the installed features, by the name of its model."""
     modules = [f"{contract.__name__}.{each.name}" for each in iter_modules(contract.__path__)]
     modules += [f"{feature.package}.records" for feature in known_features().values()]
-    modules += ["service.storage.calibrations"]
     for module in filter(find_spec, modules):
         import_module(module)
 
@@ -120,8 +119,7 @@ def models() -> Mapping[str, str]:
     for record in needed:
         modules.setdefault(module_name(record), []).append(record)
     for held in modules.values():
-        in_source = list(vars(sys.modules[held[0].__module__]))
-        held.sort(key=lambda record: in_source.index(record.__name__))
+        held.sort(key=place_in_source)
     texts_of = {
         f"models/{name}.py": module_text(name, held, list(needed)) for name, held in modules.items()
     }
@@ -137,6 +135,13 @@ def models() -> Mapping[str, str]:
     }
 
 
+def place_in_source(record: type[Record]) -> tuple[bool, int]:
+    """The order of records in a module: those of the contract, then those of a feature."""
+    source = sys.modules[record.__module__]
+    of_feature = not source.__name__.startswith(contract.__name__)
+    return of_feature, list(vars(source)).index(record.__name__)
+
+
 def module_text(name: str, held: Sequence[type[Record]], needed: Sequence[type[Record]]) -> str:
     """A module of models; ruff takes away what it need not import."""
     source = sys.modules[held[0].__module__]
@@ -147,9 +152,10 @@ def module_text(name: str, held: Sequence[type[Record]], needed: Sequence[type[R
         for each in needed
         if module_name(each) == other
     ]
-    place = source.__name__.replace(".", "/") + ".py"
+    sources = dict.fromkeys(each.__module__.replace(".", "/") + ".py" for each in held)
+    header = HEADER.format(" and\n# ".join(sources))
     text = [
-        f'"""{(source.__doc__ or "").splitlines()[0]}"""\n{HEADER.format(place)}\n',
+        f'"""{(source.__doc__ or "").splitlines()[0]}"""\n{header}\n',
         "from collections.abc import Sequence\nfrom typing import Any\n\n",
         f"from ..base import Model, {', '.join(BASES.values())}\n",
         f"from ..words import {', '.join(WORDS)}\n",

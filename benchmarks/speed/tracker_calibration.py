@@ -19,9 +19,9 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.bounds import at_most, between
 from benchmarks.report import Report
-from service.calibration.estimate import Calibration, begun, calibrate
-from service.calibration.linearise import Model, linearised
-from service.calibration.stars import IdentifiedStars
+from service.features.calibration.estimate import Calibration, begun, calibrate
+from service.features.calibration.linearise import Model, linearised
+from service.features.calibration.stars import IdentifiedStars
 from service.missions.mission import Tracker
 from service.vectors import ARCSEC_PER_RADIAN
 

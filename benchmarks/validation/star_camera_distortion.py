@@ -21,9 +21,15 @@ from benchmarks.bounds import Bound, at_most
 from benchmarks.record import ROOT, record_of
 from benchmarks.report import Report
 from benchmarks.sections import pictures_of, table
-from service.calibration.estimate import Calibration, calibrate
-from service.calibration.linearise import Model, directions, prepared, residuals, unknowns_of
-from service.calibration.stars import IdentifiedStars
+from service.features.calibration.estimate import Calibration, calibrate
+from service.features.calibration.linearise import (
+    Model,
+    directions,
+    prepared,
+    residuals,
+    unknowns_of,
+)
+from service.features.calibration.stars import IdentifiedStars
 from service.missions.mission import Tracker
 from service.vectors import ARCSEC_PER_RADIAN
 from studies.documents import Folder

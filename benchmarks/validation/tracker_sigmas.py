@@ -18,10 +18,10 @@ from tqdm import tqdm
 
 from benchmarks.bounds import at_least, between
 from benchmarks.report import Report
-from service.calibration.estimate import calibrate
-from service.calibration.linearise import Model
-from tests.calibration import drawn as simulated
-from tests.calibration.drawn import MISALIGNED, Truth
+from service.features.calibration.estimate import calibrate
+from service.features.calibration.linearise import Model
+from tests.features.calibration import drawn as simulated
+from tests.features.calibration.drawn import MISALIGNED, Truth
 
 Array = npt.NDArray[np.float64]
 # Tests have no types.

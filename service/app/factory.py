@@ -4,8 +4,8 @@ from typing import Protocol, TypeVar
 
 from service.access import Access, Tokens
 from service.acquire.kernel_build import KernelBuild
+from service.app.adoptions import CalibrationAdoptions
 from service.app.annotations import Annotations
-from service.app.calibrations import CalibrationAdoptions, CalibrationService
 from service.app.context import Context
 from service.app.frames import Frames
 from service.app.grades import DefinitiveAttitudes, Grades, LiveFilter
@@ -90,7 +90,6 @@ class App:
         self.replays = Replays(context, self.submissions, self.gyro.record_many)
         self.zones = Zones(context)
         self.comparisons = Comparisons(context, self.submissions)
-        self.calibrations = CalibrationService(context, self.submissions, self.comparisons)
         self.events = Events(context)
         self.expiries = ExpiryDates(context.reading_record)
         self.upgrade = BackgroundUpgrade(
@@ -123,7 +122,6 @@ class App:
         for part in self._parts.values():
             part.close()
         self.replays.stop()
-        self.calibrations.close()
         self.live_filter.stop()
         self.upgrade.stop()
         self.definitive.close()
@@ -185,7 +183,7 @@ def open_app(
         if not reads_only:
             _register(app.context)
             if store.lock is None:
-                _end_left_work(app, serving)
+                _end_left_work(app)
         app.single_projector.start(app.adoptions.follow)
         app.projector.start()
     except BaseException:
@@ -211,11 +209,8 @@ def _register(context: Context) -> None:
     context.change(lambda connection: register(connection, mission_rows, catalog_row))
 
 
-def _end_left_work(app: App, serving: bool) -> None:
-    """Close replays and calibrations of an earlier process, where this is the only service."""
+def _end_left_work(app: App) -> None:
+    """Close replays of an earlier process, where this is the only service."""
     moment = utc_now().text
     stored = Spool(app.settings.spool_folder).ids()
     app.context.change(lambda connection: mark_interrupted(connection, moment, stored))
-    if serving:
-        # A command may run beside the service that computes a calibration.
-        app.calibrations.interrupt()

@@ -9,11 +9,12 @@ import logging
 import threading
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 
+from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.errors import AcquisitionError
-from service.storage.calibrations import interrupt_calibrations, unfinished_calibrations
 from service.storage.queries.replays import mark_interrupted, unfinished_replays
 from service.storage.sql.projector_lock import left_behind
 from service.storage.store import Store
@@ -28,6 +29,22 @@ A service whose session was cut has taken a new one by the second look."""
 log = logging.getLogger(__name__)
 
 
+Unfinished = Callable[[Connection], set[str]]
+Interrupt = Callable[[Connection, str, set[str]], object]
+
+
+@dataclass(frozen=True)
+class LeftWork:
+    """A kind of work that a service may leave behind when it ends."""
+
+    unfinished: Unfinished
+    interrupt: Interrupt
+
+
+def _interrupt_replays(connection: Connection, now: str, ids: set[str]) -> None:
+    mark_interrupted(connection, now, only=ids)
+
+
 class SingleProjector:
     """Knows if this process is the one that projects; `start` makes it so where no other is.
 
@@ -39,6 +56,7 @@ class SingleProjector:
         self._follow: Callable[[], object] = lambda: None
         self._resume: Callable[[], object] = lambda: None
         self._listeners: list[Callable[[], object]] = []
+        self._left_work = [LeftWork(unfinished_replays, _interrupt_replays)]
         self._telling = threading.Lock()
         self._looked_s = 0.0
         self._suspected: set[str] = set()
@@ -69,6 +87,13 @@ class SingleProjector:
     def resume_with(self, resume: Callable[[], object]) -> None:
         """Start to continue what ended services left behind on this machine."""
         self._resume = resume
+
+    def ends_left_work(self, unfinished: Unfinished, interrupt: Interrupt) -> None:
+        """Start to end another kind of work that an ended service has left behind.
+
+        `unfinished` gives the ids of all that is begun; `interrupt` notes the end of some.
+        """
+        self._left_work.append(LeftWork(unfinished, interrupt))
 
     def when_projecting(self, begin: Callable[[], object]) -> None:
         """Call a function as soon as this process projects, and again each time it begins to."""
@@ -128,7 +153,7 @@ class SingleProjector:
     def _end_left_work(self) -> None:
         """Note replays and calibrations as interrupted whose service has ended."""
         with self._store.reading_record() as connection:
-            ids = unfinished_replays(connection) | unfinished_calibrations(connection)
+            ids = {id for each in self._left_work for id in each.unfinished(connection)}
         others = ids - self._store.at_work
         left: set[str] = set()
         if others:
@@ -138,5 +163,5 @@ class SingleProjector:
         if ended:
             now = utc_now().text
             with self._store.writer.projection() as connection:
-                mark_interrupted(connection, now, only=ended)
-                interrupt_calibrations(connection, now, ended)
+                for each in self._left_work:
+                    each.interrupt(connection, now, ended)

@@ -26,7 +26,6 @@ from service.products.formats import OUTPUT_FORMATS
 from service.web.api import (
     annotations,
     batches,
-    calibrations,
     events,
     frames,
     probes,
@@ -59,7 +58,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     products.router,
     batches.gyro_router,
     batches.compare_router,
-    calibrations.router,
     zones.router,
     runs.router,
     spacecraft.overview_router,

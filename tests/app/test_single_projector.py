@@ -11,13 +11,13 @@ import pytest
 from sqlalchemy import select
 
 from service.access import Caller
-from service.app.calibration_estimates import CalibrationRequest
 from service.app.factory import open_app
+from service.features.calibration.estimates import CalibrationRequest
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.queries.replays import find_replay
 from service.storage.sql.tables import results
-from tests.calibration.wrong_file import true_batches, write_mission_files
+from tests.features.calibration.wrong_file import true_batches, write_mission_files
 from tests.storage import samples
 from tests.waiting import wait_until
 

@@ -43,7 +43,9 @@ def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypa
     monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "follow, folow")
     code, _, complaint = acquire("version")
     assert code == 2
-    assert "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, follow" in complaint
+    assert (
+        "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, calibration, follow" in complaint
+    )
     assert "(got 'folow')" in complaint
     with pytest.raises(BadConfiguration, match="ACQUIRE_FEATURES_OFF"):
         features_on("folow")
@@ -105,7 +107,9 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     assert "starid_batches" in found["/metrics"][1]
     assert "starid_webhook" not in found["/metrics"][1]
     assert "starid_alarms" not in found["/metrics"][1]
-    assert "/alarms" not in found["/"][1] + found["/spacecraft/XTE"][1]
+    shown = found["/"][1] + found["/spacecraft/XTE"][1] + found["/missions"][1]
+    assert "/alarms" not in shown
+    assert "/calibration" not in shown
     loaded = {each for each in modules if each.startswith("service.features.")}
     # The names of the features, and the tables, which stay in the database.
     assert loaded <= {f"service.features.{name}" for name in SHIPPED} | {

@@ -21,7 +21,7 @@ from service.trends.drift import MeanStars, alignment_offsets_arcsec, scale_offs
 from service.trends.quantities import QUANTITIES
 from service.vectors import unit
 from service.web.app import create_app
-from tests.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
+from tests.features.calibration.wrong_file import TURNED_ARCSEC, mission_texts, true_batches
 from tests.fresh_databases import sqlite_at
 from tests.storage.twin import FIRST, SECOND, submission, twin
 from tests.web.conformance import check

@@ -1,5 +1,6 @@
-"""Limits and alarms, and annotations: notes that people write on times and periods."""
-# Written by `make client` from service/contract/alarms.py.
+"""Alarms and limits as the overview and events have them, and annotations: notes of people."""
+# Written by `make client` from service/contract/alarms.py and
+# service/features/alarms/records.py.
 
 from collections.abc import Sequence
 from typing import Any
@@ -79,25 +80,6 @@ class Alarm(Model, frozen=True, kw_only=True):
     cleared_at: str | None
 
 
-class AlarmAction(Model, frozen=True, kw_only=True):
-    """A change of an alarm, by its value or by a person."""
-
-    at: str
-    action: str
-    who: str | None
-    comment: str | None
-    severity: str | None
-    value: float | None
-    time: str | None
-
-
-class AlarmWithActions(Alarm, frozen=True, kw_only=True):
-    """An alarm with its history."""
-
-    actions: Sequence[AlarmAction]
-    """Oldest first."""
-
-
 class Annotation(Model, frozen=True, kw_only=True):
     """A note on a time or a period, signed by its author."""
 
@@ -117,3 +99,22 @@ class AnnotationChange(Annotation, frozen=True, kw_only=True):
     """The data of an event: an annotation that was written or deleted."""
 
     deleted: bool
+
+
+class AlarmAction(Model, frozen=True, kw_only=True):
+    """A change of an alarm, by its value or by a person."""
+
+    at: str
+    action: str
+    who: str | None
+    comment: str | None
+    severity: str | None
+    value: float | None
+    time: str | None
+
+
+class AlarmWithActions(Alarm, frozen=True, kw_only=True):
+    """An alarm with its history."""
+
+    actions: Sequence[AlarmAction]
+    """Oldest first."""

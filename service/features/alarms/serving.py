@@ -26,8 +26,12 @@ def check(settings: Settings) -> None:
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
     """Look every second for spacecraft that are silent, in the service that projects."""
     task = asyncio.create_task(_evaluate(app))
-    yield
-    task.cancel()
+    try:
+        yield
+    finally:
+        task.cancel()
+        # A thread that still reads must not find the database closed.
+        await asyncio.gather(task, return_exceptions=True)
 
 
 async def _evaluate(app: App) -> None:

@@ -115,14 +115,6 @@ POLICIES: dict[str, Policy] = {
     "watch_run": Policy("submit", audited=True),
     "forget_run": Policy("operate", "body"),
     "compare": Policy("read", "body"),
-    "list_calibrations": Policy("read", "query"),
-    "start_calibration": Policy("operate", "body"),
-    # Of tokens that are bound to spacecraft only calibrations of these: see the handlers.
-    "get_calibration": Policy("read", "nothing"),
-    "try_calibration": Policy("read", "nothing"),
-    "adopt_calibration": Policy("operate", "nothing"),
-    "get_calibration_in_force": Policy("read", "path"),
-    "revert_calibration": Policy("operate", "path"),
     "list_annotations": Policy("read", "query"),
     "add_annotation": Policy("operate", "body"),
     # Of tokens that are bound to spacecraft only notes on these: see the handler.

@@ -17,9 +17,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from service.calibration.elimination import NotObservable
-from service.calibration.stars import Indices
 from service.errors import BadInput, Fault
+from service.features.calibration.elimination import NotObservable
+from service.features.calibration.stars import Indices
 from service.missions.mission import AS_MEASURED, Magnitudes, Tracker
 from service.vectors import Matrix, Vector
 

@@ -1,6 +1,5 @@
 """Trackers calibrated from recorded batches, and what is recorded and shown of it."""
 
-import hashlib
 import math
 import time
 import tomllib
@@ -9,37 +8,38 @@ from dataclasses import dataclass
 from itertools import chain
 from typing import Any
 
-import msgspec
 import numpy as np
 from msgspec import structs
 
 from service.acquire import Acquisition
+from service.app.adoptions import geometry_of
 from service.app.context import Context
-from service.calibration.elimination import NotObservable
-from service.calibration.estimate import (
+from service.contract.calibration import TrackerGeometry
+from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.features.calibration import records
+from service.features.calibration.elimination import NotObservable
+from service.features.calibration.estimate import (
     Calibration,
     HeldOut,
     calibrate,
     calibrate_with_chosen_degree,
 )
-from service.calibration.evidence import identified_magnitudes, identified_stars
-from service.calibration.linearise import LARGEST_DEGREE, Model
-from service.calibration.magnitudes import (
+from service.features.calibration.evidence import identified_magnitudes, identified_stars
+from service.features.calibration.linearise import LARGEST_DEGREE, Model
+from service.features.calibration.magnitudes import (
     UNITS,
     MagnitudeCalibration,
     MagnitudeStars,
     calibrate_magnitudes,
     calibrated_settings,
 )
-from service.calibration.magnitudes import joined as joined_magnitudes
-from service.calibration.mission_file import Lines, magnitude_lines, tracker_lines
-from service.calibration.stars import IdentifiedStars, joined
-from service.errors import BadInput, Busy, Fault, Stopping, shown_value
+from service.features.calibration.magnitudes import joined as joined_magnitudes
+from service.features.calibration.mission_file import Lines, magnitude_lines, tracker_lines
+from service.features.calibration.stars import IdentifiedStars, joined
 from service.ingest.submit import SubmissionService
-from service.missions.mission import AS_MEASURED, Magnitudes, Mission, Tracker
 from service.missions.mission import Calibration as FocalPlaneSettings
+from service.missions.mission import Magnitudes, Mission, Tracker
 from service.observations.batch import ObservationBatch
-from service.storage import calibrations
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.results import sample_batches
 from service.storage.recording.unsaved_result import LIVE
@@ -220,11 +220,11 @@ MAP_CELLS = 12
 """Cells of a residual map across the field of view."""
 
 
-def result_of(run: CalibrationRun) -> calibrations.CalibrationResult:
+def result_of(run: CalibrationRun) -> records.CalibrationResult:
     """A calibration as a record, without its covariance."""
     found = run.found
-    return calibrations.CalibrationResult(
-        batches=calibrations.CalibrationBatches(
+    return records.CalibrationResult(
+        batches=records.CalibrationBatches(
             total=run.total,
             sampled=run.sampled,
             used=run.used,
@@ -236,7 +236,7 @@ def result_of(run: CalibrationRun) -> calibrations.CalibrationResult:
         stars_left_out=int(np.sum(~found.used)),
         degree=found.model.degree,
         held_out=[
-            calibrations.CalibrationHeldOut(
+            records.CalibrationHeldOut(
                 degree=each.degree,
                 residual_over_sigma=each.residual_over_sigma,
                 chosen=each.chosen,
@@ -247,7 +247,7 @@ def result_of(run: CalibrationRun) -> calibrations.CalibrationResult:
         residuals=residuals_by_tracker(found),
         unknowns=unknowns_of(run),
         not_observable=[
-            calibrations.CalibrationNotObservable(name=each.name, reason=each.reason)
+            records.CalibrationNotObservable(name=each.name, reason=each.reason)
             for each in not_observable_of(run)
         ],
         notes=notes(run),
@@ -257,12 +257,12 @@ def result_of(run: CalibrationRun) -> calibrations.CalibrationResult:
     )
 
 
-def unknowns_of(run: CalibrationRun) -> list[calibrations.CalibrationUnknown]:
+def unknowns_of(run: CalibrationRun) -> list[records.CalibrationUnknown]:
     """The names of the estimated parameters, in the order of the covariance."""
     found = run.found
     names = [each.name for each in found.stars.trackers]
     of_positions = [
-        calibrations.CalibrationUnknown(
+        records.CalibrationUnknown(
             name=unknown.name,
             tracker=names[unknown.tracker],
             kind=unknown.kind,
@@ -273,7 +273,7 @@ def unknowns_of(run: CalibrationRun) -> list[calibrations.CalibrationUnknown]:
         for unknown, value, sigma in zip(found.unknowns, found.value, found.sigma, strict=True)
     ]
     return of_positions + [
-        calibrations.CalibrationUnknown(
+        records.CalibrationUnknown(
             name=f"{names[each.tracker]} {name}",
             tracker=names[each.tracker],
             kind="magnitude",
@@ -292,7 +292,7 @@ def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
     return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
 
-def residuals_by_tracker(found: Calibration) -> list[calibrations.CalibrationResiduals]:
+def residuals_by_tracker(found: Calibration) -> list[records.CalibrationResiduals]:
     """The rms of each tracker's residuals of used stars, before and after."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     rows = []
@@ -300,7 +300,7 @@ def residuals_by_tracker(found: Calibration) -> list[calibrations.CalibrationRes
         own = found.used & (found.stars.tracker == index)
         if own.any():
             rows.append(
-                calibrations.CalibrationResiduals(
+                records.CalibrationResiduals(
                     tracker=tracker.name,
                     stars=int(own.sum()),
                     before_arcsec=_rms((found.before * sigma_arcsec)[own]),
@@ -332,7 +332,7 @@ def _colors_differ(run: CalibrationRun) -> bool:
     return max(colors) - min(colors) > least
 
 
-def _maps(found: Calibration) -> Iterator[calibrations.ResidualMap]:
+def _maps(found: Calibration) -> Iterator[records.ResidualMap]:
     """The mean residuals of used stars in the cells of each tracker's focal plane."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     both = np.hstack([found.before * sigma_arcsec, found.residual * sigma_arcsec])
@@ -348,12 +348,12 @@ def _maps(found: Calibration) -> Iterator[calibrations.ResidualMap]:
         sums = np.zeros((len(places), 4))
         np.add.at(sums, inverse.reshape(-1), both[own])
         means = np.round(sums / counts[:, None], 4)
-        yield calibrations.ResidualMap(
+        yield records.ResidualMap(
             tracker=tracker.name,
             radius_deg=radius,
             step_deg=step,
             cells=[
-                calibrations.ResidualCell(
+                records.ResidualCell(
                     h_deg=round((place[0] + 0.5) * step - radius, 6),
                     v_deg=round((place[1] + 0.5) * step - radius, 6),
                     stars=int(count),
@@ -365,57 +365,9 @@ def _maps(found: Calibration) -> Iterator[calibrations.ResidualMap]:
         )
 
 
-def geometry_of(tracker: Tracker) -> calibrations.TrackerGeometry:
-    """Alignment, focal plane and magnitudes of a tracker."""
-    plane = tracker.calibration
-    return calibrations.TrackerGeometry(
-        name=tracker.name,
-        x_axis_body=list(tracker.x_axis_body),
-        y_axis_body=list(tracker.y_axis_body),
-        z_axis_body=list(tracker.z_axis_body),
-        calibration=calibrations.FocalPlane(
-            scale=plane.scale,
-            h_terms=[list(each) for each in plane.h_terms],
-            v_terms=[list(each) for each in plane.v_terms],
-        ),
-        magnitudes=calibrations.TrackerMagnitudes(**tracker.magnitudes.model_dump()),
-    )
-
-
-def geometry_digest(mission: Mission) -> str:
-    """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
-    geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
-    for each, tracker in zip(geometries, mission.trackers, strict=True):
-        # Adoptions of versions without magnitudes hold the digest of the rest.
-        if tracker.magnitudes == AS_MEASURED:
-            del each["magnitudes"]
-    return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
-
-
-def with_geometry(mission: Mission, trackers: Sequence[calibrations.TrackerGeometry]) -> Mission:
-    """The mission with the calibrations of these trackers; those not named stay as they are."""
-    named = {each.name: each for each in trackers}
-    changed = tuple(
-        _with(each, named[each.name]) if each.name in named else each for each in mission.trackers
-    )
-    return mission.model_copy(update={"trackers": changed})
-
-
-def _with(tracker: Tracker, geometry: calibrations.TrackerGeometry) -> Tracker:
-    fields = msgspec.to_builtins(geometry)
-    if geometry.magnitudes is None:
-        del fields["magnitudes"]
-    settings = {
-        **tracker.model_dump(exclude={"camera"}),
-        **fields,
-        "camera": tracker.camera,
-    }
-    return Tracker.model_validate(settings)
-
-
 def calibrated_geometry(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
-) -> list[calibrations.TrackerGeometry]:
+) -> list[TrackerGeometry]:
     """Every tracker of a mission with what a calibration changes of it."""
     return [
         _calibrated_tracker(
@@ -426,9 +378,7 @@ def calibrated_geometry(
     ]
 
 
-def _calibrated_tracker(
-    tracker: Tracker, changes: dict[str, Lines]
-) -> calibrations.TrackerGeometry:
+def _calibrated_tracker(tracker: Tracker, changes: dict[str, Lines]) -> TrackerGeometry:
     own: dict[str, Any] = {
         name: tuple(value) for name, value in _values(changes["tracker"]).items()
     }

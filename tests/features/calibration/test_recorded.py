@@ -4,10 +4,11 @@ import json
 
 import pytest
 
-from service.app.calibration_estimates import CalibrationRequest
 from service.errors import NotFound, WrongState
+from service.features.calibration.estimates import CalibrationRequest
+from service.features.calibration.part import Calibrations
 from service.observations.schema import submission_from_json
-from tests.calibration.wrong_file import TURNED_ARCSEC, true_batches, write_mission_files
+from tests.features.calibration.wrong_file import TURNED_ARCSEC, true_batches, write_mission_files
 from tests.storage.conftest import opened
 
 __all__ = ["opened"]
@@ -33,7 +34,7 @@ def app(opened, folder, sky):
 
 def recorded(app):
     wanted = CalibrationRequest("TWO")
-    return app.calibrations.record(wanted, app.calibrations.of_spacecraft(wanted), WHO)
+    return app.part(Calibrations).record(wanted, app.part(Calibrations).of_spacecraft(wanted), WHO)
 
 
 def told(app, first):
@@ -46,7 +47,7 @@ def told(app, first):
 
 def test_what_is_recorded_is_read_again_and_tried(app):
     found = recorded(app)
-    assert app.calibrations.get(found.id) == found
+    assert app.part(Calibrations).get(found.id) == found
     assert (found.version, found.state, found.who) == (1, "done", WHO)
     assert found.result.batches.used == BATCHES
     assert len(found.covariance) == len(found.result.unknowns)
@@ -54,8 +55,8 @@ def test_what_is_recorded_is_read_again_and_tried(app):
     assert {"alignment", "scale", "magnitude"} <= kinds
     second = recorded(app)
     assert second.version == 2
-    assert [each.version for each in app.calibrations.page("TWO").items] == [2, 1]
-    tried = app.calibrations.trial(found.id, sample=BATCHES)
+    assert [each.version for each in app.part(Calibrations).page("TWO").items] == [2, 1]
+    tried = app.part(Calibrations).trial(found.id, sample=BATCHES)
     assert tried.compared == BATCHES
     assert tried.b.suspect <= 1 < tried.a.suspect
 
@@ -64,10 +65,10 @@ def test_each_change_is_in_force_at_once_after_a_restart_and_an_event(app, opene
     file = app.missions["TWO"].digest
     found = recorded(app)
     first = app.events.last()
-    adopted = app.adoptions.adopt(found.id, WHO, "after the first pass")
+    adopted = app.part(Calibrations).adopt(found.id, WHO, "after the first pass")
     assert app.missions["TWO"].digest == adopted.mission != file
     with pytest.raises(WrongState):
-        app.adoptions.adopt(found.id, WHO)
+        app.part(Calibrations).adopt(found.id, WHO)
     app.close()
     app = opened(missions=folder)
     assert app.missions["TWO"].digest == adopted.mission
@@ -94,7 +95,7 @@ def test_reprocessing_uses_what_was_adopted_and_the_record_stays_as_it_was(app):
     found = recorded(app)
     before = app.spacecraft.history("TWO", quantities=["suspect_share"], strategy="latest").series
     assert sum(before["suspect_share"].value) > 0.8 * BATCHES
-    adopted = app.adoptions.adopt(found.id, WHO)
+    adopted = app.part(Calibrations).adopt(found.id, WHO)
     progress = app.runs.reprocess("calibrated", spacecraft="TWO", processes=1)
     assert (progress.recorded, progress.refused) == (BATCHES, 0)
     after = app.spacecraft.history(

@@ -7,13 +7,14 @@ from contextlib import closing
 import httpx
 import pytest
 
-from service.app.calibration_estimates import CalibrationRequest
 from service.app.factory import open_app
+from service.features.calibration.estimates import CalibrationRequest
+from service.features.calibration.part import Calibrations
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
 from service.web.app import create_app
-from tests.calibration.wrong_file import (
+from tests.features.calibration.wrong_file import (
     CALIBRATION,
     TURNED_ARCSEC,
     true_batches,
@@ -235,11 +236,11 @@ def test_too_few_stars_end_it_as_failed_and_it_cannot_be_adopted(client):
 
 def test_a_stopping_service_leaves_none_that_looks_unfinished(copy, folder):
     app = serve(folder, copy)
-    begun = app.calibrations.start(CalibrationRequest("TWO"), "J. Operator")
+    begun = app.part(Calibrations).start(CalibrationRequest("TWO"), "J. Operator")
     app.close()
     app = serve(folder, copy)
-    app.calibrations.interrupt()
-    left = app.calibrations.get(begun.id)
+    app.part(Calibrations).interrupt()
+    left = app.part(Calibrations).get(begun.id)
     app.close()
     assert left.state == "interrupted"
     assert left.ended is not None

@@ -8,21 +8,41 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.access import Caller
-from service.app.calibration_estimates import CALIBRATION_SAMPLE, CalibrationRequest
 from service.app.results import COMPARE_SAMPLE
-from service.calibration.linearise import LARGEST_DEGREE
+from service.contract.calibration import CalibrationAdoption, CalibrationInForce
 from service.contract.runs import Comparison
 from service.errors import NotFound, shown_value
+from service.features.calibration import records as models
+from service.features.calibration.estimates import CALIBRATION_SAMPLE, CalibrationRequest
+from service.features.calibration.linearise import LARGEST_DEGREE
+from service.features.calibration.part import Calibrations
 from service.observations.schema import Key, RunName, Wire
-from service.storage import calibrations as models
 from service.web.api.batches import COMPARISON_S, SampleSize
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AppDep, CallerDep, ChangeDep, json_response, page_response
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    ChangeDep,
+    Policy,
+    json_response,
+    page_response,
+)
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("calibrations")
+ROUTERS = (router,)
+POLICIES = {
+    "list_calibrations": Policy("read", "query"),
+    "start_calibration": Policy("operate", "body"),
+    # Of tokens that are bound to spacecraft only calibrations of these: see the handlers.
+    "get_calibration": Policy("read", "nothing"),
+    "try_calibration": Policy("read", "nothing"),
+    "adopt_calibration": Policy("operate", "nothing"),
+    "get_calibration_in_force": Policy("read", "path"),
+    "revert_calibration": Policy("operate", "path"),
+}
 
 CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
 
@@ -124,7 +144,7 @@ def list_calibrations(
     request: Request, query: FromQuery[CalibrationQuery], app: AppDep
 ) -> Response:
     """Calibrations without covariances and residual maps, newest first."""
-    return page_response(request, app.calibrations.page(**query.asked()))
+    return page_response(request, app.part(Calibrations).page(**query.asked()))
 
 
 @router.serves(
@@ -137,7 +157,9 @@ def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Respons
     """Estimate alignment, scale and distortion of trackers; no setting is changed."""
     asked = read_model(CalibrationIn, body)
     change.caller.require(asked.spacecraft)
-    begun = app.calibrations.start(asked.request(), change.author(asked.who), change.entry(202))
+    begun = app.part(Calibrations).start(
+        asked.request(), change.author(asked.who), change.entry(202)
+    )
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
@@ -157,12 +179,12 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
     """Process recorded batches again with and without a calibration; nothing is recorded."""
     asked = read_model(CalibrationTrialIn, body)
     _visible(app, id, caller)
-    return json_response(app.calibrations.trial(id, **vars(asked), limit_s=COMPARISON_S))
+    return json_response(app.part(Calibrations).trial(id, **vars(asked), limit_s=COMPARISON_S))
 
 
 @router.serves(
     "POST /calibrations/{id}/adopt",
-    Returns("The adoption.", models.CalibrationAdoption),
+    Returns("The adoption.", CalibrationAdoption),
     body=CalibrationAdoptIn,
     problems=(409,),
 )
@@ -173,12 +195,12 @@ def adopt_calibration(
     asked = read_model(CalibrationAdoptIn, body)
     _visible(app, id, change.caller)
     who = change.author(asked.who)
-    return json_response(app.adoptions.adopt(id, who, asked.note, change.entry()))
+    return json_response(app.part(Calibrations).adopt(id, who, asked.note, change.entry()))
 
 
 @router.serves(
     "GET /spacecraft/{name}/calibration",
-    Returns("The calibration in force.", models.CalibrationInForce),
+    Returns("The calibration in force.", CalibrationInForce),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
     """The calibration that new batches use, and what held when."""
@@ -187,7 +209,7 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
 
 @router.serves(
     "POST /spacecraft/{name}/calibration/revert",
-    Returns("The change.", models.CalibrationAdoption),
+    Returns("The change.", CalibrationAdoption),
     body=CalibrationRevertIn,
     problems=(409,),
 )
@@ -202,7 +224,7 @@ def revert_calibration(
 
 def _visible(app: AppDep, id: str, caller: Caller) -> models.Calibration:
     """A calibration of the caller's spacecraft; raises `NotFound` for those of others."""
-    found = app.calibrations.get(id)
+    found = app.part(Calibrations).get(id)
     if not caller.may_see(found.spacecraft):
         raise NotFound(f"there is no calibration with the id {shown_value(id)}")
     return found

@@ -1,5 +1,6 @@
-"""Calibrations in the records: what was found, and what an operator adopted of it."""
-# Written by `make client` from service/storage/calibrations.py.
+"""Calibrations of trackers: what is in force, and what held before."""
+# Written by `make client` from service/contract/calibration.py and
+# service/features/calibration/records.py.
 
 from collections.abc import Sequence
 from typing import Any
@@ -35,6 +36,39 @@ class TrackerGeometry(Model, frozen=True, kw_only=True):
     calibration: FocalPlane
     magnitudes: TrackerMagnitudes | None = None
     """None: as the mission file has them (earlier versions)."""
+
+
+class CalibrationAdoption(Model, frozen=True, kw_only=True):
+    """A change of the calibration in force, by whom and when."""
+
+    id: str
+    spacecraft: str
+    adopted: str
+    who: str
+    note: str
+    calibration: str | None
+    """None: back to the mission file."""
+    version: int | None
+    """The version of the calibration."""
+    file: str
+    """The mission file's own settings at that time."""
+    mission: str
+    """The settings in force since then."""
+    trackers: Sequence[TrackerGeometry] | None
+
+
+class CalibrationInForce(Model, frozen=True, kw_only=True):
+    """The calibration that new batches of a spacecraft use, and what held before."""
+
+    spacecraft: str
+    mission: str
+    """The settings in force."""
+    calibration: str | None
+    """None: the mission file holds."""
+    overridden: bool
+    """True if the mission file was changed after the adoption, so that it holds."""
+    history: Sequence[CalibrationAdoption]
+    """Newest first."""
 
 
 class CalibrationBatches(Model, frozen=True, kw_only=True):
@@ -178,36 +212,3 @@ class Calibration(CalibrationProgress, frozen=True, kw_only=True):
     result: CalibrationResult | None
     covariance: Sequence[Sequence[float]] | None
     """Covariance of the unknowns, in their order and units."""
-
-
-class CalibrationAdoption(Model, frozen=True, kw_only=True):
-    """A change of the calibration in force, by whom and when."""
-
-    id: str
-    spacecraft: str
-    adopted: str
-    who: str
-    note: str
-    calibration: str | None
-    """None: back to the mission file."""
-    version: int | None
-    """The version of the calibration."""
-    file: str
-    """The mission file's own settings at that time."""
-    mission: str
-    """The settings in force since then."""
-    trackers: Sequence[TrackerGeometry] | None
-
-
-class CalibrationInForce(Model, frozen=True, kw_only=True):
-    """The calibration that new batches of a spacecraft use, and what held before."""
-
-    spacecraft: str
-    mission: str
-    """The settings in force."""
-    calibration: str | None
-    """None: the mission file holds."""
-    overridden: bool
-    """True if the mission file was changed after the adoption, so that it holds."""
-    history: Sequence[CalibrationAdoption]
-    """Newest first."""

@@ -24,8 +24,8 @@ import numpy as np
 import numpy.typing as npt
 from numpy.polynomial.legendre import legvander
 
-from service.calibration.stars import IdentifiedStars, Indices
 from service.errors import BadInput, Fault, shown_value
+from service.features.calibration.stars import IdentifiedStars, Indices
 from service.missions.mission import Tracker
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about
 

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.polynomial.legendre import leg2poly
 
-from service.calibration.estimate import Calibration
-from service.calibration.linearise import SKEW, STRETCH, Unknown
 from service.errors import BadConfiguration
+from service.features.calibration.estimate import Calibration
+from service.features.calibration.linearise import SKEW, STRETCH, Unknown
 from service.missions.mission import Magnitudes, Mission, Tracker, parse_mission
 from service.vectors import ARCSEC_PER_RADIAN, Matrix, rotate_about
 

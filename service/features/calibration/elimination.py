@@ -13,8 +13,8 @@ from itertools import pairwise
 import numpy as np
 import numpy.typing as npt
 
-from service.calibration.linearise import Kind, Linearised, Unknown, Weights, largest_sigma
-from service.calibration.stars import Indices
+from service.features.calibration.linearise import Kind, Linearised, Unknown, Weights, largest_sigma
+from service.features.calibration.stars import Indices
 from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
-from service.calibration.estimate import calibrate
-from service.calibration.evidence import identified_magnitudes, identified_stars
-from service.calibration.linearise import Model
-from service.calibration.magnitudes import (
+from service.features.calibration.estimate import calibrate
+from service.features.calibration.evidence import identified_magnitudes, identified_stars
+from service.features.calibration.linearise import Model
+from service.features.calibration.magnitudes import (
     COLOR,
     SCALE,
     UNITS,
@@ -20,8 +20,8 @@ from service.calibration.magnitudes import (
     calibrated_settings,
     joined,
 )
-from service.calibration.mission_file import calibrated_mission_text
-from service.calibration.stars import joined as joined_stars
+from service.features.calibration.mission_file import calibrated_mission_text
+from service.features.calibration.stars import joined as joined_stars
 from service.missions.mission import Magnitudes, parse_mission
 from service.observations.schema import submission_from_json
 from service.simulate.stretches import NO_TROUBLES, Pass
@@ -29,7 +29,7 @@ from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.model import SkyModel
-from tests.calibration.wrong_file import mission_texts
+from tests.features.calibration.wrong_file import mission_texts
 
 SEED = 11
 """Any other must do as well."""

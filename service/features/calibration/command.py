@@ -10,7 +10,7 @@ from service.cli.arguments import period_of, progress_bar, settings_of_existing
 from service.errors import BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
-    from service.app.calibration_estimates import CalibrationRun
+    from service.features.calibration.estimates import CalibrationRun
 
 RECORDED_BY = "acquire calibrate"
 """The author of a calibration that the command records."""
@@ -75,9 +75,10 @@ def run(parsed: Namespace) -> int:
     acquire calibrate TWOHEADS --record
     acquire calibrate TWOHEADS --start 1999-060T00:00:00Z --degree 3 --time-tag --json
     """
-    from service.app.calibration_estimates import CalibrationRequest
     from service.app.factory import open_app
-    from service.cli.texts import calibration_json, calibration_text
+    from service.features.calibration.estimates import CalibrationRequest
+    from service.features.calibration.part import Calibrations
+    from service.features.calibration.text import calibration_json, calibration_text
     from service.missions.mission import mission_named
 
     start, end = period_of(parsed)
@@ -95,11 +96,11 @@ def run(parsed: Namespace) -> int:
     with closing(open_app(settings_of_existing(parsed), reads_only=not parsed.record)) as app:
         wanted.require(mission_named(app.missions, parsed.spacecraft), "--tracker")
         with progress_bar("batches", "running again", parsed.quiet, leave=True) as bar:
-            result = app.calibrations.of_spacecraft(
+            result = app.part(Calibrations).of_spacecraft(
                 wanted, lambda done, total: bar(bar.done + 1, total)
             )
         if parsed.record:
-            recorded = app.calibrations.record(wanted, result, RECORDED_BY)
+            recorded = app.part(Calibrations).record(wanted, result, RECORDED_BY)
     if parsed.json:
         arguments.print_json(calibration_json(result))
     else:
@@ -112,7 +113,7 @@ def run(parsed: Namespace) -> int:
 
 
 def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
-    from service.calibration.mission_file import calibrated_mission_text
+    from service.features.calibration.mission_file import calibrated_mission_text
 
     source = _mission_file(parsed)
     if parsed.output.exists() and parsed.output.samefile(source):

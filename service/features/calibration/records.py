@@ -1,4 +1,4 @@
-"""Calibrations in the records: what was found, and what an operator adopted of it."""
+"""Calibrations in the records: what was asked, how far they are, and what was found."""
 
 import json
 from collections.abc import Collection
@@ -6,10 +6,9 @@ from typing import Annotated, ClassVar, Literal
 
 import msgspec
 from pydantic import Field
-from sqlalchemy import Connection, Select, func, insert, select, update
+from sqlalchemy import Connection, func, insert, select, update
 
 from service.contract.base import (
-    Components,
     Count,
     Digest,
     Id,
@@ -21,48 +20,14 @@ from service.contract.base import (
     doc,
     page_record,
 )
+from service.contract.calibration import TrackerGeometry
 from service.errors import NotFound, shown_value
-from service.storage.recording.ids import following_ulid
 from service.storage.sql.columns import Row
-from service.storage.sql.dialects import dialect_of
-from service.storage.sql.statements import execute, rows_of
-from service.storage.sql.tables import calibration_adoptions, calibrations
+from service.storage.sql.statements import rows_of
+from service.storage.sql.tables import calibrations
 
 CalibrationStateName = Literal["queued", "running", "done", "failed", "interrupted"]
 UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_tag", "magnitude"]
-Terms = Annotated[
-    list[Components],
-    doc("Powers of the measured h and v in degrees, and the coefficient, as in mission files."),
-]
-
-
-class FocalPlane(Record, frozen=True, kw_only=True):
-    """A tracker's focal-plane calibration, as in mission files."""
-
-    scale: float
-    h_terms: Terms
-    v_terms: Terms
-
-
-class TrackerMagnitudes(Record, frozen=True, kw_only=True):
-    """A tracker's magnitude calibration, as in mission files."""
-
-    zero_mag: float
-    scale: float
-    color_mag: float
-
-
-class TrackerGeometry(Record, frozen=True, kw_only=True):
-    """Alignment, focal plane and magnitudes of a tracker, as in mission files."""
-
-    name: str
-    x_axis_body: Components
-    y_axis_body: Components
-    z_axis_body: Components
-    calibration: FocalPlane
-    magnitudes: Annotated[
-        TrackerMagnitudes | None, doc("Null: as the mission file has them (earlier versions).")
-    ] = None
 
 
 class CalibrationBatches(Record, frozen=True, kw_only=True):
@@ -195,37 +160,8 @@ CalibrationPage = page_record(
 )
 
 
-class CalibrationAdoption(Record, frozen=True, kw_only=True):
-    """A change of the calibration in force, by whom and when."""
-
-    id: Id
-    spacecraft: str
-    adopted: Stamp
-    who: str
-    note: str
-    calibration: Annotated[Id | None, doc("Null: back to the mission file.")]
-    version: Annotated[Count | None, doc("The version of the calibration.")]
-    file: Annotated[Digest, doc("The mission file's own settings at that time.")]
-    mission: Annotated[Digest, doc("The settings in force since then.")]
-    trackers: list[TrackerGeometry] | None
-
-
-class CalibrationInForce(Record, frozen=True, kw_only=True):
-    """The calibration that new batches of a spacecraft use, and what held before."""
-
-    spacecraft: str
-    mission: Annotated[Digest, doc("The settings in force.")]
-    calibration: Annotated[Id | None, doc("Null: the mission file holds.")]
-    overridden: Annotated[
-        bool, doc("True if the mission file was changed after the adoption, so that it holds.")
-    ]
-    history: Annotated[list[CalibrationAdoption], doc("Newest first.")]
-
-
-_GEOMETRIES = msgspec.json.Decoder(list[TrackerGeometry])
 _RESULT = msgspec.json.Decoder(CalibrationResult)
 UNFINISHED = ("queued", "running")
-_NEWEST_ADOPTION = "SELECT max(id) FROM calibration_adoptions"
 _PLAIN = (*(n for n in CalibrationProgress.__struct_fields__ if n != "mission"), "fault")
 _SUMMARY = tuple(calibrations.c[name] for name in (*_PLAIN, "mission_digest", "result"))
 
@@ -301,64 +237,4 @@ def _summary(row: Row) -> CalibrationSummary:
         last=None if found is None else found.batches.last,
         unknowns=found.unknowns if found else [],
         trackers=found.trackers if found else [],
-    )
-
-
-def add_adoption(connection: Connection, row: Row) -> None:
-    """Record a change of the calibration in force."""
-    connection.execute(insert(calibration_adoptions), row)
-
-
-def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationAdoption]:
-    """What a spacecraft's calibration was from when on, newest first."""
-    query = _adoptions().where(calibration_adoptions.c.spacecraft == spacecraft)
-    return [_adoption(row) for row in rows_of(connection, query)]
-
-
-def newest_adoption(connection: Connection) -> str:
-    """The id of the last change of any spacecraft; empty where there was none."""
-    ((newest,),) = execute(connection, _NEWEST_ADOPTION)
-    return newest or ""
-
-
-def begin_adoption(connection: Connection, id: str) -> str:
-    """An id for a change, at least this one: it follows all others, whatever clocks say.
-
-    Until the end of the transaction no other process adds one.
-    """
-    dialect_of(connection).lock_table(connection, calibration_adoptions.name)
-    newest = newest_adoption(connection)
-    return id if id > newest else following_ulid(newest)
-
-
-def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:
-    """The last change of every spacecraft."""
-    latest = select(func.max(calibration_adoptions.c.id)).group_by(
-        calibration_adoptions.c.spacecraft
-    )
-    query = _adoptions().where(calibration_adoptions.c.id.in_(latest))
-    return [_adoption(row) for row in rows_of(connection, query)]
-
-
-def _adoptions() -> Select[tuple[object, ...]]:
-    return (
-        select(calibration_adoptions, calibrations.c.version)
-        .join_from(
-            calibration_adoptions,
-            calibrations,
-            calibration_adoptions.c.calibration_id == calibrations.c.id,
-            isouter=True,
-        )
-        .order_by(calibration_adoptions.c.id.desc())
-    )
-
-
-def _adoption(row: Row) -> CalibrationAdoption:
-    trackers = row["trackers"]
-    return CalibrationAdoption(
-        **{name: row[name] for name in ("id", "spacecraft", "adopted", "who", "note", "version")},
-        calibration=row["calibration_id"],
-        file=row["file_digest"],
-        mission=row["mission_digest"],
-        trackers=None if trackers is None else _GEOMETRIES.decode(trackers),
     )

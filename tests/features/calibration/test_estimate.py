@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from service.calibration.elimination import eliminate
-from service.calibration.estimate import calibrate, calibrate_with_chosen_degree
-from service.calibration.linearise import (
+from service.errors import BadInput
+from service.features.calibration.elimination import eliminate
+from service.features.calibration.estimate import calibrate, calibrate_with_chosen_degree
+from service.features.calibration.linearise import (
     Model,
     linearised,
     prepared,
@@ -13,9 +14,8 @@ from service.calibration.linearise import (
     turned_attitudes,
     unknowns_of,
 )
-from service.errors import BadInput
 from tests import scale
-from tests.calibration.drawn import (
+from tests.features.calibration.drawn import (
     MISALIGNED,
     TRACKERS,
     Truth,

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.polynomial.legendre import legval2d
 from scipy.spatial.transform import Rotation
 
-from service.calibration.linearise import Model
-from service.calibration.stars import IdentifiedStars
+from service.features.calibration.linearise import Model
+from service.features.calibration.stars import IdentifiedStars
 from service.missions.mission import Tracker
 
 ARCSEC = np.pi / 180.0 / 3600.0

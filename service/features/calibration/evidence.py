@@ -7,9 +7,9 @@ import numpy as np
 
 from service.acquire import Acquisition
 from service.acquire.choices import aberration_velocity
-from service.calibration.elimination import Marks
-from service.calibration.magnitudes import MagnitudeStars, joined
-from service.calibration.stars import IdentifiedStars, Indices
+from service.features.calibration.elimination import Marks
+from service.features.calibration.magnitudes import MagnitudeStars, joined
+from service.features.calibration.stars import IdentifiedStars, Indices
 from service.identify.attitude_from_matches import matched_vectors
 from service.observations.batch import TrackerStars
 from service.observations.focal_plane import tracker_vectors

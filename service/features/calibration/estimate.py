@@ -11,8 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from service.calibration import linearise
-from service.calibration.elimination import (
+from service.errors import BadInput, Fault
+from service.features.calibration import linearise
+from service.features.calibration.elimination import (
     Eliminated,
     Marks,
     Normal,
@@ -22,9 +23,8 @@ from service.calibration.elimination import (
     not_observable,
     observable,
 )
-from service.calibration.linearise import Model, Unknown, unknowns_of
-from service.calibration.stars import IdentifiedStars, Indices
-from service.errors import BadInput, Fault
+from service.features.calibration.linearise import Model, Unknown, unknowns_of
+from service.features.calibration.stars import IdentifiedStars, Indices
 from service.vectors import Matrix, Vector
 
 ROUNDS, LINEARISATIONS = 30, 6

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.missions.mission import read_mission
-from tests.calibration.wrong_file import write_mission_files
+from tests.features.calibration.wrong_file import write_mission_files
 
 BATCHES = 60
 

@@ -5,7 +5,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.web.app import create_app
-from tests.calibration.wrong_file import true_batches, with_true_file, write_mission_files
+from tests.features.calibration.wrong_file import true_batches, with_true_file, write_mission_files
 from tests.fresh_databases import sqlite_at
 from tests.web.browser import CHROMIUM
 from tests.web.fitting import faults

@@ -11,17 +11,20 @@ import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
-from service.app.calibration_estimates import CALIBRATION_SAMPLE, geometry_of
-from service.calibration.linearise import LARGEST_DEGREE
-from service.calibration.magnitudes import COLOR, SCALE
+from service.app.adoptions import geometry_of
+from service.contract.calibration import TrackerGeometry
 from service.errors import NotFound
+from service.features.calibration.estimates import CALIBRATION_SAMPLE
+from service.features.calibration.focal_plane import residual_pictures
+from service.features.calibration.linearise import LARGEST_DEGREE
+from service.features.calibration.magnitudes import COLOR, SCALE
+from service.features.calibration.part import Calibrations
+from service.features.calibration.records import Calibration, CalibrationSummary
 from service.missions.mission import AS_MEASURED, Mission
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
-from service.storage.calibrations import Calibration, CalibrationSummary, TrackerGeometry
 from service.storage.recording.unsaved_result import LIVE
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN
-from service.web.console.charts.focal_plane import residual_pictures
 from service.web.console.page import ContextDep, FromQuery, PageContext, PageQuery, console_page
 from service.web.requests.access import Policy
 
@@ -170,8 +173,8 @@ def calibration_page(
     """Residual maps, parameters and their history, and what was adopted when."""
     app = context.app
     in_force = app.adoptions.in_force(name)
-    versions = app.calibrations.page(name, SHOWN).items
-    shown = _shown(app.calibrations.get, versions, query.version)
+    versions = app.part(Calibrations).page(name, SHOWN).items
+    shown = _shown(app.part(Calibrations).get, versions, query.version)
     result = shown.result if shown else None
     return context.rendered(
         "calibration.html.jinja",

@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
-from service.calibration.estimate import calibrate
-from service.calibration.linearise import Model
-from service.calibration.mission_file import calibrated_mission_text, tracker_lines
 from service.errors import BadConfiguration
+from service.features.calibration.estimate import calibrate
+from service.features.calibration.linearise import Model
+from service.features.calibration.mission_file import calibrated_mission_text, tracker_lines
 from service.missions.mission import parse_mission
 from service.observations.focal_plane import tracker_vectors
-from tests.calibration.drawn import (
+from tests.features.calibration.drawn import (
     MISALIGNED,
     TRACKERS,
     Truth,

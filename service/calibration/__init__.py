@@ -1,1 +1,0 @@
-"""Calibration of trackers from identified stars of many batches: alignment, distortion, time."""
