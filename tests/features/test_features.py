@@ -309,7 +309,7 @@ from service.storage.sql import migrations
 file, first, last = sys.argv[1], *map(int, sys.argv[2:4])
 settings = Settings(database="sqlite:///" + file, replay_processes=0)
 app = open_app(settings)
-drawn = draw_pass(app.missions["XTE"], app.sky, Pass(batches=12, seed=5))
+drawn = list(draw_pass(app.missions["XTE"], app.sky, Pass(batches=12, seed=5)))
 for each in drawn[first:last]:
     print(app.submissions.submit(submission_from_json(json.dumps(each.batch))).body.decode())
 app.close()
@@ -328,8 +328,8 @@ def sent(file, first, last, *command, path=()):
         env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))},
         capture_output=True,
         text=True,
-        check=True,
     )
+    assert run.returncode == 0, run.stderr
     lines = run.stdout.splitlines()
     answers, differs = lines[: last - first], lines[last - first]
     return [json.loads(each) for each in answers], json.loads(differs), lines[last - first + 1 :]

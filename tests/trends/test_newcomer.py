@@ -125,8 +125,8 @@ def test_a_measured_quantity_has_values_of_batches_and_trackers_limits_and_alarm
         cwd=ROOT,
         capture_output=True,
         text=True,
-        check=True,
     )
+    assert run.returncode == 0, run.stderr
     found = json.loads(run.stdout.splitlines()[-1])
     assert found["schema"] == []
     # The batch has the faintest of all its stars, each tracker that of its own.
