@@ -1,14 +1,7 @@
-"""The calibration in force of each spacecraft: adopted and taken back by an operator.
+"""The calibration in force of each spacecraft: adopted and taken back by an operator."""
 
-An adopted calibration lies over the mission file: alignment and focal plane of every
-tracker are those that were adopted, and all other settings the file's.  Where the file's
-own alignments or focal planes have changed since, the file holds.
-"""
-
-import hashlib
 import logging
-import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 
 import msgspec
 from sqlalchemy import Connection
@@ -18,12 +11,11 @@ from service.app.context import Context
 from service.contract.calibration import (
     CalibrationAdoption,
     CalibrationInForce,
-    FocalPlane,
     TrackerGeometry,
-    TrackerMagnitudes,
 )
 from service.errors import NotFound, WrongState, shown_value
-from service.missions.mission import AS_MEASURED, Mission, Tracker, load_missions, mission_named
+from service.ingest.missions_in_force import MissionsInForce, geometry_digest, with_geometry
+from service.missions.mission import Mission, load_missions, mission_named
 from service.storage import adoptions
 from service.storage.recording import events
 from service.storage.recording.ids import Ulids
@@ -36,69 +28,12 @@ EVENT_FIELDS = ("id", "spacecraft", "adopted", "who", "note", "calibration", "ve
 """The fields of a change's event; the others are long."""
 
 
-def adopted_missions(
-    connection: Connection, files: Mapping[str, Mission], leave: str | None = None
-) -> dict[str, Mission]:
-    """The missions of these files with an adopted calibration over them, but for `leave`."""
-    found: dict[str, Mission] = {}
-    for each in adoptions.latest_adoptions(connection):
-        file = files.get(each.spacecraft)
-        if file is None or each.spacecraft == leave or each.trackers is None:
-            continue
-        if each.file != geometry_digest(file):
-            log.warning(
-                "%s: the mission file was changed after calibration version %s was adopted; "
-                "the file holds",
-                each.spacecraft,
-                each.version,
-            )
-            continue
-        found[each.spacecraft] = with_geometry(file, each.trackers)
-    return found
-
-
 class CalibrationAdoptions:
-    """Adopts calibrations, and says what held when.
+    """Adopts calibrations, and says what held when."""
 
-    `context.missions` have what is in force; the settings of the files are kept here.
-    """
-
-    def __init__(self, context: Context, missions_changed: Callable[[], None]) -> None:
-        """`missions_changed` is called after a mission of the context was replaced."""
-        self._context = context
-        self._files = dict(context.missions)
-        self._missions_changed = missions_changed
+    def __init__(self, context: Context, in_force: MissionsInForce) -> None:
+        self._context, self._in_force = context, in_force
         self._ids = Ulids()
-        self._lock = threading.Lock()
-        self._leave: str | None = None
-        self._loaded: str | None = None
-        """The newest adoption when they were loaded; empty where there was none."""
-
-    def follow(self) -> None:
-        """`load` again where another service has adopted one since."""
-        with self._context.reading_record() as connection:
-            self.follow_in(connection)
-
-    def follow_in(self, connection: Connection) -> None:
-        """`follow`, with a connection that sees the record as it is now.
-
-        Each group of posts begins with this: whoever posts after an adoption was answered, by
-        whichever service, is answered with the calibration that was adopted.
-        """
-        if adoptions.newest_adoption(connection) != self._loaded:
-            self.load(self._leave)
-
-    def load(self, leave: str | None = None) -> None:
-        """Put what was adopted over the mission files, but for the spacecraft `leave`."""
-        self._leave = leave
-        with self._lock:
-            before = dict(self._context.missions)
-            with self._context.reading_record() as connection:
-                self._loaded = adoptions.newest_adoption(connection)
-                adopted = adopted_missions(connection, self._files, leave)
-            self._context.missions.update(self._files | adopted)
-            if self._context.missions != before:
-                self._missions_changed()
 
     def in_force(self, spacecraft: str) -> CalibrationInForce:
         """The calibration that new batches use, and every change of it, newest first."""
@@ -157,14 +92,14 @@ class CalibrationAdoptions:
 
     def file_of(self, spacecraft: str) -> Mission:
         """The settings as the mission file has them, whatever was adopted; the last without one."""
-        return self._files.get(spacecraft) or self._context.mission(spacecraft)
+        return self._in_force.files.get(spacecraft) or self._context.mission(spacecraft)
 
     def changed_files(self) -> dict[str, str]:
         """By spacecraft, what the next start would change; raises `BadConfiguration`."""
         settings = self._context.settings
         now = load_missions(*settings.mission_places, shipped=settings.ships_missions)
         found = {}
-        for name, mission in self._files.items():
+        for name, mission in self._in_force.files.items():
             if name not in now:
                 found[name] = "The mission file is gone: the next start retires the spacecraft."
             elif now[name].digest != mission.digest:
@@ -210,60 +145,9 @@ class CalibrationAdoptions:
             events.add_event(connection, "calibration", fields, spacecraft=name)
             return adopted
 
-        self.follow()
-        with self._lock:
+        self._in_force.follow()
+        with self._in_force.replacing(mission):
             if mission_named(self._context.missions, name).digest == mission.digest:
                 raise WrongState("these settings are in force already")
             # Results name the settings by their digest, which is recorded before the first.
-            adopted = self._context.change_audited(change, entry)
-            self._context.missions[name] = mission
-            self._missions_changed()
-        return adopted
-
-
-def geometry_of(tracker: Tracker) -> TrackerGeometry:
-    """Alignment, focal plane and magnitudes of a tracker."""
-    plane = tracker.calibration
-    return TrackerGeometry(
-        name=tracker.name,
-        x_axis_body=list(tracker.x_axis_body),
-        y_axis_body=list(tracker.y_axis_body),
-        z_axis_body=list(tracker.z_axis_body),
-        calibration=FocalPlane(
-            scale=plane.scale,
-            h_terms=[list(each) for each in plane.h_terms],
-            v_terms=[list(each) for each in plane.v_terms],
-        ),
-        magnitudes=TrackerMagnitudes(**tracker.magnitudes.model_dump()),
-    )
-
-
-def geometry_digest(mission: Mission) -> str:
-    """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
-    geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
-    for each, tracker in zip(geometries, mission.trackers, strict=True):
-        # Adoptions of versions without magnitudes hold the digest of the rest.
-        if tracker.magnitudes == AS_MEASURED:
-            del each["magnitudes"]
-    return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
-
-
-def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
-    """The mission with the calibrations of these trackers; those not named stay as they are."""
-    named = {each.name: each for each in trackers}
-    changed = tuple(
-        _with(each, named[each.name]) if each.name in named else each for each in mission.trackers
-    )
-    return mission.model_copy(update={"trackers": changed})
-
-
-def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
-    fields = msgspec.to_builtins(geometry)
-    if geometry.magnitudes is None:
-        del fields["magnitudes"]
-    settings = {
-        **tracker.model_dump(exclude={"camera"}),
-        **fields,
-        "camera": tracker.camera,
-    }
-    return Tracker.model_validate(settings)
+            return self._context.change_audited(change, entry)

@@ -18,6 +18,7 @@ from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Gyro, Spacecraft
 from service.app.zones import Zones
 from service.feature import feature_modules
+from service.ingest.missions_in_force import MissionsInForce
 from service.ingest.spool import Spool
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, load_missions
@@ -73,10 +74,9 @@ class App:
             utc_now,
         )
         self.tokens = Tokens(context, context.missions)
-        self.adoptions = CalibrationAdoptions(context, lambda: self.replays.bulk.workers.restart())
-        self.submissions = SubmissionService(
-            context.missions, context.sky, context.store, kernels, self.adoptions
-        )
+        self.in_force = MissionsInForce(context.missions, context.store)
+        self.adoptions = CalibrationAdoptions(context, self.in_force)
+        self.submissions = SubmissionService(self.in_force, context.sky, context.store, kernels)
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
@@ -87,7 +87,7 @@ class App:
         self.live_filter = LiveFilter(context, kernels)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
-        self.replays = Replays(context, self.submissions, self.gyro.record_many)
+        self.replays = Replays(context, self.in_force, self.submissions, self.gyro.record_many)
         self.zones = Zones(context)
         self.comparisons = Comparisons(context, self.submissions)
         self.events = Events(context)
@@ -179,12 +179,12 @@ def open_app(
     leave = mission.name if mission is not None else None
 
     try:
-        app.adoptions.load(leave)
+        app.in_force.load(leave)
         if not reads_only:
             _register(app.context)
             if store.lock is None:
                 _end_left_work(app)
-        app.single_projector.start(app.adoptions.follow)
+        app.single_projector.start(app.in_force.follow)
         app.projector.start()
     except BaseException:
         app.close()

@@ -9,8 +9,8 @@ import numpy as np
 from sqlalchemy import Connection
 
 from service import __version__
-from service.app.adoptions import adopted_missions
 from service.errors import BadBatch, Fault
+from service.ingest.missions_in_force import adopted_missions
 from service.missions.mission import Mission, load_missions, mission_named
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.products import attitudes as attitude_series

@@ -17,6 +17,7 @@ from service.contract.runs import Replay, ReplayCounts, ReplayLines
 from service.errors import AcquisitionError, Busy, NotFound, Stopping
 from service.ingest.bulk import Bulk, Check, RecordBlocks
 from service.ingest.memory import require_memory_for_replay
+from service.ingest.missions_in_force import MissionsInForce
 from service.ingest.replays import RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
@@ -78,6 +79,7 @@ class Replays:
     def __init__(
         self,
         context: Context,
+        in_force: MissionsInForce,
         submissions: SubmissionService,
         record_blocks: RecordBlocks,
     ) -> None:
@@ -95,6 +97,7 @@ class Replays:
             config,
             context.settings.replay_processes,
         )
+        in_force.when_changed(self.bulk.workers.restart)
         self._spool = Spool(context.settings.spool_folder)
         self._lock = threading.Lock()
         self._replays: list[RunningReplay] = []

@@ -21,13 +21,12 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
-from typing import Generic, Protocol, TypeVar
-
-from sqlalchemy import Connection
+from typing import Generic, TypeVar
 
 from service.errors import AcquisitionError, BeingBuilt, Busy, Stopping
+from service.ingest.missions_in_force import MissionsInForce
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, SolverTask
-from service.ingest.tracking import last_results, with_prediction
+from service.ingest.tracking import predicted_from, with_prediction
 from service.observations.schema import Submission
 from service.sky.cache import NotAtHand
 from service.storage.recording.identity import (
@@ -38,7 +37,7 @@ from service.storage.recording.identity import (
     look_up,
     remember_keys,
 )
-from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
+from service.storage.recording.unsaved_result import LIVE, Answered, PredictedFrom, UnsavedResult
 from service.storage.recording.writer import RETRY_AFTER_S, WriteOutcome, WriterState
 from service.storage.store import Store
 from service.times import Utc, utc_now
@@ -53,13 +52,6 @@ STALLED_S = 20.0
 """A look-up takes at most five seconds, and computing a group much less."""
 
 log = logging.getLogger(__name__)
-
-
-class Adoptions(Protocol):
-    """The calibrations that operators adopt, through any of the services on a database."""
-
-    def follow_in(self, connection: Connection) -> None:
-        """Use what another service has adopted since."""
 
 
 @dataclass(eq=False, slots=True)
@@ -117,12 +109,12 @@ class IngestQueue:
         store: Store,
         pool: SolverPool,
         counts: "RecordedCounts",
-        adoptions: Adoptions | None = None,
+        in_force: MissionsInForce,
     ) -> None:
-        """`adoptions`, of services that share a database, are followed before each group."""
+        """Where services share a database, `in_force` follows it before each group."""
         self._solver, self._store, self._pool = solver, store, pool
         self._counts = counts
-        self._adoptions = adoptions if store.lock is not None else None
+        self._shared_missions = in_force if store.lock is not None else None
         self._changed = threading.Condition()
         self._waiting: deque[PendingBatch] = deque()
         """Those that the thread has to take: new ones, and those that the pool has computed."""
@@ -249,8 +241,8 @@ class IngestQueue:
                     {pending.identity for pending in group},
                     {pending.key for pending in group if pending.key is not None},
                 )
-                if self._adoptions is not None:
-                    self._adoptions.follow_in(connection)
+                if self._shared_missions is not None:
+                    self._shared_missions.follow_in(connection)
         except Busy:
             # Batches that cannot be looked up cannot be written either.
             self._store.writer.note_failure(len(group))
@@ -404,20 +396,16 @@ class IngestQueue:
 
     def _solved_alone(self, pending: PendingBatch) -> UnsavedResult:
         submission = pending.make()
-        is_outdated: Callable[[Connection], bool] | None = None
+        last: PredictedFrom | None = None
         if self._solver.asks_for_last(batch := submission.batch):
             mission = self._solver.missions[batch.spacecraft]
             with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
                 if self._store.lock is not None:
                     # Other services record attitudes of this spacecraft, too.
-                    last = last_results(connection, batch, mission)
-
-                    def is_outdated(connection: Connection) -> bool:
-                        return last_results(connection, batch, mission) != last
-
+                    last = predicted_from(connection, batch, mission)
         unsaved = self._solver.solve(submission, pending.received, pending.key)
-        unsaved.is_outdated = is_outdated
+        unsaved.predicted_from = last
         unsaved.handed_over_ns = time.perf_counter_ns()
         return unsaved
 

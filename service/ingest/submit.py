@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -20,7 +20,8 @@ from service.acquire import Acquisition
 from service.acquire.choices import refuse_idle_options
 from service.acquire.kernel_build import KernelBuild
 from service.errors import AcquisitionError, BadBatch, Busy, Fault, shown_value
-from service.ingest.queue import Adoptions, Backlog, IngestQueue, PendingBatch, RecordedCounts
+from service.ingest.missions_in_force import MissionsInForce
+from service.ingest.queue import Backlog, IngestQueue, PendingBatch, RecordedCounts
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
@@ -73,20 +74,19 @@ class SubmissionService:
 
     def __init__(
         self,
-        missions: Mapping[str, Mission],
+        in_force: MissionsInForce,
         sky: SkyModel,
         store: Store,
         kernels: KernelBuild | None = None,
-        adoptions: Adoptions | None = None,
     ) -> None:
         """With `kernels`, batches are refused until those that they need are compiled."""
         self.pool = SolverPool()
-        self.solver = Solver(missions, replace(sky, builder=self.pool.builder))
+        self.solver = Solver(in_force.missions, replace(sky, builder=self.pool.builder))
         self._store = store
         self._kernels = kernels
         self._reader = ThreadPoolExecutor(1, "read")
         self.counts = RecordedCounts()
-        self._queue = IngestQueue(self.solver, store, self.pool, self.counts, adoptions)
+        self._queue = IngestQueue(self.solver, store, self.pool, self.counts, in_force)
         self._single_s = -float("inf")
 
     def require_kernels(self, *, of_zones: bool = False) -> None:

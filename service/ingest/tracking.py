@@ -22,6 +22,8 @@ from service.observations.batch import ObservationBatch
 from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
 from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes
 from service.storage.gyro import BlockFilter
+from service.storage.recording.results import last_good_results
+from service.storage.recording.unsaved_result import PredictedFrom
 from service.times import shifted
 from service.vectors import ARCSEC_PER_RADIAN
 
@@ -33,11 +35,15 @@ SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
 
 
-def last_results(connection: Connection, batch: ObservationBatch, mission: Mission) -> list[str]:
+def predicted_from(
+    connection: Connection, batch: ObservationBatch, mission: Mission
+) -> PredictedFrom:
     """The results whose attitudes the prediction of a batch begins with."""
     settings = mission.tracking or TrackingSettings()
-    found = last_attitudes(connection, batch.spacecraft, batch.run, batch.time, settings.max_age_s)
-    return [each.result for each in found]
+    until_ns = batch.time.tai_ns
+    since_ns = until_ns - round(settings.max_age_s * 1e9)
+    period = PredictedFrom(batch.spacecraft, batch.run, since_ns, until_ns, ())
+    return structs.replace(period, results=last_good_results(connection, period))
 
 
 def with_prediction(

@@ -12,7 +12,6 @@ import numpy as np
 from msgspec import structs
 
 from service.acquire import Acquisition
-from service.app.adoptions import geometry_of
 from service.app.context import Context
 from service.contract.calibration import TrackerGeometry
 from service.errors import BadInput, Busy, Fault, Stopping, shown_value
@@ -36,6 +35,7 @@ from service.features.calibration.magnitudes import (
 from service.features.calibration.magnitudes import joined as joined_magnitudes
 from service.features.calibration.mission_file import Lines, magnitude_lines, tracker_lines
 from service.features.calibration.stars import IdentifiedStars, joined
+from service.ingest.missions_in_force import geometry_of
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Calibration as FocalPlaneSettings
 from service.missions.mission import Magnitudes, Mission, Tracker

@@ -11,7 +11,6 @@ import numpy as np
 from pydantic import Field
 from starlette.responses import Response
 
-from service.app.adoptions import geometry_of
 from service.contract.calibration import TrackerGeometry
 from service.errors import NotFound
 from service.features.calibration.estimates import CALIBRATION_SAMPLE
@@ -20,6 +19,7 @@ from service.features.calibration.linearise import LARGEST_DEGREE
 from service.features.calibration.magnitudes import COLOR, SCALE
 from service.features.calibration.part import Calibrations
 from service.features.calibration.records import Calibration, CalibrationSummary
+from service.ingest.missions_in_force import geometry_of
 from service.missions.mission import AS_MEASURED, Mission
 from service.sky.catalog.run_catalog import UNKNOWN_COLOR_BV_MAG
 from service.storage.recording.unsaved_result import LIVE

@@ -13,7 +13,7 @@ from sqlalchemy import Connection
 from sqlalchemy.exc import SQLAlchemyError
 
 from service.access import Entry
-from service.app.adoptions import CalibrationAdoptions, with_geometry
+from service.app.adoptions import CalibrationAdoptions
 from service.app.context import Context, known_id
 from service.app.factory import App
 from service.app.results import COMPARE_SAMPLE, Comparisons, Stretch
@@ -35,6 +35,7 @@ from service.features.calibration.records import (
     interrupt_calibrations,
     unfinished_calibrations,
 )
+from service.ingest.missions_in_force import with_geometry
 from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission, mission_named
 from service.storage.recording.ids import Ulids

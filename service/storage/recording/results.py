@@ -3,7 +3,7 @@
 import json
 from collections.abc import Mapping, Sequence
 
-from sqlalchemy import Connection, and_, delete, insert, select, update
+from sqlalchemy import BigInteger, Connection, and_, bindparam, delete, insert, select, update
 
 from service.errors import AcquisitionError, Busy
 from service.storage.recording import events
@@ -18,18 +18,37 @@ from service.storage.recording.identity import (
     stored_answers,
 )
 from service.storage.recording.result_metrics import split_anew
-from service.storage.recording.unsaved_result import LIVE, Answered, UnsavedResult
+from service.storage.recording.unsaved_result import LIVE, Answered, PredictedFrom, UnsavedResult
 from service.storage.sql import tables
 from service.storage.sql.chain_tables import record_leaves
 from service.storage.sql.columns import Row
 from service.storage.sql.dialects import dialect_of
-from service.storage.sql.statements import execute, insert_all, insert_missing, insert_runs
+from service.storage.sql.statements import (
+    execute,
+    insert_all,
+    insert_missing,
+    insert_runs,
+    prepared,
+)
 from service.storage.sql.tables import audit
 
 RecordOutcome = Answered | AcquisitionError
 
 _LOCK_SEQUENCE = (
     "SELECT pg_advisory_xact_lock(hashtextextended(%(pair)s, 'batches'::regclass::oid::int8))"
+)
+_LAST_GOOD = prepared(
+    select(tables.results.c.id)
+    .where(
+        tables.results.c.current,
+        tables.results.c.spacecraft == bindparam("spacecraft"),
+        tables.results.c.run == bindparam("run"),
+        tables.results.c.time_ns >= bindparam("since_ns", type_=BigInteger),
+        tables.results.c.time_ns <= bindparam("until_ns", type_=BigInteger),
+        tables.results.c.status == "good",
+    )
+    .order_by(tables.results.c.time_ns.desc(), tables.results.c.batch_id.desc())
+    .limit(2)
 )
 _RUNS = "runs"
 """The key under which a connection remembers the runs that it has inserted, or found there."""
@@ -138,16 +157,26 @@ def _outdated(
     Until the transaction ends no other service records one that asks for the last attitude of
     the same spacecraft and run.  All locks are taken first, and in order.
     """
-    asked = [unsaved for unsaved in unsaved_results if unsaved.is_outdated is not None]
+    asked = [
+        (unsaved, unsaved.predicted_from)
+        for unsaved in unsaved_results
+        if unsaved.predicted_from is not None
+    ]
     if not asked:
         return {}
-    for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved in asked}):
+    for pair in sorted({"\n".join(unsaved.identity[:2]) for unsaved, _ in asked}):
         execute(connection, _LOCK_SEQUENCE, {"pair": pair})
     return {
         unsaved.id: PredictionOutdated("another attitude was recorded meanwhile")
-        for unsaved in asked
-        if unsaved.is_outdated is not None and unsaved.is_outdated(connection)
+        for unsaved, last in asked
+        if last_good_results(connection, last) != last.results
     }
+
+
+def last_good_results(connection: Connection, period: PredictedFrom) -> tuple[str, ...]:
+    """The two last good results of a period, latest first."""
+    asked = {name: getattr(period, name) for name in ("spacecraft", "run", "since_ns", "until_ns")}
+    return tuple(row["id"] for row in _LAST_GOOD.read(connection, asked))
 
 
 def _outcome(

@@ -8,11 +8,10 @@ objects.
 
 import json
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import msgspec
 from msgspec import UNSET, Struct, structs
-from sqlalchemy import Connection
 
 from service.acquire import Acquisition
 from service.contract.answers import Answer, Attitude, FrameSummary, FrameTimings
@@ -47,6 +46,16 @@ class Answered(Struct, frozen=True):
     replayed: bool
 
 
+class PredictedFrom(Struct, frozen=True):
+    """The results whose attitudes a prediction begins with: the last good ones of a period."""
+
+    spacecraft: str
+    run: str
+    since_ns: int
+    until_ns: int
+    results: tuple[str, ...]
+
+
 class UnsavedResult(Struct, eq=False):
     """A result that is computed and not yet recorded.
 
@@ -69,8 +78,8 @@ class UnsavedResult(Struct, eq=False):
     """The values of each tracker, of a mission with several (`tracker_values`)."""
     audit: Row | None = None
     """The entry of the audit list that is stored with a recorded what-if."""
-    is_outdated: Callable[[Connection], bool] | None = None
-    """On PostgreSQL, of a batch that asked for the last attitude: whether there is a later one."""
+    predicted_from: "PredictedFrom | None" = None
+    """Of a batch that asked for the last attitude, where other services record attitudes, too."""
 
     @property
     def id(self) -> str:

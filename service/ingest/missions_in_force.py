@@ -1,0 +1,153 @@
+"""The missions in force: those of the files, with the calibrations that were adopted over them.
+
+An adopted calibration lies over the mission file: alignment and focal plane of every tracker are
+those that were adopted, and all other settings the file's.  Where the file's own alignments or
+focal planes have changed since, the file holds.  Of several services on a database each follows
+what operators adopt through any of them.
+"""
+
+import hashlib
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import msgspec
+from sqlalchemy import Connection
+
+from service.contract.calibration import FocalPlane, TrackerGeometry, TrackerMagnitudes
+from service.missions.mission import AS_MEASURED, Mission, Tracker
+from service.storage.adoptions import latest_adoptions, newest_adoption
+from service.storage.readers import Readers
+
+log = logging.getLogger(__name__)
+
+
+class MissionsInForce:
+    """Keeps a mapping of missions as operators have adopted them.
+
+    `missions` is changed in place: everybody who holds it computes with what is in force.
+    """
+
+    def __init__(self, missions: dict[str, Mission], readers: Readers) -> None:
+        """`missions` are at first those of the files."""
+        self.missions = missions
+        self.files: Mapping[str, Mission] = dict(missions)
+        """The settings as the files have them."""
+        self._readers = readers
+        self._lock = threading.Lock()
+        self._leave: str | None = None
+        self._loaded: str | None = None
+        """The newest adoption when they were loaded; empty where there was none."""
+        self._when_changed: list[Callable[[], None]] = []
+
+    def when_changed(self, call: Callable[[], None]) -> None:
+        """Call a function each time a mission was replaced."""
+        self._when_changed.append(call)
+
+    def follow(self) -> None:
+        """`load` again where another service has adopted one since."""
+        with self._readers.reading_record() as connection:
+            self.follow_in(connection)
+
+    def follow_in(self, connection: Connection) -> None:
+        """`follow`, with a connection that sees the record as it is now.
+
+        Each group of posts begins with this: whoever posts after an adoption was answered, by
+        whichever service, is answered with the calibration that was adopted.
+        """
+        if newest_adoption(connection) != self._loaded:
+            self.load(self._leave)
+
+    def load(self, leave: str | None = None) -> None:
+        """Put what was adopted over the mission files, but for the spacecraft `leave`."""
+        self._leave = leave
+        with self._lock:
+            before = dict(self.missions)
+            with self._readers.reading_record() as connection:
+                self._loaded = newest_adoption(connection)
+                adopted = adopted_missions(connection, self.files, leave)
+            self.missions.update({**self.files, **adopted})
+            if self.missions != before:
+                self._tell()
+
+    @contextmanager
+    def replacing(self, mission: Mission) -> Iterator[None]:
+        """Replace a mission when the block, which records its adoption, has ended without error."""
+        with self._lock:
+            yield
+            self.missions[mission.name] = mission
+            self._tell()
+
+    def _tell(self) -> None:
+        for call in self._when_changed:
+            call()
+
+
+def adopted_missions(
+    connection: Connection, files: Mapping[str, Mission], leave: str | None = None
+) -> dict[str, Mission]:
+    """The missions of these files with an adopted calibration over them, but for `leave`."""
+    found: dict[str, Mission] = {}
+    for each in latest_adoptions(connection):
+        file = files.get(each.spacecraft)
+        if file is None or each.spacecraft == leave or each.trackers is None:
+            continue
+        if each.file != geometry_digest(file):
+            log.warning(
+                "%s: the mission file was changed after calibration version %s was adopted; "
+                "the file holds",
+                each.spacecraft,
+                each.version,
+            )
+            continue
+        found[each.spacecraft] = with_geometry(file, each.trackers)
+    return found
+
+
+def geometry_of(tracker: Tracker) -> TrackerGeometry:
+    """Alignment, focal plane and magnitudes of a tracker."""
+    plane = tracker.calibration
+    return TrackerGeometry(
+        name=tracker.name,
+        x_axis_body=list(tracker.x_axis_body),
+        y_axis_body=list(tracker.y_axis_body),
+        z_axis_body=list(tracker.z_axis_body),
+        calibration=FocalPlane(
+            scale=plane.scale,
+            h_terms=[list(each) for each in plane.h_terms],
+            v_terms=[list(each) for each in plane.v_terms],
+        ),
+        magnitudes=TrackerMagnitudes(**tracker.magnitudes.model_dump()),
+    )
+
+
+def geometry_digest(mission: Mission) -> str:
+    """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
+    geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
+    for each, tracker in zip(geometries, mission.trackers, strict=True):
+        # Adoptions of versions without magnitudes hold the digest of the rest.
+        if tracker.magnitudes == AS_MEASURED:
+            del each["magnitudes"]
+    return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
+
+
+def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
+    """The mission with the calibrations of these trackers; those not named stay as they are."""
+    named = {each.name: each for each in trackers}
+    changed = tuple(
+        _with(each, named[each.name]) if each.name in named else each for each in mission.trackers
+    )
+    return mission.model_copy(update={"trackers": changed})
+
+
+def _with(tracker: Tracker, geometry: TrackerGeometry) -> Tracker:
+    fields = msgspec.to_builtins(geometry)
+    if geometry.magnitudes is None:
+        del fields["magnitudes"]
+    settings = {
+        **tracker.model_dump(exclude={"camera"}),
+        **fields,
+        "camera": tracker.camera,
+    }
+    return Tracker.model_validate(settings)
