@@ -1,5 +1,6 @@
-"""One post, followed through its threads: calls go from higher floors to lower ones alone."""
+"""Posts, followed through their threads: calls go from higher floors to lower ones alone."""
 
+import json
 import os
 import threading
 import tomllib
@@ -9,8 +10,8 @@ import httpx
 
 import service
 from service.app.factory import open_app
+from service.feature import KINDS
 from service.web.app import create_app
-from tests.fresh_databases import sqlite_at
 from tests.storage.samples import submission
 from tests.waiting import wait_until
 from tests.web.serving import Server, in_process_settings
@@ -61,36 +62,44 @@ class Calls:
 
 
 def upward(pairs, floor_of):
-    """The calls from a lower floor to a higher one, in `service` or within one of its packages."""
+    """The calls from a lower floor to a higher one, in `service` or within one of its packages.
+
+    What a feature declares, such as its projection, is called by those that ask for it.
+    """
     found = []
     for pair in pairs:
         calling, called = (each.split("/") for each in pair)
         depth = 1 if calling[0] != called[0] else 2
         names = "/".join(calling[:depth]), "/".join(called[:depth])
+        if called[0] == "features" and called[-1] in KINDS:
+            continue
         if all(name in floor_of for name in names) and floor_of[names[0]] < floor_of[names[1]]:
             found.append(pair)
     return sorted(found)
 
 
-def test_a_post_passes_from_top_to_bottom(tmp_path, sky, missions):
+def test_a_post_and_its_repeat_pass_from_top_to_bottom(database, sky, missions):
     calls = Calls()
     threading.setprofile(calls.record)
     try:
-        app = open_app(in_process_settings(sqlite_at(tmp_path / "one.db")))
+        app = open_app(in_process_settings(database), serving=True)
         with Server(create_app(app)) as address, httpx.Client(base_url=address) as client:
-            headers = {"Content-Type": "application/json"}
 
-            def post(name):
-                sent = client.post(
-                    "/api/v1/batches", content=submission(sky, missions, name).text, headers=headers
-                )
-                assert sent.status_code == 201, sent.text
+            def post(name, status=201, text=None, **headers):
+                headers["Content-Type"] = "application/json"
+                text = text or submission(sky, missions, name).text
+                sent = client.post("/api/v1/batches", content=text, headers=headers)
+                assert sent.status_code == status, sent.text
 
             wait_until(lambda: client.get("/readyz").status_code == 200)
             post("opens what it needs")
             app.store.progress.catch_up()
             calls.is_on = True
             post("followed")
+            post("followed", 200, **{"Idempotency-Key": "given later"})
+            asks_for_last = json.loads(submission(sky, missions, "predicted").text)
+            asks_for_last["a_priori"] = {"from": "last"}
+            post("predicted", text=json.dumps(asks_for_last))
             wait_until(lambda: app.store.progress.lag().results == 0)
             calls.is_on = False
     finally:
