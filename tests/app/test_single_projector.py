@@ -13,6 +13,7 @@ from sqlalchemy import select
 from service.access import Caller
 from service.app.factory import open_app
 from service.features.calibration.estimates import CalibrationRequest
+from service.features.calibration.part import Calibrations
 from service.observations.schema import submission_from_json
 from service.settings import Settings
 from service.storage.queries.replays import find_replay
@@ -118,15 +119,15 @@ def test_a_calibration_that_one_service_adopted_holds_for_the_next_batch_of_the_
         sent = [submission_from_json(json.dumps(each)) for each in batches]
         one.submissions.submit_many(sent[:30])
         wanted = CalibrationRequest("TWO")
-        estimate = one.calibrations.of_spacecraft(wanted)
-        found = one.calibrations.record(wanted, estimate, WHO)
+        estimate = one.part(Calibrations).of_spacecraft(wanted)
+        found = one.part(Calibrations).record(wanted, estimate, WHO)
 
         def used(submission):
             answer = json.loads(other.submissions.submit(submission).body)
             return answer["provenance"]["mission"]
 
         assert used(sent[30]) == file
-        adopted = one.adoptions.adopt(found.id, WHO)
+        adopted = one.part(Calibrations).adopt(found.id, WHO)
         assert used(sent[31]) == adopted.mission != file
         # Whatever the clocks of two machines say, a later change has a later id.
         back = other.adoptions.revert("TWO", None, WHO)

@@ -61,7 +61,7 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_back_in_limits(tight, make)
     send(tight, make, ["good", "good"], start=3)
     back = only(tight)
     assert (back.state, back.in_limits, back.current_severity) == ("open", True, None)
-    cleared = tight.alarms.acknowledge(alarm.id, "jb", "dust")
+    cleared = tight.part(Alarms).acknowledge(alarm.id, "jb", "dust")
     assert cleared.state == "cleared"
     assert [each.action for each in cleared.actions] == [
         "raised",
@@ -71,13 +71,13 @@ def test_an_alarm_stays_until_it_is_acknowledged_and_back_in_limits(tight, make)
     ]
     said = cleared.actions[2]
     assert (said.who, said.comment) == ("jb", "dust")
-    assert tight.alarms.page().items == []
+    assert tight.part(Alarms).page().items == []
     assert only(tight, "cleared").id == alarm.id
 
 
 def test_acknowledged_first_it_clears_by_itself_when_it_is_back(tight, make):
     send(tight, make, ["spurious"] * 3)
-    alarm = tight.alarms.acknowledge(only(tight).id, "jb")
+    alarm = tight.part(Alarms).acknowledge(only(tight).id, "jb")
     assert alarm.state == "acknowledged"
     send(tight, make, ["good"] * 2, start=3)
     assert only(tight, "cleared").id == alarm.id
@@ -88,9 +88,9 @@ def test_acknowledged_first_it_clears_by_itself_when_it_is_back(tight, make):
 
 def test_what_gets_worse_than_it_was_is_open_again(tight, make):
     send(tight, make, ["spurious"] * 2)
-    alarm = tight.alarms.acknowledge(only(tight).id, "jb")
+    alarm = tight.part(Alarms).acknowledge(only(tight).id, "jb")
     worse = TIGHT.model_copy(update={"critical": TIGHT.critical.model_copy(update={"high": 0.15})})
-    tight.limits.set("XTE", "unmatched_share", worse, who="jb")
+    tight.part(Alarms).limits.set("XTE", "unmatched_share", worse, who="jb")
     send(tight, make, ["spurious"], start=2)
     found = only(tight)
     assert (found.id, found.state, found.severity) == (alarm.id, "open", "critical")
@@ -100,7 +100,7 @@ def test_what_gets_worse_than_it_was_is_open_again(tight, make):
 def test_a_batch_is_looked_at_once_however_often_it_comes(tight, make):
     for _ in range(4):
         send(tight, make, ["spurious"])
-    assert tight.alarms.page().items == []
+    assert tight.part(Alarms).page().items == []
     send(tight, make, ["spurious"], start=1)
     assert actions(tight, only(tight)) == ["raised"]
 
@@ -129,7 +129,7 @@ def test_back_in_limits_an_alarm_meets_the_latest_of_many_as_it_would_meet_each(
     """Most alarms wait for somebody while all is well again, and then nothing is judged twice."""
     send(tight, make, ["spurious"] * 3 + ["good"] * 6)
     together = tight
-    together.limits.set("SWAS", "unmatched_share", TIGHT, who="jb", comment="the same")
+    together.part(Alarms).limits.set("SWAS", "unmatched_share", TIGHT, who="jb", comment="the same")
     kinds = ["spurious"] * 3 + ["good"] * 6
     others = [
         make(f"s{k}", kind=kind, after_s=30.0 * k, spacecraft="SWAS")
@@ -167,11 +167,11 @@ def test_what_another_process_kept_of_the_latest_values_is_gone_on_with(tight, m
 
 def test_alarms_watch_live_batches_and_a_run_when_asked(tight, make):
     send(tight, make, ["spurious"] * 3, run="quiet")
-    assert tight.alarms.page(run="*").items == []
+    assert tight.part(Alarms).page(run="*").items == []
     tight.runs.watch("loud")
     send(tight, make, ["spurious"] * 3, run="loud")
     assert only(tight, run="loud").run == "loud"
-    assert tight.alarms.page().items == []
+    assert tight.part(Alarms).page().items == []
     assert {each.run: each.alarms for each in tight.runs.all()} == {
         "loud": True,
         "quiet": False,
@@ -181,23 +181,23 @@ def test_alarms_watch_live_batches_and_a_run_when_asked(tight, make):
 @pytest.mark.both_databases
 def test_alarms_and_limits_outlive_the_process(opened, make):
     first = opened()
-    first.limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="kept")
+    first.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb", comment="kept")
     send(first, make, ["spurious"])
     first.close()
     second = opened()
     # The batch before the restart counts: one more makes two.
     send(second, make, ["spurious"], start=1)
-    alarm = second.alarms.shelve(only(second).id, "jb", 60)
+    alarm = second.part(Alarms).shelve(only(second).id, "jb", 60)
     second.close()
     third = opened()
     assert only(third, "shelved").id == alarm.id
-    assert third.limits.all("XTE")[1].comment == "kept"
+    assert third.part(Alarms).limits.all("XTE")[1].comment == "kept"
 
 
 @pytest.mark.parametrize("database", ["postgresql"], indirect=True)
 def test_two_processes_look_at_one_spacecraft_in_turn(opened, make):
     one, two = opened(), opened()
-    one.limits.set("XTE", "unmatched_share", TIGHT, who="jb")
+    one.part(Alarms).limits.set("XTE", "unmatched_share", TIGHT, who="jb")
     for k in range(6):
         (one, two)[k % 2].submissions.submit(make(f"b{k}", kind="spurious", after_s=30.0 * k))
     alarm = only(two)
@@ -208,22 +208,22 @@ def test_two_processes_look_at_one_spacecraft_in_turn(opened, make):
 
 def test_a_shelf_has_an_end(tight, make, monkeypatch):
     send(tight, make, ["spurious"] * 2)
-    alarm = tight.alarms.shelve(only(tight).id, "jb", 30, "until the pass is over")
+    alarm = tight.part(Alarms).shelve(only(tight).id, "jb", 30, "until the pass is over")
     assert alarm.state == "shelved"
-    assert tight.alarms.page(state="open").items == []
+    assert tight.part(Alarms).page(state="open").items == []
     assert structs.asdict(tight.spacecraft.overview().alarms) == {
         "open": 0,
         "acknowledged": 0,
         "shelved": 1,
         "worst": None,
     }
-    assert not tight.alarms.evaluate_by_clock()
+    assert not tight.part(Alarms).evaluate_by_clock()
     later = shifted(utc_now(), 31 * 60)
     monkeypatch.setattr("service.features.alarms.part.utc_now", lambda: later)
     assert only(tight, "open").id == alarm.id
-    assert tight.alarms.evaluate_by_clock()
+    assert tight.part(Alarms).evaluate_by_clock()
     assert actions(tight, alarm)[-1] == "shelf_expired"
-    assert not tight.alarms.evaluate_by_clock()
+    assert not tight.part(Alarms).evaluate_by_clock()
 
 
 @pytest.mark.both_databases
@@ -231,17 +231,17 @@ def test_who_comes_late_to_an_alarm_is_told_so(tight, make):
     send(tight, make, ["spurious"] * 2)
     id = only(tight).id
     with pytest.raises(WrongState, match="not shelved"):
-        tight.alarms.unshelve(id, "jb")
-    tight.alarms.acknowledge(id, "jb")
+        tight.part(Alarms).unshelve(id, "jb")
+    tight.part(Alarms).acknowledge(id, "jb")
     with pytest.raises(WrongState, match="acknowledged by jb"):
-        tight.alarms.acknowledge(id, "mk")
-    tight.alarms.comment(id, "mk", "looked at it")
+        tight.part(Alarms).acknowledge(id, "mk")
+    tight.part(Alarms).comment(id, "mk", "looked at it")
     send(tight, make, ["good"] * 2, start=2)
-    for act in (tight.alarms.acknowledge, tight.alarms.unshelve):
+    for act in (tight.part(Alarms).acknowledge, tight.part(Alarms).unshelve):
         with pytest.raises(WrongState, match="cleared"):
             act(id, "mk")
     with pytest.raises(NotFound, match="no alarm"):
-        tight.alarms.get("01JD0000000000000000000001")
+        tight.part(Alarms).get("01JD0000000000000000000001")
 
 
 def test_live_silence_is_an_alarm_that_the_next_batch_ends(app, make, monkeypatch):
@@ -293,7 +293,7 @@ def test_a_batch_dated_far_ahead_is_not_judged(tight, make):
     for name in ("b1", "b2", "b3"):
         text = make(name, kind="spurious").text.replace("1996-01-10T", "2098-01-10T")
         tight.submissions.submit(submission_from_json(text.encode()))
-    assert tight.alarms.page().items == []
+    assert tight.part(Alarms).page().items == []
 
 
 def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
@@ -303,7 +303,7 @@ def test_a_what_if_that_is_adopted_raises_nothing(tight, make):
     )
     for each in tight.results.page().items:
         tight.results.what_if(each.id, options, adopt=True)
-    assert tight.alarms.page().items == []
+    assert tight.part(Alarms).page().items == []
 
 
 @pytest.mark.both_databases
@@ -325,7 +325,7 @@ def test_every_limit_that_was_set_stays_in_the_history(app):
 
 def test_what_happens_to_alarms_and_limits_is_told(tight, make):
     send(tight, make, ["spurious"] * 2)
-    tight.alarms.acknowledge(only(tight).id, "jb")
+    tight.part(Alarms).acknowledge(only(tight).id, "jb")
     tight.store.progress.catch_up()
     told = [(each.kind, json.loads(each.data).get("state")) for each in tight.events.after(0, 100)]
     assert [each for each in told if each[0] != "batches"] == [

@@ -122,5 +122,5 @@ def test_a_tracker_is_previewed_by_its_own_values(opened, sky, missions):
 
 
 def test_a_run_without_batches_has_a_preview_without_values(opened):
-    told = opened().limits.preview("XTE", "ambiguous_share", TIGHT, run="none")
+    told = opened().part(Alarms).limits.preview("XTE", "ambiguous_share", TIGHT, run="none")
     assert (told.batches, told.start, told.proposed.evaluated) == (0, None, 0)

@@ -43,11 +43,11 @@ def test_in_process(file, tmp_path):
     asked = ["replay", str(file), "--in-process", "--database", database, "--run", "loud"]
     assert main([*asked, "--alarms"]) == 0
     again = open_app(in_process_settings(database))
-    before = again.alarms.page(run="loud", state="all").items
+    before = again.part(Alarms).page(run="loud", state="all").items
     again.close()
     assert "a_priori_angle_deg" in {each.quantity for each in before}
     # A second time adds nothing, and raises nothing anew.
     assert main([*asked, "--alarms"]) == 0
     again = open_app(in_process_settings(database))
-    assert again.alarms.page(run="loud", state="all").items == before
+    assert again.part(Alarms).page(run="loud", state="all").items == before
     again.close()

@@ -56,7 +56,7 @@ def test_it_returns_and_is_raised_anew_as_the_same_tracker_s(twins, sky, mission
     back = of_ratio(twins)[SECOND]
     assert (back.id, back.in_limits) == (first.id, True)
     for alarm in of_ratio(twins).values():
-        assert twins.alarms.acknowledge(alarm.id, "jb").state == "cleared"
+        assert twins.part(Alarms).acknowledge(alarm.id, "jb").state == "cleared"
     send(twins, sky, mission, range(9, 13), noise_arcsec=NOISY)
     assert of_ratio(twins)[SECOND].id != first.id
     twins.close()
@@ -76,19 +76,23 @@ def test_a_restart_goes_on_with_the_windows_and_alarms_of_trackers(twins, opened
 
 def test_a_tracker_has_the_limits_of_its_spacecraft_until_it_has_its_own(twins, sky, mission):
     (ratio,) = (
-        each for each in twins.limits.all("XTE", SECOND) if each.quantity == "residual_ratio"
+        each
+        for each in twins.part(Alarms).limits.all("XTE", SECOND)
+        if each.quantity == "residual_ratio"
     )
     assert (ratio.tracker, ratio.is_default) == (SECOND, True)
     assert ratio.settings == QUICK.model_dump(mode="json")
-    set_now = twins.limits.set("XTE", "residual_ratio", OFF, who="jb", tracker=SECOND)
+    set_now = twins.part(Alarms).limits.set("XTE", "residual_ratio", OFF, who="jb", tracker=SECOND)
     assert (set_now.tracker, set_now.is_default) == (SECOND, False)
-    history = twins.limits.get("XTE", "residual_ratio", SECOND)
+    history = twins.part(Alarms).limits.get("XTE", "residual_ratio", SECOND)
     assert history.default == QUICK.model_dump(mode="json")
     assert [each.settings["enabled"] for each in history.history] == [False]
-    assert twins.limits.get("XTE", "residual_ratio").limit.settings["enabled"]
+    assert twins.part(Alarms).limits.get("XTE", "residual_ratio").limit.settings["enabled"]
     send(twins, sky, mission, range(4), noise_arcsec=NOISY)
     assert SECOND not in of_ratio(twins)
-    restored = twins.limits.set("XTE", "residual_ratio", None, who="jb", tracker=SECOND)
+    restored = twins.part(Alarms).limits.set(
+        "XTE", "residual_ratio", None, who="jb", tracker=SECOND
+    )
     assert restored.is_default
     send(twins, sky, mission, range(4, 8), noise_arcsec=NOISY)
     assert SECOND in of_ratio(twins)
@@ -96,9 +100,9 @@ def test_a_tracker_has_the_limits_of_its_spacecraft_until_it_has_its_own(twins, 
 
 def test_limits_of_what_has_none_are_refused(twins, opened):
     with pytest.raises(BadInput, match="tracker: XTE has STARTRACKER_1, STARTRACKER_2"):
-        twins.limits.all("XTE", "STARTRACKER_3")
+        twins.part(Alarms).limits.all("XTE", "STARTRACKER_3")
     with pytest.raises(BadInput, match="tracker: a tracker has"):
-        twins.limits.get("XTE", "silence_s", SECOND)
+        twins.part(Alarms).limits.get("XTE", "silence_s", SECOND)
     twins.close()
     app = opened()
     (lone,) = app.missions["XTE"].trackers
@@ -107,7 +111,7 @@ def test_limits_of_what_has_none_are_refused(twins, opened):
 
 
 def test_limits_of_a_tracker_are_set_for_the_quantities_that_it_has(twins):
-    names = {each.quantity for each in twins.limits.all("XTE", FIRST)}
+    names = {each.quantity for each in twins.part(Alarms).limits.all("XTE", FIRST)}
     assert names == {
         "ambiguous_share",
         "unmatched_share",

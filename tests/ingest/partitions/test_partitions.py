@@ -10,6 +10,7 @@ from msgspec.structs import asdict
 from sqlalchemy import func, select
 
 from service.errors import BadBatch, BadConfiguration, Busy, Conflict
+from service.features.alarms.part import Alarms
 from service.ingest import partition_coordinator
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
@@ -279,7 +280,7 @@ def test_limits_of_a_run_with_alarms_are_evaluated_in_order_of_time(archived, pl
     def raised(run):
         return [
             (each.quantity, each.severity, each.raised.time, each.worst.value)
-            for each in archived.alarms.page(run=run, state="all", limit=100).items
+            for each in archived.part(Alarms).page(run=run, state="all", limit=100).items
         ]
 
     assert raised("again") == raised("replayed") != []
