@@ -17,6 +17,7 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 - `part`: `open_part(app)` makes what the feature adds to an open `App`, which has it by its class
   (`App.part`) and closes it by its `close()`.
 - `command`: `add(commands)` declares its commands, as a module of `service.cli.commands` does.
+- `formats`: `INPUT_FORMATS`, input formats by name (`service.observations.input_formats`).
 - `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
 - `routes`: `ROUTERS` are its routes of the API, `POLICIES` their policies by name.
@@ -51,6 +52,7 @@ KINDS = (
     "shares",
     "part",
     "command",
+    "formats",
     "serving",
     "routes",
     "pages",

@@ -50,7 +50,13 @@ def add(commands: Any) -> None:
 
 
 def _add_mission(group: Any) -> None:
-    parser = add_command(group, "mission", _run_mission, notes=NOTES)
+    parser = add_command(
+        group,
+        "mission",
+        _run_mission,
+        notes=NOTES,
+        first="--sweep --at-most-ambiguous --stars --plot",
+    )
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
     )
@@ -260,7 +266,9 @@ same after the attitude check of the identifier `ptp`."""
 
 
 def _add_paper(group: Any) -> None:
-    parser = add_command(group, "paper", _run_paper, notes=PTP_HELP)
+    parser = add_command(
+        group, "paper", _run_paper, notes=PTP_HELP, first="--table --stars --seed --report"
+    )
     parser.add_argument(
         "--table",
         type=_table,

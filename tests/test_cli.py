@@ -1,5 +1,6 @@
 """The command: help that teaches, one clear line a mistake, exit codes that scripts can use."""
 
+import argparse
 import csv
 import gzip
 import json
@@ -19,7 +20,7 @@ import pytest
 from service import __version__
 from service.acquire import kernel_build
 from service.cli import build_parser
-from service.observations.csv_rows import COLUMNS
+from service.cli.arguments import MOST_FIRST, MOST_OPTIONS
 from service.simulate.telemetry import read_objects
 from service.times import parse_utc
 from tests.fresh_databases import sqlite_at
@@ -110,10 +111,34 @@ def test_every_example_in_the_help_is_understood(acquire):
                 assert parser.parse_args(words[1:]).function
 
 
-def test_the_help_of_replay_names_every_column_of_a_csv_file(acquire):
-    _, out, _ = acquire("replay", "--help")
-    named = out.split("Columns, as in the JSON:\n")[1].split("spacecraft, batch, time")[0].split()
-    assert sorted(named) == sorted(COLUMNS)
+def parsers_of(parser, words=()):
+    """Every command that has no commands of its own, with its words."""
+    if parser.commands is None:
+        yield " ".join(words), parser
+        return
+    for name, each in parser.commands.choices.items():
+        yield from parsers_of(each, (*words, name))
+
+
+@pytest.mark.parametrize(("command", "parser"), [*parsers_of(build_parser())])
+def test_help_shows_first_what_most_people_need(command, parser):
+    arguments = [each for each in parser._actions if each.help != argparse.SUPPRESS][1:]
+    _, _, listed = parser.format_help().partition("\narguments:\n")
+    first, _, rest = listed.partition("\nmore options:\n")
+    assert bool(listed) == bool(parser.first)
+    assert set(parser.first) <= set(parser._option_string_actions)
+    if not listed:
+        assert len(arguments) <= MOST_OPTIONS
+        return
+    rest = rest.partition("\nexamples:\n")[0]
+    starts = [line.split()[0].rstrip(",") for line in first.splitlines() if line[2:3].strip()]
+    assert 1 < len(starts) <= MOST_FIRST
+    for each in arguments:
+        name = each.option_strings[0] if each.option_strings else each.metavar
+        in_first = re.search(rf"^  {re.escape(name)}(?![\w-])", first, re.MULTILINE) is not None
+        in_rest = re.search(rf"^  {re.escape(name)}(?![\w-])", rest, re.MULTILINE) is not None
+        assert in_first != in_rest, f"{command}: {name} stands in one of the two lists"
+        assert in_first or not each.required
 
 
 def loaded_by(code, *arguments):

@@ -23,9 +23,8 @@ from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.decompress import Coding, Line, unpacked_lines
+from service.observations.input_formats import NDJSON, PACKETS
 from service.observations.telemetry import (
-    TelemetryForm,
-    TelemetryFormat,
     read_lines,
     require_telemetry,
 )
@@ -67,8 +66,8 @@ class UploadForm:
     coding: Coding
     longest_bytes: int
     """A line is cut there."""
-    form: TelemetryForm = "lines"
-    """`packets` is an archive of space packets and their XTCE file."""
+    form: str = NDJSON
+    """The name of an input format; `packets` is an archive of space packets and their XTCE file."""
     spacecraft: str | None = None
     """The mission whose packets are read; None: the only one that reads packets."""
 
@@ -145,8 +144,7 @@ class Replays:
             packets = self._packet_lines(file, form)
             if packets is None and form.coding == "identity":
                 file.flush()
-                kind: TelemetryFormat = "csv" if form.form == "csv" else "ndjson"
-                require_telemetry(Path(file.name), kind, "body")
+                require_telemetry(Path(file.name), form.form, "body")
             replay = self._new(run, options, drop=self._spool.drop)
             on_failure.callback(replay.release_slot)
             about = SpooledReplay(
@@ -157,7 +155,7 @@ class Replays:
                 caller.name,
                 bound,
                 packets.spacecraft if packets else None,
-                form.form == "csv",
+                form=form.form,
             )
             on_failure.callback(self._spool.drop, replay.id)
             self._spool.keep(file, about)
@@ -201,21 +199,20 @@ class Replays:
         file = self._spool.open(about.id)
         replay = self._new(stored.run, options, stored, self._spool.drop)
         log.info("replay %s continues after line %d", about.id, stored.lines.done)
-        kind: TelemetryForm = "lines" if about.packets is None else "packets"
-        form = UploadForm(about.coding, about.longest_bytes, kind, about.packets)
+        form = UploadForm(about.coding, about.longest_bytes, about.form_name, about.packets)
         replay.resume(self._packet_lines(file, form) or self._lines_of(file, about, replay))
 
     def _lines_of(
         self, file: IO[bytes], about: SpooledReplay, replay: RunningReplay
     ) -> Iterable[bytes | Line]:
-        if not about.is_csv:
+        if about.form_name == NDJSON:
             return unpacked_lines(file, about.coding, about.longest_bytes, replay.require_going_on)
         file.close()
-        return read_lines(self._spool.path(about.id), "csv")
+        return read_lines(self._spool.path(about.id), about.form_name)
 
     def _packet_lines(self, file: IO[bytes], form: UploadForm) -> PacketLines | None:
         """The batches of packets; None for an upload of lines."""
-        if form.form != "packets":
+        if form.form != PACKETS:
             return None
         return PacketLines(file, self._context.missions, form.spacecraft)
 

@@ -32,6 +32,9 @@ MISSION = "XTE, SWAS, SOHO, the name of one of your own, or its file (.toml)"
 CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera, or its file (.toml)"
 FILE_OR_NAME = "a mission file (.toml), or the name of a spacecraft"
 
+MOST_OPTIONS, MOST_FIRST = 8, 7
+"""Arguments of a command whose help is one list, and those that stand first in a longer one."""
+
 Function = Callable[[argparse.Namespace], int]
 
 
@@ -50,6 +53,45 @@ class Parser(argparse.ArgumentParser):
 
     commands: Any = None
     """What takes the commands of this command; None for one without."""
+    first: Sequence[str] = ()
+    """Options that most people need: the help of a command with many shows these first."""
+
+    def format_help(self) -> str:
+        """The help; with `first` these, and what is required, before all other options."""
+        if not self.first:
+            return super().format_help()
+        actions = [each for each in self._actions if each.help != argparse.SUPPRESS]
+        shown = [
+            each
+            for each in actions
+            if each.required or not each.option_strings or {*each.option_strings} & {*self.first}
+        ]
+        rest = [each for each in self._optionals._group_actions if each in actions]
+        formatter = self._get_formatter()
+        more = argparse.Action([], "more", nargs="?", metavar="more options")
+        groups = [
+            each for each in self._mutually_exclusive_groups if {*each._group_actions} <= {*shown}
+        ]
+        formatter.add_usage(None, [*shown, more], groups)
+        formatter.add_text(self.description)
+        sections = [
+            ("arguments", None, shown),
+            ("more options", None, rest),
+            *(
+                (group.title, group.description, group._group_actions)
+                for group in self._action_groups
+                if group not in (self._optionals, self._positionals)
+            ),
+        ]
+        for title, description, members in sections:
+            formatter.start_section(title)
+            formatter.add_text(description)
+            formatter.add_arguments(
+                each for each in members if members is shown or each not in shown
+            )
+            formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
 
     def error(self, message: str) -> NoReturn:
         """Print the message and exit with code 2."""
@@ -109,12 +151,14 @@ def add_command(
     summary: str = "",
     examples: str = "",
     notes: str = "",
+    first: str = "",
 ) -> argparse.ArgumentParser:
     """Add a command that runs `function`, which returns the exit code.
 
     The help is the function's docstring: what the command does, an empty line, examples.  A group,
     and a command whose function serves several, has `summary` and `examples` instead.  `notes`
-    follow the examples.  `parent` None makes the parser of the whole command.
+    follow the examples.  `first` are the options that most people need, of a command with more
+    than `MOST_OPTIONS`.  `parent` None makes the parser of the whole command.
     """
     if not summary:
         summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
@@ -131,6 +175,8 @@ def add_command(
         return Parser(prog=name, **arguments)
     made: argparse.ArgumentParser = parent.add_parser(name, help=summary, **arguments)
     made.set_defaults(function=function)
+    if isinstance(made, Parser):
+        made.first = first.split()
     return made
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from service.advice.intervals import wilson
 from service.advice.mission_check import (
     FEW_STARS,
     Finding,
@@ -181,14 +182,20 @@ def _sentences(report: MissionReport) -> list[str]:
         )
     lines += [
         f"Expected in {each.sky} sky ({_LATITUDES[each.sky]} deg from the plane of the Milky Way; "
-        f"{each.views} simulated views): {100.0 * each.share('unique'):.1f} % of the stars unique, "
-        f"{100.0 * each.share('ambiguous'):.1f} % ambiguous, "
-        f"{100.0 * each.share('unmatched'):.1f} % unmatched, "
-        f"{100.0 * each.share('wrong'):.2f} % wrong; a good attitude in "
+        f"{each.views} simulated views), with 95 % intervals: {_share(each, 'unique')} of the "
+        f"stars unique, {_share(each, 'ambiguous')} ambiguous, {_share(each, 'unmatched')} "
+        f"unmatched, {_share(each, 'wrong')} wrong; a good attitude in "
         f"{100.0 * each.attitudes / each.views:.0f} % of the views."
         for each in report.expected
     ]
     return [part for line in lines for part in textwrap.wrap(line, WIDTH)]
+
+
+def _share(expected: "Expected", outcome: str) -> str:
+    """A share of the stars; its interval counts views, whose stars are not independent."""
+    found = wilson(expected.share(outcome), expected.views)
+    low, high = (f"{100.0 * each:.1f}" for each in (found.low, found.high))
+    return f"{100.0 * found.value:.1f} % ({low} to {high})"
 
 
 _LATITUDES = {"clear": "more than 30", "dense": "less than 10"}

@@ -13,6 +13,7 @@ from typing import IO
 
 from service.errors import Busy
 from service.observations.decompress import Coding
+from service.observations.input_formats import CSV, NDJSON, PACKETS
 from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 
 PART, LINES, ABOUT = ".part", ".lines", ".json"
@@ -37,7 +38,15 @@ class SpooledReplay:
     packets: str | None = None
     """The spacecraft whose space packets the file holds; None: the file has lines."""
     is_csv: bool = False
-    """True if the lines are CSV rows."""
+    """True if the lines are CSV rows, as earlier versions wrote it in place of `form`."""
+    form: str = ""
+    """The name of the file's format."""
+
+    @property
+    def form_name(self) -> str:
+        """The name of the file's format, of earlier versions too."""
+        earlier = PACKETS if self.packets is not None else CSV if self.is_csv else NDJSON
+        return self.form or earlier
 
 
 class Spool:

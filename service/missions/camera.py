@@ -130,7 +130,8 @@ class Camera(Strict):
     @model_validator(mode="after")
     def _bias_lies_below_saturation(self) -> Self:
         if self.bias_counts >= self.saturation_counts:
-            raise ValueError("bias_counts must be below saturation_counts")
+            held = f"{self.bias_counts:g} and {self.saturation_counts:g}"
+            raise ValueError(f"bias_counts must be below saturation_counts, not {held}")
         return self
 
     @model_validator(mode="after")

@@ -187,6 +187,11 @@ _CORNER = "the largest field_of_view_radius_deg"
 
 RULES: tuple[Rule, ...] = (
     Rule(
+        "a_priori_error_deg",
+        "0.1 deg if sun_pointed_axis_body and limit_mag are given, as in the paper",
+        lambda given: SUN_ERROR_DEG if given.is_short() and given.sun_axis() else None,
+    ),
+    Rule(
         "identifier",
         "lost_in_space if the file states no a priori knowledge, else verified",
         _identifier,

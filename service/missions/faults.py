@@ -46,6 +46,8 @@ EXAMPLES: dict[str, Any] = {
     "width_px": 1024,
     "height_px": 1024,
     "focal_length_px": 5852.0,
+    "sigma_v_rad_s0_5": 1e-6,
+    "sigma_u_rad_s1_5": 1e-9,
     "spacecraft": "XTE",
     "batch": "1996-010-0001",
     "time": "1996-01-10T12:00:00.000Z",
@@ -96,6 +98,8 @@ FORMS: dict[str, str] = {
 """The patterns of names, in words."""
 
 
+LEAST_CUT = 3
+"""Letters of a name that stands for a longer one."""
 MOST_COMPARED = 20
 """Unknown keys of one table that are compared with its missing ones."""
 
@@ -108,16 +112,29 @@ def plain_message(fault: PydanticFault) -> str:
         text = re.sub(r"^Input should (be|have) ", r"must \1 ", text)
     else:
         text = words(fault.get("ctx", {}))
-    key = next((part for part in reversed(fault["loc"]) if isinstance(part, str)), None)
-    # Messages of our own say what is right; for an entry of a list the whole list is the example.
-    if fault["type"] in _WITHOUT_EXAMPLE or key not in EXAMPLES or "options" in fault["loc"]:
+    # Messages of our own say what is right.
+    if fault["type"] in _WITHOUT_EXAMPLE or "options" in fault["loc"]:
         return text
-    return f"{text}, such as {json.dumps(EXAMPLES[key])}"
+    example = _example(fault["loc"])
+    return text if example is None else f"{text}, such as {json.dumps(example)}"
+
+
+def _example(location: Location) -> Any:
+    """The usual value of a key, or of the entry of its list; None where none is known."""
+    at = max((k for k, part in enumerate(location) if isinstance(part, str)), default=None)
+    if at is None or (location[at] == "kind" and "zone" not in location):
+        return None
+    key = str(location[at])
+    example = EXAMPLES.get("tracker" if key == "name" and "trackers" in location else key)
+    for place in location[at + 1 :]:
+        if isinstance(example, list) and isinstance(place, int):
+            example = example[min(place, len(example) - 1)]
+    return example
 
 
 def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
     """The faults that do not follow from others: unknown keys, wrong values, missing keys."""
-    joined = [*_of_lists(faults)]
+    joined = [*map(_of_kind, _of_lists(faults))]
     # A client may send any number of unknown keys: the time is linear in it.
     wholes: set[Location] = set()
     unknown: dict[Location, list[Any]] = {}
@@ -159,10 +176,25 @@ def of_the_form_given(
 def nearest(name: Any, known: Sequence[Any]) -> str | None:
     """The name among those known that is spelt most like another, or None."""
     names = [*map(str, known)]
-    # A unit that was left out, as in sigma for sigma_arcsec.
-    longer = [each for each in names if each.startswith(f"{name}_")]
+    # A unit that was left out, as in sigma for sigma_arcsec, or a word that was cut, as mag.
+    longer = [each for each in names if each.startswith(f"{name}_")] or [
+        each for each in names if len(str(name)) >= LEAST_CUT and each.startswith(str(name))
+    ]
     near = longer or difflib.get_close_matches(str(name), names, n=1, cutoff=0.7)
     return near[0] if near else None
+
+
+def _of_kind(fault: PydanticFault) -> PydanticFault:
+    """The fault, that of a table of an unknown kind as one of the key that names the kind."""
+    key = str(fault.get("ctx", {}).get("discriminator", "")).strip("'")
+    if fault["type"] not in ("union_tag_invalid", "union_tag_not_found") or not key.isidentifier():
+        return fault
+    located = {"loc": (*fault["loc"], key), "msg": "", "input": fault["input"]}
+    if fault["type"] == "union_tag_not_found":
+        return {**located, "type": "missing"}
+    expected = _either(fault["ctx"]["expected_tags"])
+    value = fault["input"].get(key)
+    return {**located, "type": "literal_error", "input": value, "ctx": {"expected": expected}}
 
 
 _RANK = {"extra_forbidden": 0, "missing": 2}
@@ -233,8 +265,6 @@ _WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
         ("model_type", "model_attributes_type", "dict_type"),
         lambda c: "must be a table of keys and values",
     ),
-    "union_tag_not_found": lambda c: f"needs the key {c['discriminator']}",
-    "union_tag_invalid": lambda c: f"must have {c['discriminator']} {_either(c['expected_tags'])}",
 }
 
 
@@ -262,8 +292,9 @@ def explained(model: type[BaseModel], fault: PydanticFault) -> str:
         return plain_message(fault)
     allowed = allowed_keys(model, fault["loc"][:-1])
     near = nearest(fault["loc"][-1], allowed)
-    meant = f"; did you mean {near}?" if near else ""
-    return f"no such key{meant}; allowed here: {', '.join(allowed)}"
+    return (
+        f"no such key; {f'did you mean {near}?' if near else 'allowed here: ' + ', '.join(allowed)}"
+    )
 
 
 Models = list[type[BaseModel]]

@@ -46,7 +46,13 @@ from service.missions.motion import (
 from service.missions.packets import Packets
 from service.missions.product_settings import DEFAULT_PRODUCTS, ProductSettings, beside
 from service.missions.scan import Scan, SunTracker
-from service.missions.strict import Components, Direction, Strict, is_missing
+from service.missions.strict import (
+    Components,
+    Direction,
+    Strict,
+    is_missing,
+    require_right_handed,
+)
 from service.vectors import Matrix, Vector, read_only, unit
 
 SHIPPED_FOLDER = Path(__file__).parent
@@ -252,9 +258,7 @@ class Tracker(Strict):
 
     @model_validator(mode="after")
     def _axes_are_right_handed(self) -> Self:
-        axes = np.column_stack([self.x_axis_body, self.y_axis_body, self.z_axis_body])
-        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4) or np.linalg.det(axes) < 0:
-            raise ValueError("the three axes must be a right-handed set of unit vectors")
+        require_right_handed(self.x_axis_body, self.y_axis_body, self.z_axis_body)
         return self
 
     @cached_property
@@ -434,7 +438,10 @@ def parse_mission(text: str, file: str) -> Mission:
             causes(error.errors()), lambda fault: dotted_key(Mission, fault["loc"])
         )
     found = [_described(fault) for fault in faults if not _is_waiting(fault, whole)]
-    lines = [*found, *needs(table)] or [_described(fault) for fault in faults]
+    lacking = [*needs(table)]
+    stated = {line.partition(":")[0] for line in lacking}
+    found = [each for each in found if each.partition(":")[0] not in stated]
+    lines = [*found, *lacking] or [_described(fault) for fault in faults]
     raise BadConfiguration("\n".join(f"{file}: {each}" for each in lines))
 
 
@@ -447,7 +454,11 @@ def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
 
 def _described(fault: PydanticFault) -> str:
     text = f"{dotted_key(Mission, fault['loc'])}: {explained(Mission, fault)}"
-    return text if fault["type"] == "missing" else f"{text} (got {shown_value(fault['input'])})"
+    # The message about a whole table names the values in it that matter.
+    of_a_table = fault["type"] == "value_error" and isinstance(fault["input"], dict)
+    if fault["type"] == "missing" or of_a_table:
+        return text
+    return f"{text} (got {shown_value(fault['input'])})"
 
 
 def read_mission(path: Path) -> Mission:

@@ -14,7 +14,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
-from service.missions.strict import Components, Strict
+from service.missions.strict import Components, Strict, require_right_handed
 from service.vectors import Matrix, read_only
 
 MOST_SAMPLES, MOST_WIRES, MOST_LINES = 1001, 16, 8192
@@ -153,9 +153,7 @@ class SunTracker(Strict):
 
     @model_validator(mode="after")
     def _axes_are_right_handed(self) -> Self:
-        axes = self.body_from_tracker
-        if not np.allclose(axes.T @ axes, np.eye(3), atol=1e-4) or np.linalg.det(axes) < 0:
-            raise ValueError("the three axes must be a right-handed set of unit vectors")
+        require_right_handed(self.x_axis_body, self.y_axis_body, self.z_axis_body)
         return self
 
     @cached_property

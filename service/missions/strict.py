@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Self
 
+import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
 Components = tuple[float, float, float]
@@ -16,6 +17,34 @@ def _has_direction(vector: Components) -> Components:
 
 
 Direction = Annotated[Components, AfterValidator(_has_direction)]
+
+
+AXIS_NAMES = ("x_axis_body", "y_axis_body", "z_axis_body")
+
+
+def require_right_handed(*axes: Components) -> None:
+    """Raise `ValueError` naming what is wrong with the axes X, Y and Z of an instrument."""
+    matrix = np.column_stack(axes)
+    products = matrix.T @ matrix
+    if np.allclose(products, np.eye(3), atol=1e-4) and np.linalg.det(matrix) > 0:
+        return
+    norms = np.sqrt(np.diag(products))
+    for first, second in (0, 2), (0, 1), (1, 2):
+        cosine = products[first, second] / max(norms[first] * norms[second], 1e-12)
+        if norms.min() > 0.0 and abs(cosine) > 1e-4:
+            angle_deg = math.degrees(math.acos(min(max(cosine, -1.0), 1.0)))
+            raise ValueError(
+                f"{AXIS_NAMES[first]} and {AXIS_NAMES[second]} must be at right angles, not at "
+                f"{angle_deg:.4g} deg, such as [1.0, 0.0, 0.0] and [0.0, 0.0, 1.0]"
+            )
+    for name, norm in zip(AXIS_NAMES, norms.tolist(), strict=True):
+        if abs(norm - 1.0) > 5e-5:
+            example = "must be a unit vector, such as [1.0, 0.0, 0.0]"
+            raise ValueError(f"{name} {example}; its norm is {norm:.6g}")
+    raise ValueError(
+        "the three axes must be right-handed: y_axis_body must be the cross product of z_axis_body "
+        "and x_axis_body"
+    )
 
 
 class Strict(BaseModel):

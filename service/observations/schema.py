@@ -26,7 +26,13 @@ from pydantic import (
 )
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
-from service.missions.faults import NAME_PATTERN, causes, plain_message
+from service.missions.faults import (
+    NAME_PATTERN,
+    allowed_keys,
+    causes,
+    nearest,
+    plain_message,
+)
 from service.missions.mission import GridStep, Identifier, SolverName
 from service.missions.scan import MOST_LINES, MOST_SAMPLES, MOST_WIRES
 from service.observations.batch import (
@@ -53,12 +59,31 @@ PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")
 """The kinds of a priori knowledge, and the field that tells each."""
 
 
-def faults_of(error: ValidationError, prefix: tuple[str, ...] = ()) -> list[Fault]:
-    """Faults that pydantic found, in the service's words: a dotted field, a message, the value."""
+def faults_of(
+    error: ValidationError, prefix: tuple[str, ...] = (), model: type[BaseModel] | None = None
+) -> list[Fault]:
+    """Faults that pydantic found, in the service's words: a dotted field, a message, the value.
+
+    With the model that was validated, an unknown field is answered with the nearest that there is.
+    """
     return [
-        Fault(_field((*prefix, *fault["loc"])), plain_message(fault), _value(fault))
+        Fault(
+            _field((*prefix, *fault["loc"])),
+            plain_message(fault) + _meant(model, fault),
+            _value(fault),
+        )
         for fault in causes(error.errors(include_url=False))[:MAX_FAULTS_SHOWN]
     ]
+
+
+def _meant(model: type[BaseModel] | None, fault: Any) -> str:
+    """The field that an unknown one may stand for, or those that there are, as end of a message."""
+    if model is None or fault["type"] != "extra_forbidden":
+        return ""
+    allowed = allowed_keys(model, fault["loc"][:-1])
+    if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
+        return f"; did you mean {near}?"
+    return f"; there are {', '.join(allowed)}" if allowed else ""
 
 
 def checked_by(
@@ -72,7 +97,10 @@ def checked_by(
     try:
         return validate(given)
     except ValidationError as error:
-        faults = faults_of(error, prefix)
+        # Of the validator of a model, a bound method, the model is known.
+        owner = getattr(validate, "__self__", None)
+        is_model = isinstance(owner, type) and issubclass(owner, BaseModel)
+        faults = faults_of(error, prefix, owner if is_model else None)
     raise BadBatch(faults)
 
 

@@ -15,7 +15,7 @@ from acquire_client.models import Replay
 from tqdm import tqdm
 
 from service.errors import BadFile, Fault
-from service.observations.telemetry import telemetry_format
+from service.observations.input_formats import input_format, telemetry_format
 from service.replay.items import LineOutcome
 
 MAX_PROBLEMS_SHOWN = 20
@@ -226,7 +226,7 @@ def _lines_in(files: Sequence[Path]) -> int | None:
     """Lines to come, for the bar; None where a line is not a batch."""
     count = 0
     for file in files:
-        if telemetry_format(file) == "csv":
+        if not input_format(telemetry_format(file)).one_a_line:
             return None
         try:
             with file.open("rb") as stream:

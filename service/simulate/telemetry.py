@@ -28,8 +28,8 @@ from service.missions.mission import Band, Mission
 from service.missions.motion import GyroSettings
 from service.observations.batch import Aberration
 from service.observations.csv_rows import write_batches_csv
+from service.observations.input_formats import CSV, telemetry_format
 from service.observations.schema import BatchIn
-from service.observations.telemetry import telemetry_format
 from service.simulate import motion
 from service.simulate.sightings import BatchScene, Seen, real_sky
 from service.simulate.stretches import Pass
@@ -265,7 +265,7 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
     with ExitStack() as stack:
         truth = stack.enter_context(_appearing(truth_path(telemetry)))
         out = stack.enter_context(_appearing(telemetry))
-        if telemetry_format(telemetry) == "csv":
+        if telemetry_format(telemetry) == CSV:
             write_batches_csv(
                 (BatchIn.model_validate_json(json.dumps(each.batch)) for each in truth_written()),
                 out,

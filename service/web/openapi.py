@@ -21,12 +21,13 @@ from starlette.responses import Response
 from service import __version__
 from service.contract.base import Record, component_name, described
 from service.contract.events import EVENT_DATA
+from service.observations.input_formats import INPUT_FORMATS, NDJSON, PACKETS, input_formats
 from service.products.formats import attitude_formats, table_formats
 from service.web.middleware import API
 from service.web.requests.access import POLICIES
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
 from service.web.requests.query_parameters import NO_QUERY, TIME_SCHEMA
-from service.web.requests.request_body import BINARY, CSV, FRAMES, JSON, NDJSON, PACKETS
+from service.web.requests.request_body import BINARY, FRAMES, JSON
 
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
@@ -153,11 +154,14 @@ class ApiRouter(APIRouter):
         if lines_of is not None:
             description = f"A `{lines_of.__name__}` a line."
             lines = {"schema": _BINARY | {"description": description}}
-            content, reading = dict.fromkeys((NDJSON[0], BINARY), lines), READING_NDJSON
+            types = INPUT_FORMATS[NDJSON].media_types[0], BINARY
+            content, reading = dict.fromkeys(types, lines), READING_NDJSON
             if archive is not None:
-                rows = "One star or one gyro sample a row; `.csv` or `.tsv` of `acquire replay`."
-                content[CSV] = {"schema": _BINARY | {"description": rows}}
-                content[PACKETS] = {"schema": _BINARY | {"description": archive}}
+                for name, each in input_formats().items():
+                    if name != NDJSON and each.media_types:
+                        text = archive if name == PACKETS else each.uploaded
+                        schema = _BINARY | {"description": text}
+                        content[each.media_types[0]] = {"schema": schema}
         if frame:
             file = {"schema": _BINARY}
             content, reading = dict.fromkeys(FRAMES, file), READING_FRAME

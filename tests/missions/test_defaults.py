@@ -12,7 +12,7 @@ from service.missions.defaults import RULES, TRACKER_RULES
 from service.missions.mission import SHIPPED_FOLDER, parse_mission, read_mission
 from service.simulate.sightings import in_field
 from service.vectors import from_ra_dec, rotate_about, separation_deg
-from tests.missions.stated_files import STATED_FOLDER
+from tests.missions.stated_files import STATED_FOLDER, toml_text
 
 DOCUMENT = Path(__file__).parents[2] / "docs" / "missions.md"
 TEN_LINES = DOCUMENT.read_text(encoding="utf-8").split("```toml\n")[1].partition("```")[0]
@@ -35,6 +35,29 @@ def test_the_mission_of_ten_lines_in_the_document_is_whole():
     assert mission.zone.kind == "cap"
     assert mission.identifier == "verified"
     assert mission.catalog.magnitude_limit_mag == 6.5
+
+
+def test_four_values_are_required_and_every_other_has_a_default():
+    """A tracker along the body's own axes needs no axes, one that states Z states X or Y too."""
+    table = tomllib.loads(TEN_LINES)
+    tracker = table["trackers"][0]
+    required = set()
+    for held in (table, tracker):
+        for key in [*held]:
+            value = held.pop(key)
+            try:
+                parse_mission(toml_text(table), "mine.toml")
+            except BadConfiguration:
+                required.add(key)
+            held[key] = value
+    assert required - {"trackers"} == {
+        *("name", "field_of_view_deg", "sigma_arcsec", "limit_mag"),
+        *("x_axis_body",),
+    }
+    for key in ("x_axis_body", "z_axis_body"):
+        del tracker[key]
+    del table["a_priori_error_deg"]
+    assert parse_mission(toml_text(table), "mine.toml").identifier == "lost_in_space"
 
 
 @pytest.mark.parametrize("name", ["xte", "swas", "soho", "imager"])

@@ -8,11 +8,10 @@ import tomllib
 
 import pytest
 
-from service.cli.mission_files import _value
 from service.errors import BadBatch, BadConfiguration
 from service.missions.mission import parse_mission
 from service.observations.schema import submission_from_json
-from tests.missions.stated_files import STATED_FOLDER
+from tests.missions.stated_files import STATED_FOLDER, toml_text
 from tests.missions.test_defaults import TEN_LINES
 from tests.observations.example import BATCH
 
@@ -56,13 +55,6 @@ def mutated(whole, rng):
     else:
         del held[path[-1]]
     return made
-
-
-def toml_text(table):
-    """A table as TOML, its own tables in line."""
-    return "".join(f"{key} = {_value(value)}\n" for key, value in table.items()).replace(
-        "NaN", "nan"
-    )
 
 
 def checked(line, whole):

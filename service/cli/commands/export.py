@@ -33,7 +33,9 @@ def add(commands: Any) -> None:
 
 
 def _add_attitude(commands: Any) -> None:
-    parser = arguments.add_command(commands, "attitude", _write_attitude)
+    parser = arguments.add_command(
+        commands, "attitude", _write_attitude, first="--run --start --end --format --grade --output"
+    )
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     parser.add_argument("--format", choices=tuple(attitude_formats()), default="csv")

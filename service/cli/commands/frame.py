@@ -21,7 +21,13 @@ FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "frame", run, notes=SIDECAR)
+    parser = arguments.add_command(
+        commands,
+        "frame",
+        run,
+        notes=SIDECAR,
+        first="--spacecraft --fov --a-priori --overlay --url --in-process",
+    )
     parser.add_argument("files", nargs="+", type=Path, metavar="FILE")
     parser.add_argument(
         "--spacecraft", metavar="NAME", help=f"{arguments.CAMERA_MISSION}; none: any camera"

@@ -16,30 +16,22 @@ if TYPE_CHECKING:
     from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
-CSV_HELP = """\
-CSV files have a header and one star per row; the rows with the same (spacecraft, run, batch)
-form a batch, in whatever order they are.  Commas, semicolons (also with decimal commas), tabs or
-bars separate the cells, which may be empty.  Columns, as in the JSON:
-  spacecraft batch run time frame aberration options
-  q1 q2 q3 qc boresight_ra_deg boresight_dec_deg sun_pointed sun_counts a_priori_from
-  rate_x_deg_per_s rate_y_deg_per_s rate_z_deg_per_s
-  velocity_x_km_per_s velocity_y_km_per_s velocity_z_km_per_s
-  position_x_km position_y_km position_z_km sun_vector_x sun_vector_y sun_vector_z
-  tracker x y z h_deg v_deg magnitude time_offset_s sigma_arcsec
-  h_counts v_counts h_times v_times column_counts row_counts
-  measured_q1 measured_q2 measured_q3 measured_qc
-  measured_sigma_x_arcsec measured_sigma_y_arcsec measured_sigma_z_arcsec
-  measured_p11_arcsec2 measured_p12_arcsec2 measured_p13_arcsec2
-  measured_p22_arcsec2 measured_p23_arcsec2 measured_p33_arcsec2
-spacecraft, batch, time are required, with stars (tracker, and x y z, h_deg v_deg or the counts or
-times of a scan) or a measured attitude."""
 
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "replay", run, notes=CSV_HELP)
+    parser = arguments.add_command(
+        commands, "replay", run, first="--run --url --in-process --results --formats"
+    )
     parser.add_argument(
         "files", nargs="*", type=Path, metavar="FILE", help=".csv and .tsv are CSV, else NDJSON"
+    )
+    parser.add_argument(
+        "--formats",
+        nargs="?",
+        const="",
+        metavar="NAME",
+        help="print the list of input formats; with NAME its fields, and an example",
     )
     _add_packets(parser)
     arguments.add_url_or_in_process(parser)
@@ -133,7 +125,11 @@ def run(parsed: Namespace) -> int:
     acquire replay pass.ndjson --a-priori xte.aem  use the attitudes of a file as a priori
     acquire replay pass.ndjson --ephemeris xte.oem  use the velocities of a file
     acquire replay --packets pass.dat --xtce mission.xml     CCSDS space packets
+    acquire replay --formats csv                   the columns of CSV files, and an example
     """
+    if parsed.formats is not None:
+        print(_formats_text(parsed.formats))
+        return 0
     from msgspec import to_builtins
 
     from service.replay.items import AttitudeCarrier, Pace, items_of, packet_items, run_name
@@ -199,6 +195,21 @@ def run(parsed: Namespace) -> int:
     if not parsed.json and summary.batches:
         print(f"{'next':<20}{_next_step(parsed, run)}")
     return 1 if summary.refused else 0
+
+
+def _formats_text(name: str) -> str:
+    """The list of input formats, or what one of them holds, with an example."""
+    from service.observations.input_formats import input_format, input_formats
+
+    if name:
+        shown = input_format(name)
+        parts = f"{shown.title}: {shown.holds}", f"acquire replay {shown.given}", shown.notes
+        return "\n\n".join((*parts, f"Example:\n\n{shown.example}") if shown.example else parts)
+    rows = [
+        f"{key:<9}{each.given:<28}{each.title}: {each.holds}"
+        for key, each in input_formats().items()
+    ]
+    return "\n".join((*rows, "", "acquire replay --formats NAME prints its fields, and an example"))
 
 
 def _next_step(parsed: Namespace, run: str) -> str:

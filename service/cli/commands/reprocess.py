@@ -20,7 +20,9 @@ settings name, and tcp:// only in a network that you trust.  The extra `dask` ha
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "reprocess", run, notes=SCHEDULER)
+    parser = arguments.add_command(
+        commands, "reprocess", run, notes=SCHEDULER, first="--spacecraft --source --run --mission"
+    )
     arguments.add_period(
         parser, "the run for the results; default: a name derived from the settings"
     )

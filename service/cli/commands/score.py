@@ -18,6 +18,7 @@ def add(commands: Any) -> None:
         commands,
         "score",
         run,
+        first="--run --plot",
         notes="Between two records of the truth the body is taken to turn at a constant rate. "
         "Attitudes\noutside its segments are counted and left out.",
     )

@@ -33,12 +33,16 @@ def add(commands: Any) -> None:
 
 
 def _add_frames(group: Any) -> None:
-    parser = arguments.add_command(group, "frames", _run_frames)
-    parser.add_argument("output", type=Path, metavar="OUTDIR")
+    parser = arguments.add_command(
+        group, "frames", _run_frames, first="--seed --format --prior-error --lost"
+    )
+    parser.add_argument("output", type=Path, metavar="OUTDIR", help="the folder to write")
     parser.add_argument(
         "--spacecraft", required=True, metavar="NAME", help=arguments.CAMERA_MISSION
     )
-    parser.add_argument("--frames", required=True, type=arguments.count, metavar="N")
+    parser.add_argument(
+        "--frames", required=True, type=arguments.count, metavar="N", help="number of frames"
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--tracker", metavar="NAME", help="default: the first tracker with a camera"
@@ -143,10 +147,14 @@ _SERIOUS_SHARE = 0.1
 
 
 def _add_telemetry(group: Any) -> None:
-    parser = arguments.add_command(group, "telemetry", _run_telemetry)
-    parser.add_argument("output", type=Path, metavar="OUT.ndjson")
+    parser = arguments.add_command(
+        group, "telemetry", _run_telemetry, first="--seed --start --cadence --nominal"
+    )
+    parser.add_argument("output", type=Path, metavar="OUT.ndjson", help="or OUT.csv")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
-    parser.add_argument("--batches", required=True, type=arguments.count, metavar="N")
+    parser.add_argument(
+        "--batches", required=True, type=arguments.count, metavar="N", help="number of batches"
+    )
     parser.add_argument("--seed", type=int, default=1, metavar="S", help="default 1")
     parser.add_argument(
         "--start",
@@ -171,15 +179,14 @@ def _add_telemetry(group: Any) -> None:
         "space",
     )
     _add_errors(parser)
-    more = parser.add_argument_group("more options")
-    more.add_argument(
+    parser.add_argument(
         "--angles",
         type=float,
         default=0.25,
         metavar="SHARE",
         help="share of stars sent as h_deg, v_deg; default 0.25",
     )
-    more.add_argument(
+    parser.add_argument(
         "--aberration",
         default="to_correct",
         metavar="WORD[=SHARE],...",
@@ -226,7 +233,7 @@ def _add_periods(parser: Any) -> None:
         "share of the pass with each error, from 0 to 1, and its size",
     )
     preset = serious.add_mutually_exclusive_group()
-    preset.add_argument("--nominal", action="store_true", help="no errors")
+    preset.add_argument("--nominal", action="store_true", help="no periods with errors")
     preset.add_argument(
         "--serious", action="store_true", help="each kind of error for a tenth of the pass"
     )
@@ -339,7 +346,7 @@ def _drawn_text(wanted: "Pass", mission: "Mission") -> str:
 
 
 def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
-    from service.observations.telemetry import telemetry_format
+    from service.observations.input_formats import NDJSON, telemetry_format
     from service.simulate.telemetry import GyroWanted
 
     flaws = parsed.gyro_quantum, parsed.gyro_gap, parsed.clock_step
@@ -347,7 +354,7 @@ def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
         if any(flaws):
             raise BadInput(Fault("--gyro", "is missing: without it there is no gyro"))
         return None
-    if telemetry_format(parsed.output) == "csv":
+    if telemetry_format(parsed.output) != NDJSON:
         raise BadInput(Fault("--gyro", "needs NDJSON: a CSV file has batches or gyro samples"))
     return GyroWanted(parsed.gyro, *flaws)
 

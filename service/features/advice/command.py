@@ -10,7 +10,7 @@ from service.cli.arguments import period_of, progress_bar, settings_of_existing
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "advise", run)
+    parser = arguments.add_command(commands, "advise", run, first="--run --try")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run to examine; default live")
     parser.add_argument(

@@ -18,7 +18,9 @@ RECORDED_BY = "acquire calibrate"
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "calibrate", run)
+    parser = arguments.add_command(
+        commands, "calibrate", run, first="--run --start --end --output --record"
+    )
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
     arguments.add_period(parser, "the run to use; default live")
     parser.add_argument(

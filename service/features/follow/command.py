@@ -16,7 +16,7 @@ DEFAULT_CONCURRENCY = 16
 
 def add(commands: Any) -> None:
     """Declare the command."""
-    parser = arguments.add_command(commands, "follow", run)
+    parser = arguments.add_command(commands, "follow", run, first="--url --answers --until-empty")
     parser.add_argument("source", metavar="nats://HOST/STREAM", help="or tls://HOST/STREAM")
     parser.add_argument(
         "--consumer",

@@ -12,6 +12,7 @@ from starlette.responses import Response
 from service.app.replays import UploadForm, discard_upload
 from service.contract.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.errors import BadBatch, Fault, shown_value
+from service.observations.input_formats import PACKETS
 from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
@@ -161,7 +162,7 @@ def start_replay(
     ends as `failed`.
     """
     query, body = upload.query, upload.body
-    if query.spacecraft is not None and body.form != "packets":
+    if query.spacecraft is not None and body.form != PACKETS:
         discard_upload(body.file)
         message = "goes with space packets; a batch names its own spacecraft"
         raise BadBatch(Fault("spacecraft", message, shown_value(query.spacecraft)))

@@ -22,19 +22,14 @@ from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
+from service.observations.input_formats import NDJSON, format_of_media_type, input_formats
 from service.observations.schema import checked_by
-from service.observations.telemetry import TelemetryForm
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
 FRAMES = ("application/fits", "image/fits", "image/tiff", "image/png", "application/x-npy", BINARY)
 """Media types of frames; the first bytes tell the format."""
-NDJSON = ("application/x-ndjson", "application/ndjson", "application/jsonl", BINARY)
-"""Generated clients can send the last one: most know no type for lines."""
-PACKETS = "application/x-tar"
-CSV = "text/csv"
-"""Files of space packets with their XTCE file."""
 
 MAX_JSON_BYTES = 2 << 20
 """Enough for ten thousand stars, so that the error names their number and not the size."""
@@ -201,19 +196,21 @@ class Spooled:
     file: IO[bytes]
     coding: Coding
     lines: int | None
-    form: TelemetryForm = "lines"
+    form: str = NDJSON
 
 
 async def telemetry_body(
     request: Request, new_file: Callable[[], IO[bytes]], discard: Callable[[IO[bytes]], object]
 ) -> Spooled:
-    """A body of lines, CSV or packets in a new file; one that did not arrive is discarded.
+    """A body in one of the input formats in a new file; one that did not arrive is discarded.
 
-    Lines (NDJSON) may be compressed.
+    One with a batch a line may be compressed.
     """
-    kind = _require_type(request, (*NDJSON, CSV, PACKETS))
-    form: TelemetryForm = "packets" if kind == PACKETS else "csv" if kind == CSV else "lines"
-    coding = _coding(request, ("identity", "gzip", "zstd") if form == "lines" else ("identity",))
+    formats = input_formats()
+    kind = _require_type(request, sum((each.media_types for each in formats.values()), ()))
+    form = format_of_media_type(kind)
+    codings = ("identity", "gzip", "zstd") if formats[form].one_a_line else ("identity",)
+    coding = _coding(request, codings)
     limits: BodyLimits = request.app.state.limits
     file = new_file()
     lines, last = 0, b"\n"
@@ -231,7 +228,7 @@ async def telemetry_body(
         discard(file)
         raise BadBatch(Fault("body", "has no lines; it must hold one batch per line"))
     file.seek(0)
-    if form != "lines":
+    if not formats[form].one_a_line:
         return Spooled(file, coding, None, form)
     # The last line may lack its newline.
     return Spooled(file, coding, lines + (last != b"\n") if coding == "identity" else None)
