@@ -111,6 +111,16 @@ def test_every_example_in_the_help_is_understood(acquire):
                 assert parser.parse_args(words[1:]).function
 
 
+def test_the_help_of_all_begins_with_the_commands_of_a_first_day(acquire):
+    out = acquire("--help")[1]
+    first, _, more = out.partition("commands to begin with:\n")[2].partition("\nmore commands:\n")
+    shown = re.findall(r"^  ([a-z]+) ", first, re.MULTILINE)
+    assert shown == ["mission", "simulate", "serve", "replay", "frame", "export", "demo"]
+    others = re.findall(r"^  ([a-z]+) ", more.partition("\noptions:")[0], re.MULTILINE)
+    assert {*shown, *others} == {*build_parser().commands.choices}
+    assert len(out.splitlines()) < 75
+
+
 def parsers_of(parser, words=()):
     """Every command that has no commands of its own, with its words."""
     if parser.commands is None:

@@ -87,6 +87,7 @@ def build_parser(features_off: str = "") -> argparse.ArgumentParser:
         acquire replay pass.ndjson --results out.ndjson
         acquire COMMAND --help                       the arguments of a command
         """,
+        first="mission simulate serve replay frame export demo",
     )
     parser.add_argument("--version", action="version", version=f"acquire {__version__}")
     added = add_subcommands(parser)

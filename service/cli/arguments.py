@@ -45,6 +45,10 @@ def print_json(value: Any) -> None:
     print(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
 
 
+_Section = tuple[str | None, str | None, Sequence[argparse.Action]]
+"""A title, a description, and the arguments or commands of a part of the help."""
+
+
 class Parser(argparse.ArgumentParser):
     """A parser whose error messages fit on one line, name what was meant and point to the help.
 
@@ -54,44 +58,66 @@ class Parser(argparse.ArgumentParser):
     commands: Any = None
     """What takes the commands of this command; None for one without."""
     first: Sequence[str] = ()
-    """Options that most people need: the help of a command with many shows these first."""
+    """Options, or commands, that most people need: the help shows these before all others."""
 
     def format_help(self) -> str:
-        """The help; with `first` these, and what is required, before all other options."""
+        """The help; with `first` these, and what is required, before all others."""
         if not self.first:
             return super().format_help()
-        actions = [each for each in self._actions if each.help != argparse.SUPPRESS]
-        shown = [
-            each
-            for each in actions
-            if each.required or not each.option_strings or {*each.option_strings} & {*self.first}
-        ]
-        rest = [each for each in self._optionals._group_actions if each in actions]
         formatter = self._get_formatter()
-        more = argparse.Action([], "more", nargs="?", metavar="more options")
-        groups = [
-            each for each in self._mutually_exclusive_groups if {*each._group_actions} <= {*shown}
-        ]
-        formatter.add_usage(None, [*shown, more], groups)
+        if self.commands is not None:
+            formatter.add_usage(None, self._actions, [])
+            sections = self._sections_of_commands()
+        else:
+            shown = self._first_arguments()
+            more = argparse.Action([], "more", nargs="?", metavar="more options")
+            groups = [
+                each
+                for each in self._mutually_exclusive_groups
+                if {*each._group_actions} <= {*shown}
+            ]
+            formatter.add_usage(None, [*shown, more], groups)
+            sections = self._sections_of_options(shown)
         formatter.add_text(self.description)
-        sections = [
-            ("arguments", None, shown),
-            ("more options", None, rest),
-            *(
-                (group.title, group.description, group._group_actions)
-                for group in self._action_groups
-                if group not in (self._optionals, self._positionals)
-            ),
-        ]
         for title, description, members in sections:
             formatter.start_section(title)
             formatter.add_text(description)
-            formatter.add_arguments(
-                each for each in members if members is shown or each not in shown
-            )
+            formatter.add_arguments(members)
             formatter.end_section()
         formatter.add_text(self.epilog)
         return formatter.format_help()
+
+    def _sections_of_commands(self) -> list[_Section]:
+        listed = {each.dest: each for each in self.commands._get_subactions()}
+        # A command of a feature that is off is not there.
+        shown = [listed.pop(name) for name in self.first if name in listed]
+        return [
+            ("commands to begin with", None, shown),
+            ("more commands", None, [*listed.values()]),
+            ("options", None, self._optionals._group_actions),
+        ]
+
+    def _first_arguments(self) -> list[argparse.Action]:
+        return [
+            each
+            for each in self._actions
+            if each.help != argparse.SUPPRESS
+            and (each.required or not each.option_strings or {*each.option_strings} & {*self.first})
+        ]
+
+    def _sections_of_options(self, shown: list[argparse.Action]) -> list[_Section]:
+        return [
+            ("arguments", None, shown),
+            *(
+                (
+                    "more options" if group is self._optionals else group.title,
+                    group.description,
+                    [each for each in group._group_actions if each not in shown],
+                )
+                for group in self._action_groups
+                if group is not self._positionals
+            ),
+        ]
 
     def error(self, message: str) -> NoReturn:
         """Print the message and exit with code 2."""
@@ -158,7 +184,8 @@ def add_command(
     The help is the function's docstring: what the command does, an empty line, examples.  A group,
     and a command whose function serves several, has `summary` and `examples` instead.  `notes`
     follow the examples.  `first` are the options that most people need, of a command with more
-    than `MOST_OPTIONS`.  `parent` None makes the parser of the whole command.
+    than `MOST_OPTIONS`, or the commands to begin with.  `parent` None makes the parser of the whole
+    command.
     """
     if not summary:
         summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
@@ -172,8 +199,12 @@ def add_command(
         "allow_abbrev": False,
     }
     if parent is None:
-        return Parser(prog=name, **arguments)
-    made: argparse.ArgumentParser = parent.add_parser(name, help=summary, **arguments)
+        whole = Parser(prog=name, **arguments)
+        whole.first = first.split()
+        return whole
+    # The list of commands has their first sentences.
+    brief = f"{summary.partition('. ')[0].rstrip('.')}."
+    made: argparse.ArgumentParser = parent.add_parser(name, help=brief, **arguments)
     made.set_defaults(function=function)
     if isinstance(made, Parser):
         made.first = first.split()

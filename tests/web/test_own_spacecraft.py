@@ -11,6 +11,9 @@ from pathlib import Path
 
 import pytest
 
+from service.acquire import acquire
+from service.missions.mission import parse_mission
+from service.observations.schema import submission_from_json
 from tests.waiting import wait_until
 from tests.web.serving import is_ready
 from tests.web.test_quickstart import run
@@ -65,6 +68,13 @@ def test_every_command_gives_the_output_that_is_shown(tmp_path):
             server.send_signal(signal.SIGTERM)
             server.wait(timeout=60)
     assert server is not None
+
+
+def test_the_batch_on_the_page_is_one_of_the_mission_on_the_page(sky):
+    (batch,) = re.findall(r"^```json\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
+    (mission,) = [text for kind, text in BLOCKS if kind == "text" and "[[trackers]]" in text]
+    read = submission_from_json(batch).batch
+    assert acquire(read, parse_mission(mission, "mycube.toml"), sky).counts["observed"] == 2
 
 
 def test_the_mission_on_the_page_has_ten_lines_at_most():

@@ -24,7 +24,7 @@ def add(commands: Any) -> None:
     group = arguments.add_group(
         commands,
         "mission",
-        "Mission files: check one before the service uses it, and estimate its zones.",
+        "Mission files: write one, check what it can expect, show every value.",
         "acquire mission check missions/mine.toml",
     )
     parser = arguments.add_command(group, "check", check, notes=NOTES)
