@@ -60,8 +60,8 @@ def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> Mis
     return MissionReport(mission, run_catalog, views, zones, found)
 
 
-def with_expectation(report: MissionReport, catalog: "Catalog") -> MissionReport:
-    """The report with outcomes of simulated views; as it is where something is wrong."""
+def with_expectation(report: MissionReport, catalog: "Catalog", seconds: float) -> MissionReport:
+    """The report with outcomes of views simulated for that long; as it is where it is wrong."""
     from service.acquire.kernel_build import KernelBuild
     from service.simulate.expected import expected_outcomes
     from service.sky.cache import LruCache
@@ -74,7 +74,7 @@ def with_expectation(report: MissionReport, catalog: "Catalog") -> MissionReport
         print(text, file=sys.stderr, flush=True)
     sky = SkyModel(catalog, LruCache(256 << 20))
     moment = parse_utc(f"{report.run_catalog.epoch_year:.0f}-03-01T00:00:00Z")
-    return replace(report, expected=expected_outcomes(report.mission, sky, moment))
+    return replace(report, expected=expected_outcomes(report.mission, sky, moment, seconds))
 
 
 def epoch_of(epoch: float | None) -> float:

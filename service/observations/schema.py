@@ -80,7 +80,7 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
     """The field that an unknown one may stand for, or those that there are, as end of a message."""
     if model is None or fault["type"] != "extra_forbidden":
         return ""
-    allowed = allowed_keys(model, fault["loc"][:-1])
+    allowed = allowed_keys(model, _fields_of(fault["loc"])[:-1])
     if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
         return f"; did you mean {near}?"
     return f"; there are {', '.join(allowed)}" if allowed else ""
@@ -104,21 +104,23 @@ def checked_by(
     raise BadBatch(faults)
 
 
-def _field(location: tuple[str | int, ...]) -> str:
-    tags = tuple(PRIOR_KINDS)
-    parts = [
-        # A client's own key may be of any length.
-        str(part)[:MAX_NAME_SHOWN]
+def _fields_of(location: tuple[str | int, ...]) -> list[str | int]:
+    """A location without the tag of the kind of prior, which is pydantic's, not a field."""
+    return [
+        part
         for index, part in enumerate(location)
-        # The tag of the kind of prior is pydantic's, not a field of the body.
         if not (
-            part in tags
+            part in PRIOR_KINDS
             and index
             and location[index - 1] == "a_priori"
             and index + 1 < len(location)
         )
     ]
-    return ".".join(parts) or "body"
+
+
+def _field(location: tuple[str | int, ...]) -> str:
+    # A client's own key may be of any length.
+    return ".".join(str(part)[:MAX_NAME_SHOWN] for part in _fields_of(location)) or "body"
 
 
 def _value(fault: Any) -> str | None:

@@ -26,7 +26,6 @@ CLEAR_LATITUDE_DEG, DENSE_LATITUDE_DEG = 30.0, 10.0
 """A view farther from the galactic plane counts as clear sky, a nearer one as dense."""
 VIEWS, AT_ONCE = 400, 20
 STARS = 5
-SECONDS = 5.0
 
 
 @dataclass
@@ -49,7 +48,7 @@ class Expected:
 
 
 def expected_outcomes(
-    mission: Mission, sky: SkyModel, moment: Utc, seed: int = 1, seconds: float = SECONDS
+    mission: Mission, sky: SkyModel, moment: Utc, seconds: float, seed: int = 1
 ) -> list[Expected]:
     """Outcomes in clear and in dense sky of up to `VIEWS` views, or as many as the time allows."""
     found = {"clear": Expected("clear"), "dense": Expected("dense")}

@@ -1,0 +1,74 @@
+"""Ten lines for trackers of data sheets: telemetry is identified as the paper's rules predict.
+
+The tolerances follow from the lines by the factors of the paper's Table 1, and the prediction is
+its simulator.  Fields and errors are those of:
+
+- the star tracker of ROSAT: SPIE, doi 10.1117/12.968097 (5.9 x 4.4 deg, 2 arcsec, 6.5 mag);
+- TOAST, of TPD: ESA SP-255 (1986), p. 295 (8.1 x 5.4 deg, 1.5 arcsec, 6.5 mag);
+- the tracker of a test bench: doi 10.1155/2013/505720 (22.48 x 17.02 deg, 7 mag, 61 arcsec a
+  pixel, of which a tenth is a usual error of a position).
+"""
+
+import json
+
+import numpy as np
+import pytest
+
+from service.acquire import acquire
+from service.advice.intervals import share_of
+from service.missions.mission import parse_mission
+from service.observations.schema import submission_from_json
+from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.telemetry import draw_pass
+from studies.mission_rates.simulation import Plan, one_tracker, settings_of, simulate
+from tests.scale import draws
+
+SHEETS = {
+    "ROSAT": ("[5.9, 4.4]", 2.0, 6.5),
+    "TOAST": ("[8.1, 5.4]", 1.5, 6.5),
+    "BENCH": ("[22.48, 17.02]", 6.1, 7.0),
+}
+
+
+def mission_of(name):
+    field, sigma, limit = SHEETS[name]
+    text = f"""name = "{name}"
+identifier = "starid"
+a_priori_error_deg = 0.5
+[[trackers]]
+x_axis_body = [1.0, 0.0, 0.0]
+z_axis_body = [0.0, 0.0, 1.0]
+field_of_view_deg = {field}
+sigma_arcsec = {sigma}
+limit_mag = {limit}
+"""
+    assert len(text.splitlines()) <= 10
+    return parse_mission(text, f"{name}.toml")
+
+
+def share_right(mission, sky, batches, seed):
+    """The share of stars of telemetry that are unique and right; the interval counts batches."""
+    right, batch = [], []
+    wanted = Pass(batches, seed, stars=5, troubles=NO_TROUBLES)
+    for k, drawn in enumerate(draw_pass(mission, sky, wanted)):
+        found = acquire(submission_from_json(json.dumps(drawn.batch)).batch, mission, sky)
+        for truth, tracker in zip(drawn.truth["observations"], found.trackers, strict=True):
+            named = tracker.identification
+            for true, star, unique in zip(truth["stars"], named.star, named.unique, strict=True):
+                right.append(bool(unique) and found.run_catalog.star_id[star] == true)
+                batch.append(k)
+    return share_of(np.array(right), np.array(batch))
+
+
+@pytest.mark.parametrize("name", SHEETS)
+def test_telemetry_has_the_shares_that_the_rules_of_the_paper_predict(name, sky, seed):
+    """Within both intervals, each made twice as wide, for no seed is to fail by chance."""
+    mission = one_tracker(mission_of(name), None)
+    settings = tuple(settings_of(mission, []))
+    plan = Plan(settings, "starid", {}, None, 180.0, draws(24, 120), 10, 5, seed)
+    (rates,) = simulate(plan, processes=1, quiet=True)
+    predicted, found = rates.unique_right, share_right(mission, sky, draws(150, 1000), seed)
+    reach = (predicted.high - predicted.low) + (found.high - found.low)
+    assert found.value == pytest.approx(predicted.value, abs=reach)
+    assert rates.wrong.value < 0.01
+    print(name, predicted, found, rates)
