@@ -81,6 +81,9 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
     if model is None or fault["type"] != "extra_forbidden":
         return ""
     allowed = allowed_keys(model, _fields_of(fault["loc"])[:-1])
+    if fault["loc"][-1] in allowed:
+        # A field of another kind of a priori knowledge.
+        return f" beside {fault['loc'][-2]}"
     if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
         return f"; did you mean {near}?"
     return f"; there are {', '.join(allowed)}" if allowed else ""

@@ -15,7 +15,7 @@ from service.acquire.pipeline import acquired
 from service.acquire.result import Acquisition
 from service.missions.mission import Band, Mission
 from service.observations.schema import submission_from_json
-from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.stretches import NO_TROUBLES, Pass, usual_stars
 from service.simulate.telemetry import DrawnBatch, draw_pass
 from service.sky.model import SkyModel
 from service.times import DAY_S, Utc, shifted
@@ -25,7 +25,6 @@ GALACTIC_POLE = from_ra_dec(192.85948, 27.12825)
 CLEAR_LATITUDE_DEG, DENSE_LATITUDE_DEG = 30.0, 10.0
 """A view farther from the galactic plane counts as clear sky, a nearer one as dense."""
 VIEWS, AT_ONCE = 400, 20
-STARS = 5
 
 
 @dataclass
@@ -71,7 +70,7 @@ def _views(mission: Mission, sky: SkyModel, moment: Utc, seed: int) -> Iterator[
             1,
             seed * VIEWS + k,
             start=shifted(moment, k * step_days * DAY_S).text,
-            stars=STARS,
+            stars=usual_stars(mission),
             prior="quaternion" if mission.knows_attitude else "none",
             troubles=NO_TROUBLES,
         )

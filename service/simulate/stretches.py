@@ -64,6 +64,16 @@ class Stretch:
     progress: float = 0.0
 
 
+USUAL_STARS = 5
+"""The most stars of a tracker that sends no frames, as in the paper."""
+
+
+def usual_stars(mission: Mission) -> int:
+    """The most stars that a tracker of the mission reports: of a camera as many as it sends."""
+    cameras = [each.camera for each in mission.trackers if each.camera is not None]
+    return max((each.most_stars for each in cameras), default=USUAL_STARS)
+
+
 @dataclass(frozen=True)
 class Pass:
     """Everything that decides what telemetry is drawn; the same pass is always drawn the same."""
@@ -72,7 +82,7 @@ class Pass:
     seed: int = 1
     start: str | None = None
     cadence_s: float | None = None
-    stars: int = 5
+    stars: int = USUAL_STARS
     prior: PriorKind = "quaternion"
     angles_share: float = 0.25
     """The share of batches whose stars come as `h_deg`, `v_deg`; the others come as vectors."""

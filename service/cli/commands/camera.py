@@ -67,6 +67,7 @@ def run(parsed: Namespace) -> int:
     maps = _write_maps(parsed.output, found)
     _print_result(found)
     print(f"{parsed.output}: mission {name}; residual maps: {maps[0]}, {maps[1]}")
+    print(f"next: acquire frame PICTURE --spacecraft {parsed.output} --time UTC")
     return 0 if len(used) == len(parsed.files) else 1
 
 

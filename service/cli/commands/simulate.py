@@ -167,9 +167,8 @@ def _add_telemetry(group: Any) -> None:
     parser.add_argument(
         "--stars",
         type=arguments.count,
-        default=5,
         metavar="N",
-        help="maximum number of stars per tracker; default 5",
+        help="maximum number of stars per tracker; default 5, of a camera as many as it sends",
     )
     parser.add_argument(
         "--prior",
@@ -361,7 +360,7 @@ def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
 
 def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
     """The pass that the arguments describe; raises `BadInput` for an impossible one."""
-    from service.simulate.stretches import Pass, Trouble, Troubles
+    from service.simulate.stretches import Pass, Trouble, Troubles, usual_stars
 
     troubles = {}
     for kind, size_name in _SIZES.items():
@@ -377,7 +376,7 @@ def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
         seed=parsed.seed,
         start=parsed.start,
         cadence_s=parsed.cadence,
-        stars=parsed.stars,
+        stars=parsed.stars or usual_stars(mission),
         prior=parsed.prior or ("quaternion" if mission.knows_attitude else "none"),
         a_priori_error_deg=parsed.a_priori_error,
         noise_arcsec=parsed.noise,
