@@ -209,7 +209,9 @@ async def telemetry_body(
     formats = input_formats()
     kind = _require_type(request, sum((each.media_types for each in formats.values()), ()))
     form = format_of_media_type(kind)
-    codings = ("identity", "gzip", "zstd") if formats[form].one_a_line else ("identity",)
+    codings: tuple[Coding, ...] = (
+        ("identity", "gzip", "zstd") if formats[form].one_a_line else ("identity",)
+    )
     coding = _coding(request, codings)
     limits: BodyLimits = request.app.state.limits
     file = new_file()
