@@ -37,8 +37,8 @@ def test_the_mission_of_ten_lines_in_the_document_is_whole():
     assert mission.catalog.magnitude_limit_mag == 6.5
 
 
-def test_four_values_are_required_and_every_other_has_a_default():
-    """A tracker along the body's own axes needs no axes, one that states Z states X or Y too."""
+def test_six_values_are_required_and_every_other_has_a_default():
+    """Four, where the tracker stands along the body's own axes: one axis alone is refused."""
     table = tomllib.loads(TEN_LINES)
     tracker = table["trackers"][0]
     required = set()
@@ -52,7 +52,7 @@ def test_four_values_are_required_and_every_other_has_a_default():
             held[key] = value
     assert required - {"trackers"} == {
         *("name", "field_of_view_deg", "sigma_arcsec", "limit_mag"),
-        *("x_axis_body",),
+        *("x_axis_body", "z_axis_body"),
     }
     for key in ("x_axis_body", "z_axis_body"):
         del tracker[key]

@@ -90,7 +90,7 @@ MISTAKES = [
         ("solver", "'quest' or 'triad'", "kalman"),
     ),
     (XTE.replace("z_axis_body = [1.0", "z_axis_body = [-1.0"), ("trackers.0", "right-handed")),
-    (XTE.replace("z_axis_body = [1.0", "z_axis_body = [2.0"), ("trackers.0", "unit vectors")),
+    (XTE.replace("z_axis_body = [1.0", "z_axis_body = [2.0"), ("trackers.0", "unit vector")),
     (
         XTE.replace("z_axis_body = [1.0, 0.0, 0.0]\n", "").replace("y_axis_body", "# y"),
         ("trackers.0.z_axis_body: is required, such as [0.0, 0.0, 1.0]",),
