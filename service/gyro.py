@@ -13,7 +13,8 @@ from erfa import ufunc
 from pydantic import AfterValidator, Field, model_validator
 
 from service.errors import BadBatch, Conflict, Fault, shown_value
-from service.observations.schema import Key, Number, RunName, Wire, checked_by, is_time
+from service.observations.field_faults import checked_by
+from service.observations.schema import Key, Number, RunName, Wire, is_time
 from service.times import DAY_S, Utc, parse_utc, shifted
 from service.vectors import Vector, read_only
 

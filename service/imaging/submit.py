@@ -24,8 +24,8 @@ from service.missions.camera import STARS_TO_MAG, Camera, CentroidMethod
 from service.missions.mission import Mission, Tracker
 from service.observations import schema
 from service.observations.batch import Aberration
+from service.observations.field_faults import checked_by
 from service.observations.frame_record import FrameRecord, rounded_counts
-from service.observations.schema import checked_by
 from service.times import utc_now
 from service.vectors import Vector
 

@@ -25,7 +25,8 @@ from service.ingest.queue import Backlog, IngestQueue, PendingBatch, RecordedCou
 from service.ingest.solver_pool import WAIT_S, Solver, SolverPool, may_take_long, mission_in_input
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
-from service.observations.schema import OptionsIn, Submission, checked_by, submission_from_json
+from service.observations.field_faults import checked_by
+from service.observations.schema import OptionsIn, Submission, submission_from_json
 from service.sky.model import SkyModel
 from service.storage.queries.results import batch_with_options, read_parent
 from service.storage.recording.answer import answer_of

@@ -8,8 +8,8 @@ models are also what `openapi.yaml` shows.
 import codecs
 import hashlib
 import math
-from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any, Literal, Self, TypeVar
+from collections.abc import Iterable, Sequence
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from msgspec import Struct
@@ -20,19 +20,12 @@ from pydantic import (
     Discriminator,
     Field,
     Tag,
-    ValidationError,
     ValidationInfo,
     model_validator,
 )
 
 from service.errors import BadBatch, BadInput, Fault, shown_value
-from service.missions.faults import (
-    NAME_PATTERN,
-    allowed_keys,
-    causes,
-    nearest,
-    plain_message,
-)
+from service.missions.faults import NAME_PATTERN
 from service.missions.mission import GridStep, Identifier, SolverName
 from service.missions.scan import MOST_LINES, MOST_SAMPLES, MOST_WIRES
 from service.observations.batch import (
@@ -44,91 +37,10 @@ from service.observations.batch import (
     Options,
 )
 from service.observations.decode import batch_from_canonical, prior_from_canonical
+from service.observations.field_faults import PRIOR_KINDS, checked_by
 from service.observations.fill_values import MOST_REMARKS, without_fill_values
 from service.observations.frame_record import FrameRecord
 from service.times import parse_utc
-
-Value = TypeVar("Value")
-
-MAX_FAULTS_SHOWN = 20
-MAX_NAME_SHOWN = 80
-
-PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
-    "from_last": "from"
-}
-"""The kinds of a priori knowledge, and the field that tells each."""
-
-
-def faults_of(
-    error: ValidationError, prefix: tuple[str, ...] = (), model: type[BaseModel] | None = None
-) -> list[Fault]:
-    """Faults that pydantic found, in the service's words: a dotted field, a message, the value.
-
-    With the model that was validated, an unknown field is answered with the nearest that there is.
-    """
-    return [
-        Fault(
-            _field((*prefix, *fault["loc"])),
-            plain_message(fault) + _meant(model, fault),
-            _value(fault),
-        )
-        for fault in causes(error.errors(include_url=False))[:MAX_FAULTS_SHOWN]
-    ]
-
-
-def _meant(model: type[BaseModel] | None, fault: Any) -> str:
-    """The field that an unknown one may stand for, or those that there are, as end of a message."""
-    if model is None or fault["type"] != "extra_forbidden":
-        return ""
-    allowed = allowed_keys(model, _fields_of(fault["loc"])[:-1])
-    if fault["loc"][-1] in allowed:
-        # A field of another kind of a priori knowledge.
-        return f" beside {fault['loc'][-2]}"
-    if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
-        return f"; did you mean {near}?"
-    return f"; there are {', '.join(allowed)}" if allowed else ""
-
-
-def checked_by(
-    validate: Callable[[Any], Value], given: object, prefix: tuple[str, ...] = ()
-) -> Value:
-    """What one of pydantic's validators makes of what was given.
-
-    Raises `BadBatch` with the faults, outside the handler: pydantic's error holds all that was
-    given, and once it is part of a cycle Python's collector never frees it.
-    """
-    try:
-        return validate(given)
-    except ValidationError as error:
-        # Of the validator of a model, a bound method, the model is known.
-        owner = getattr(validate, "__self__", None)
-        is_model = isinstance(owner, type) and issubclass(owner, BaseModel)
-        faults = faults_of(error, prefix, owner if is_model else None)
-    raise BadBatch(faults)
-
-
-def _fields_of(location: tuple[str | int, ...]) -> list[str | int]:
-    """A location without the tag of the kind of prior, which is pydantic's, not a field."""
-    return [
-        part
-        for index, part in enumerate(location)
-        if not (
-            part in PRIOR_KINDS
-            and index
-            and location[index - 1] == "a_priori"
-            and index + 1 < len(location)
-        )
-    ]
-
-
-def _field(location: tuple[str | int, ...]) -> str:
-    # A client's own key may be of any length.
-    return ".".join(str(part)[:MAX_NAME_SHOWN] for part in _fields_of(location)) or "body"
-
-
-def _value(fault: Any) -> str | None:
-    # A missing field or a fault of the whole has nothing to show but its surroundings.
-    return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])
 
 
 def is_time(text: str) -> str:

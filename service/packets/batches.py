@@ -7,7 +7,8 @@ from typing import Any
 
 from service.errors import BadBatch, Fault
 from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
-from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_by, checked_from_model
+from service.observations.field_faults import checked_by
+from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
 from service.packets import clock
 from service.packets.definition import PacketFault
 from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns

@@ -145,10 +145,13 @@ with Server(create_app(open_app(settings, serving=True))) as url:
     body, kind = open(file, "rb").read(), {"content-type": "text/x-stars"}
     begun = httpx.post(url + "/api/v1/replays?run=up", content=body, headers=kind, timeout=120)
     assert begun.status_code == 202, begun.text
-    while (state := httpx.get(url + begun.headers["location"]).json())["state"] == "running":
+    def got(path):
+        return httpx.get(url + path, timeout=120).json()
+
+    while (state := got(begun.headers["location"]))["state"] == "running":
         time.sleep(0.1)
     print(state["state"], state["counts"]["new"], state["counts"]["unique"])
-    described = httpx.get(url + "/api/v1/openapi.json").json()["paths"]["/api/v1/replays"]["post"]
+    described = got("/api/v1/openapi.json")["paths"]["/api/v1/replays"]["post"]
     print(described["requestBody"]["content"]["text/x-stars"]["schema"]["description"])
 """
 

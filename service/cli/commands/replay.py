@@ -1,7 +1,7 @@
 """`acquire replay`: send files of batches through the service."""
 
 from argparse import ArgumentParser, Namespace
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -12,7 +12,7 @@ from service.errors import BadFile, BadInput, Fault, shown_value
 
 if TYPE_CHECKING:
     from service.packets.reader import PacketReader
-    from service.replay.items import FromFile
+    from service.replay.items import AttitudeCarrier, FromFile, Item, Pace
     from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
@@ -158,43 +158,60 @@ def run(parsed: Namespace) -> int:
             with ReplaySummary(sized, parsed.results, progress) as summary:
                 replay_in_process(app, items, summary.add, pace, carrier)
     else:
-        from service.replay.over_http import replay_in_bulk, replay_over_http
-
         if parsed.database is not None:
             message = "goes with --in-process; a running service has its own"
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
-        url, token = service_url(parsed), settings_of(parsed).token
         with ReplaySummary(sized, parsed.results, progress) as summary:
-            if not in_bulk:
-                many = parsed.concurrency or DEFAULT_CONCURRENCY
-                replay_over_http(
-                    url,
-                    items,
-                    summary.add,
-                    pace,
-                    many,
-                    token=token,
-                    watched_run=run if parsed.alarms else None,
-                    carrier=carrier,
-                )
+            if in_bulk:
+                _send_files(parsed, files, run, summary)
             else:
-                replay_in_bulk(
-                    url,
-                    files,
-                    run,
-                    summary.add,
-                    summary.follow,
-                    token=token,
-                    alarms=parsed.alarms,
-                    spacecraft=parsed.spacecraft,
-                    xtce=parsed.xtce,
-                )
+                _send_batches(parsed, items, run, summary, pace, carrier)
     if reader is not None:
         summary.packets = to_builtins(reader.totals())
     _print_counts(run, summary, sources, parsed.json)
     if not parsed.json and summary.batches:
         print(f"{'next':<20}{_next_step(parsed, run)}")
     return 1 if summary.refused else 0
+
+
+def _send_files(
+    parsed: Namespace, files: Sequence[Path], run: str, summary: "ReplaySummary"
+) -> None:
+    from service.replay.over_http import replay_in_bulk
+
+    replay_in_bulk(
+        service_url(parsed),
+        files,
+        run,
+        summary.add,
+        summary.follow,
+        token=settings_of(parsed).token,
+        alarms=parsed.alarms,
+        spacecraft=parsed.spacecraft,
+        xtce=parsed.xtce,
+    )
+
+
+def _send_batches(
+    parsed: Namespace,
+    items: "Iterable[Item]",
+    run: str,
+    summary: "ReplaySummary",
+    pace: "Pace",
+    carrier: "AttitudeCarrier | None",
+) -> None:
+    from service.replay.over_http import replay_over_http
+
+    replay_over_http(
+        service_url(parsed),
+        items,
+        summary.add,
+        pace,
+        parsed.concurrency or DEFAULT_CONCURRENCY,
+        token=settings_of(parsed).token,
+        watched_run=run if parsed.alarms else None,
+        carrier=carrier,
+    )
 
 
 def _formats_text(name: str) -> str:

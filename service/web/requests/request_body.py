@@ -22,8 +22,8 @@ from starlette.types import Scope
 
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
+from service.observations.field_faults import checked_by
 from service.observations.input_formats import NDJSON, format_of_media_type, input_formats
-from service.observations.schema import checked_by
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
