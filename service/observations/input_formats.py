@@ -228,6 +228,12 @@ DATA_START
 DATA_STOP
 """
 
+_ATTITUDES_EXAMPLE = """\
+time,q1,q2,q3,qc
+1996-01-10T12:54:00.000Z,0.6330424085,-0.333721514,0.5945872171,0.3665423597
+1996-01-10T12:55:00.000Z,0.6330424085,-0.333721514,0.5945872171,0.3665423597
+"""
+
 _OEM_EXAMPLE = """\
 CCSDS_OEM_VERS = 2.0
 CREATION_DATE = 1996-01-11T00:00:00
@@ -273,7 +279,7 @@ INPUT_FORMATS: dict[str, InputFormat] = {
     ),
     CSV: InputFormat(
         "CSV",
-        "batches, one star a row; or gyro blocks, one sample a row",
+        "batches, one star a row; or gyro samples",
         "FILE.csv or FILE.tsv",
         _CSV_NOTES + _columns_text(),
         _CSV_EXAMPLE,
@@ -293,14 +299,28 @@ INPUT_FORMATS: dict[str, InputFormat] = {
     ),
     "aem": InputFormat(
         "CCSDS AEM",
-        "attitudes: the a priori attitude of each batch",
+        "the a priori attitude of each batch",
         "--a-priori FILE",
-        "Versions 1 and 2, KVN and XML, every type of attitude.",
+        "Versions 1 and 2, KVN and XML, every type of attitude; perhaps packed with gzip.",
         _AEM_EXAMPLE,
+    ),
+    "acm": InputFormat(
+        "CCSDS ACM",
+        "the a priori attitude of each batch",
+        "--a-priori FILE",
+        "Version 2, KVN and XML: the blocks of attitudes; perhaps packed with gzip.",
+    ),
+    "attitude-csv": InputFormat(
+        "Attitudes as CSV",
+        "the a priori attitude of each batch",
+        "--a-priori FILE",
+        "The columns time, q1, q2, q3, qc, as `acquire export attitude` writes them, and perhaps\n"
+        "rate_x, rate_y, rate_z, stretch, status.",
+        _ATTITUDES_EXAMPLE,
     ),
     "ck": InputFormat(
         "SPICE C-kernel",
-        "attitudes: the a priori attitude of each batch",
+        "the a priori attitude of each batch",
         "--a-priori FILE",
         "A .bc file of type 1 or 3 with its clock (.tsc) in the same folder, or a zip of both.\n"
         "Needs the extra `spice`.",
@@ -319,6 +339,13 @@ INPUT_FORMATS: dict[str, InputFormat] = {
         "With or without lines of names; each is used within 7 days of its epoch.\n"
         "Needs the extra `tle`.",
         _TLE_EXAMPLE,
+    ),
+    "omm": InputFormat(
+        "CCSDS OMM",
+        "velocities and positions",
+        "--ephemeris FILE",
+        "Versions 1 to 3, KVN and XML, and the JSON and CSV of CelesTrak: the elements of a\n"
+        "two-line set.  Needs the extra `tle`.",
     ),
 }
 """The input formats by name."""

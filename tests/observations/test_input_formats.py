@@ -37,7 +37,7 @@ def test_every_column_of_csv_is_described_once():
 
 
 def test_the_page_has_every_format_column_and_example():
-    rows = dict(re.findall(r"^\| `(\w+)` \| `([^|]+)` \|", PAGE, re.MULTILINE))
+    rows = dict(re.findall(r"^\| `([\w-]+)` \| `([^|]+)` \|", PAGE, re.MULTILINE))
     assert rows == {name: each.given for name, each in INPUT_FORMATS.items()}
     for names, unit, meaning in CSV_COLUMNS:
         cells = ", ".join(f"`{name}`" for name in names.split())
@@ -64,9 +64,10 @@ def test_the_batch_and_the_gyro_block_of_the_examples_are_read(tmp_path, mission
 
 def test_the_files_beside_telemetry_of_the_examples_are_read(tmp_path):
     body = json.loads(INPUT_FORMATS["ndjson"].example.splitlines()[0])
-    attitudes = read_attitudes(example_file("aem", tmp_path), "--a-priori")
-    (prior,) = attitudes.at(np.array([NOON.tai_ns])).tolist()
-    assert prior == pytest.approx(body["a_priori"]["quaternion"], abs=1e-9)
+    for name in ("aem", "attitude-csv"):
+        attitudes = read_attitudes(example_file(name, tmp_path), "--a-priori")
+        (prior,) = attitudes.at(np.array([NOON.tai_ns])).tolist()
+        assert prior == pytest.approx(body["a_priori"]["quaternion"], abs=1e-9)
     orbit = read_ephemeris(example_file("oem", tmp_path), "--ephemeris").at(NOON)
     assert orbit[3:].tolist() == pytest.approx(body["velocity_km_per_s"], abs=1e-6)
 

@@ -223,7 +223,7 @@ def _formats_text(name: str) -> str:
         parts = f"{shown.title}: {shown.holds}", f"acquire replay {shown.given}", shown.notes
         return "\n\n".join((*parts, f"Example:\n\n{shown.example}") if shown.example else parts)
     rows = [
-        f"{key:<9}{each.given:<28}{each.title}: {each.holds}"
+        f"{key:<14}{each.given:<28}{each.title}: {each.holds}"
         for key, each in input_formats().items()
     ]
     return "\n".join((*rows, "", "acquire replay --formats NAME prints its fields, and an example"))
