@@ -7,6 +7,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.features.advice.part import AdviceService
+from service.features.alarms.part import Alarms
 from service.missions.mission import load_missions
 from service.replay.in_process import replay_in_process
 from service.replay.items import items_of
@@ -37,7 +38,7 @@ def test_a_nominal_day_raises_no_alarm_and_no_advice(name, tmp_path, sky, seed):
             items_of([file], RUN),
             lambda outcome: refused.append(outcome.problem) if outcome.problem else None,
         )
-        alarms = app.alarms.page(run=RUN, state="all").items
+        alarms = app.part(Alarms).page(run=RUN, state="all").items
         advice = app.part(AdviceService).of_spacecraft(name, run=RUN, sample=100)
     assert refused == []
     assert [(each.quantity, each.value) for each in alarms] == []
