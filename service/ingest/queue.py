@@ -111,7 +111,7 @@ class IngestQueue:
         counts: "RecordedCounts",
         in_force: MissionsInForce,
     ) -> None:
-        """Where services share a database, `in_force` follows it before each group."""
+        """`in_force` follows a database that services share before each group."""
         self._solver, self._store, self._pool = solver, store, pool
         self._counts = counts
         self._shared_missions = in_force if store.lock is not None else None

@@ -79,7 +79,7 @@ class UnsavedResult(Struct, eq=False):
     audit: Row | None = None
     """The entry of the audit list that is stored with a recorded what-if."""
     predicted_from: "PredictedFrom | None" = None
-    """Of a batch that asked for the last attitude, where other services record attitudes, too."""
+    """The results that a prediction began with, where other services record attitudes, too."""
 
     @property
     def id(self) -> str:
