@@ -19,8 +19,10 @@ import logging
 import os
 import tomllib
 from contextlib import ExitStack
+from pathlib import Path
 
 import hypothesis
+import numba
 import numpy as np
 import pytest
 from _pytest.faulthandler import fault_handler_stderr_fd_key
@@ -172,6 +174,19 @@ def pytest_terminal_summary(terminalreporter, config):
         terminalreporter.section("figures")
         for line in sorted(told):
             terminalreporter.line(line)
+    if late := kernels_compiled_twice():
+        terminalreporter.section("kernels compiled for a second kind of arguments")
+        for name in late:
+            terminalreporter.line(name)
+
+
+def kernels_compiled_twice():
+    """Names of numba's files for further kinds of arguments; a post would wait for such a kernel.
+
+    Of all processes that had this folder of kernels since the source was changed.
+    """
+    compiled = Path(numba.config.CACHE_DIR).glob("*/*.nbc")
+    return sorted(path.name for path in compiled if not path.name.endswith(".1.nbc"))
 
 
 def _left_out(config):
@@ -181,9 +196,14 @@ def _left_out(config):
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_sessionfinish(session):
-    """A worker of pytest-xdist tells what it left out; all of them leave out the same."""
+    """A worker of pytest-xdist tells what it left out; all of them leave out the same.
+
+    The whole run fails where a kernel was compiled for a second kind of arguments.
+    """
     if hasattr(session.config, "workeroutput"):
         session.config.workeroutput["left_out"] = session.config.stash.get(LEFT_OUT, {})
+    elif kernels_compiled_twice() and session.exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -24,7 +24,15 @@ from service.observations.scans.reduce import sun_body
 from service.sky.ephemeris import ecliptic_north, sun_direction
 from service.sky.zones import SearchRegion
 from service.times import Utc
-from service.vectors import Matrix, Vector, from_ra_dec, separation_deg, to_ra_dec, unit
+from service.vectors import (
+    Matrix,
+    Vector,
+    from_ra_dec,
+    locked,
+    separation_deg,
+    to_ra_dec,
+    unit,
+)
 
 POLE_FROM_SUN_WARNING_DEG = 1.0
 SUN_FROM_EARTH_GROWTH_DEG = 0.3
@@ -67,7 +75,8 @@ def prior_attitude(
     """
     if isinstance(prior, QuaternionPrior):
         attitude = np.empty((3, 3))
-        to_matrix(prior.quaternion, attitude)
+        # From another process it comes as an array that can be written: a kernel of its own.
+        to_matrix(locked(prior.quaternion), attitude)
         axis = np.dot(mission.axis_body, attitude)
         if isinstance(prior, PredictedPrior):
             return PriorAttitude(attitude, axis, True, None, predicted=prior)

@@ -59,6 +59,16 @@ class Strict(BaseModel):
             del vars(copied)[name]
         return copied
 
+    def __getstate__(self) -> dict[Any, Any]:
+        """What another process gets: the values, and nothing that was worked out from them.
+
+        An array would arrive there as one that can be written, for which kernels are compiled anew.
+        """
+        state = super().__getstate__()
+        fields = type(self).model_fields
+        own = {name: value for name, value in state["__dict__"].items() if name in fields}
+        return state | {"__dict__": own}
+
 
 def is_missing(table: object) -> bool:
     """True if a table was left out of the file: it is then no part of the mission's digest."""

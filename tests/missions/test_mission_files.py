@@ -1,6 +1,7 @@
 """Mission files say what the paper's Table 1 says; a mistake is named with its remedy."""
 
 import math
+import pickle
 
 import numpy as np
 import pytest
@@ -212,6 +213,18 @@ def test_a_changed_copy_keeps_nothing_that_was_worked_out_from_the_old_values(mi
         assert changed.rules.limits.magnitude == 0.9
         assert changed.digest != old.digest
         assert changed.model_copy(update={"tolerances": old.tolerances}).digest == old.digest
+
+
+def test_in_another_process_a_mission_s_arrays_are_locked_as_they_are_here(missions):
+    """Kernels are compiled anew for arrays that can be written, in the way of a batch."""
+    here = missions["XTE"]
+    assert not here.axis_body.flags.writeable
+    assert not here.trackers[0].body_from_tracker.flags.writeable
+    there = pickle.loads(pickle.dumps(here))
+    assert there == here
+    assert there.digest == here.digest
+    assert not there.axis_body.flags.writeable
+    assert not there.trackers[0].body_from_tracker.flags.writeable
 
 
 def test_rules_hold_every_tolerance_and_test_as_the_kernels_read_them(missions):
