@@ -34,7 +34,8 @@ unexport PYTHONDONTWRITEBYTECODE
 VENV = .venv
 BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
-UV = $(BIN)/uv pip install --quiet --python $(BIN)/python
+# Not quiet: it says what it downloads, with sizes.
+UV = $(BIN)/uv pip install --python $(BIN)/python
 COMPILE = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header
 
 IMAGE_EXTRAS = postgresql nats sign spice tle packets tables dask plots images raw
