@@ -126,7 +126,7 @@ Grade = Literal["filtered", "smoothed"]
 Model = Literal["gyro", "constant_rate"]
 GRADES: tuple[Grade, ...] = ("filtered", "smoothed")
 
-METHOD = 4
+METHOD = 5
 """Counted up with every change of what is computed: then days are computed anew."""
 WARM_UP_S = 6 * 3600.0
 """For the bias to settle (two hours), after a tracker that is wrong at the beginning was found

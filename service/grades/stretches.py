@@ -269,17 +269,24 @@ BIAS_SIGMAS = 6.0
 
 
 def turns_beside_bias(
-    settings: GyroSettings, attitudes: AttitudeMeasurements
+    settings: GyroSettings, attitudes: AttitudeMeasurements, carried_rad_s: Vector | None = None
 ) -> npt.NDArray[np.bool_]:
     """Marks (m - 1,) of the steps between attitudes in which the body turned for certain.
 
-    It turned by more than the attitudes' errors and a gyro's bias can make of a body at rest.
+    It turned by more than the attitudes' errors and a gyro's bias can make of a body at rest; by
+    the rates (m, 3) that batches carried where these are of more than a quarter turn, of which
+    the attitudes may show less or, of a whole turn, nothing.
     """
     q, covariance = attitudes.quaternion, attitudes.covariance_rad2
     turn_rad = np.linalg.norm(rotation_vectors(q[:-1], q[1:]), axis=1)
     variance = np.trace(covariance, axis1=1, axis2=2)
     noise_rad = np.sqrt(variance[1:] + variance[:-1])
-    drift_rad = settings.bias_sigma_rad_s * np.diff(attitudes.tai_ns) * NS
+    step_s = np.diff(attitudes.tai_ns) * NS
+    if carried_rad_s is not None:
+        fastest = np.linalg.norm(carried_rad_s, axis=1)
+        told_rad = np.maximum(fastest[1:], fastest[:-1]) * step_s
+        turn_rad = np.maximum(turn_rad, np.where(told_rad > QUARTER_TURN_RAD, told_rad, 0.0))
+    drift_rad = settings.bias_sigma_rad_s * step_s
     return np.asarray(turn_rad > BIAS_SIGMAS * (noise_rad + drift_rad))
 
 
@@ -297,7 +304,8 @@ def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
     first = np.searchsorted(recorded.gyro_ns, attitude_ns[:-1], side="right")
     end = np.searchsorted(recorded.gyro_ns, attitude_ns[1:])
     zeros = np.append(0, np.cumsum(zero))
-    turned = turns_beside_bias(settings, recorded.attitudes) & (end > first)
+    turned = turns_beside_bias(settings, recorded.attitudes, recorded.carried_rad_s)
+    turned &= end > first
     turned &= zeros[end] - zeros[first] == end - first
     # Each run of zeros of which a part is none, is none.
     edge = np.flatnonzero(np.diff(np.concatenate([[0], zero, [0]])))

@@ -394,3 +394,31 @@ def test_zeros_of_a_gyro_while_the_body_turns_are_none(missions, rng):
     day = graded(recorded_of(still.tai_ns, np.zeros((3601, 3)), attitudes), mission)
     assert day.gyro["not_given"] == 0
     assert [each.model for each in day.stretches] == ["gyro"]
+
+
+@pytest.mark.parametrize("spin_deg_per_s", [36.0, 24.0, -18.0])
+def test_zeros_of_a_gyro_take_nothing_from_the_rates_of_a_spinning_body(
+    missions, rng, spin_deg_per_s
+):
+    """At 36 deg/s, with a batch every ten seconds, the attitudes agree with the zeros."""
+    truth, rows, recorded, own = spun((0.0, 0.0, spin_deg_per_s), rng)
+    gyro_ns = np.arange(NOON_NS, recorded.attitudes.tai_ns[-1] + 1, 10**9)
+    off = replace(recorded, gyro_ns=gyro_ns, rates_rad_s=np.zeros((len(gyro_ns), 3)))
+    day = graded(off, mission_with(missions["XTE"], gyro=GYRO))
+    assert day.gyro["not_given"] == len(gyro_ns)
+    (stretch,) = day.stretches
+    assert stretch.model == "constant_rate"
+    for samples in stretch.samples.values():
+        np.testing.assert_allclose(samples.rate_deg_per_s[5:-1], own[5:-1], atol=0.02)
+        e = (Rotation.from_quat(samples.quaternion).inv() * truth.attitude[rows]).as_rotvec()
+        assert np.mean(squares(e, covariances_of(samples))) / 3.0 < 2.0
+
+
+def test_zeros_of_a_gyro_stand_where_batches_carry_the_noise_of_a_body_at_rest(missions, rng):
+    still = truth_of(inertial_hold, 900.0)
+    attitudes = attitudes_of(still, np.arange(0, 901, 10), SIGMAS, rng)
+    recorded = recorded_of(still.tai_ns, np.zeros((901, 3)), attitudes)
+    noise = np.radians(rng.normal(0.0, 0.05, (91, 3)))
+    day = graded(replace(recorded, carried_rad_s=noise), mission_with(missions["XTE"], gyro=GYRO))
+    assert day.gyro["not_given"] == 0
+    assert [each.model for each in day.stretches] == ["gyro"]

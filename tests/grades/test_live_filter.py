@@ -358,12 +358,21 @@ def test_a_service_that_is_killed_and_started_again_gives_the_same_state(
         assert second["covariance_arcsec2"][0][0] < first["covariance_arcsec2"][0][0]
 
 
-def test_rates_of_recorded_batches_lead_a_spinning_body_through_the_day_and_live(live, rng):
-    """36 deg/s and a batch every ten seconds: a turn a batch, by the attitudes a body at rest."""
+@pytest.mark.parametrize("is_gyro_off", [False, True])
+def test_rates_of_recorded_batches_lead_a_spinning_body_through_the_day_and_live(
+    live, rng, is_gyro_off
+):
+    """36 deg/s and a batch every ten seconds: a turn a batch, by the attitudes a body at rest.
+
+    A gyro that is off may send zeros: it says the same.
+    """
     rate_deg_per_s = [0.0, 0.0, 36.0]
     truth = truth_of(lambda t: np.tile(np.radians(rate_deg_per_s), (len(t), 1)), 400.0, 0.5)
     measured = attitudes_of(truth, np.arange(0, 801, 20), (6.0, 6.0, 40.0), rng)
     recorded = recorded_of([], np.zeros((0, 3)), measured).attitudes
+    if is_gyro_off:
+        gyro_ns = np.arange(recorded.tai_ns[0], recorded.tai_ns[-1] + 1, 10**9)
+        put_gyro(live, gyro_ns, np.zeros((len(gyro_ns), 3)))
     for body in bodies(recorded):
         told = json.dumps(body | {"body_rates_deg_per_s": rate_deg_per_s})
         live.submissions.submit(submission_from_json(told))

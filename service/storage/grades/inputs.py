@@ -71,7 +71,9 @@ def recorded_in(
     numbers = rows[:, 1:11].astype(np.float64)
     attitudes, sound = usable_attitudes(rows[:, 0].astype(np.int64), numbers[:, :4], numbers[:, 4:])
     gyro_ns, rates = gyro_in(connection, BlockFilter(spacecraft, run, start, end))
-    carried = _carried_rates(connection, rows[sound, 11].tolist(), attitudes.tai_ns, gyro_ns)
+    # A gyro that is off may send zeros, which are no better than what batches carried.
+    told_ns = gyro_ns[rates.any(axis=1)]
+    carried = _carried_rates(connection, rows[sound, 11].tolist(), attitudes.tai_ns, told_ns)
     directions = lone_stars(connection, sky, selected)
     unusable = int(np.count_nonzero(~sound))
     return Recorded(gyro_ns, rates, attitudes, directions, unusable, carried)
@@ -80,7 +82,10 @@ def recorded_in(
 def _carried_rates(
     connection: Connection, batch_ids: list[str], tai_ns: Nanoseconds, gyro_ns: Nanoseconds
 ) -> Vector | None:
-    """The rates that batches carried, see `Recorded`; zeros near gyro samples, which are better."""
+    """The rates that batches carried, see `Recorded`; zeros near gyro samples, which are better.
+
+    `gyro_ns` are the times of the samples that are not zero about all axes.
+    """
     carried = np.zeros((len(batch_ids), 3))
     padded = np.concatenate([[-FAR_NS], gyro_ns, [FAR_NS]])
     place = np.searchsorted(gyro_ns, tai_ns)
