@@ -360,10 +360,11 @@ def at_carried_rates(
     """The model and the rates of a stretch whose batches carried rates of a body that spins.
 
     `times_ns` (n,) are those of all measurements, `carried_rad_s` (m, 3) the rates of the
-    attitudes, zeros where none.  Where they are of no use, the model comes back without rates.
+    attitudes, zeros where none.  Where they are of no use, or all measurements are of one time,
+    the model comes back without rates.
     """
     known = carried_rad_s.any(axis=1)
-    if not rates_of_use(model, attitude_ns, carried_rad_s):
+    if len(times_ns) < 2 or not rates_of_use(model, attitude_ns, carried_rad_s):
         return model, None
     known_ns = attitude_ns[known]
     # Each measurement without rates takes those of the nearest that has some.

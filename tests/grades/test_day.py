@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from service.filtering.inputs import AttitudeMeasurements, no_attitudes
 from service.filtering.result import Status
 from service.grades.day import day_bounds, grade_day, packed, unpacked, window_of
-from service.grades.stretches import usable_attitudes
+from service.grades.stretches import attitudes_where, usable_attitudes
 from service.missions.motion import GyroSettings
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import (
@@ -422,3 +422,17 @@ def test_zeros_of_a_gyro_stand_where_batches_carry_the_noise_of_a_body_at_rest(m
     day = graded(replace(recorded, carried_rad_s=noise), mission_with(missions["XTE"], gyro=GYRO))
     assert day.gyro["not_given"] == 0
     assert [each.model for each in day.stretches] == ["gyro"]
+
+
+def test_batches_of_one_moment_have_an_attitude_whatever_rates_they_carry(rng):
+    """As those of several trackers: over no time no rate tells anything."""
+    _, _, recorded, _ = spun((0.0, 0.0, 36.0), rng)
+    one = replace(
+        recorded,
+        attitudes=attitudes_where(recorded.attitudes, [0] * 6),
+        carried_rad_s=recorded.carried_rad_s[:6],
+    )
+    (stretch,) = graded(one, mission_without_gyro("XTE")).stretches
+    samples = stretch.samples["smoothed"]
+    assert len(samples) == 1
+    assert np.isfinite(samples.covariance_arcsec2).all()
