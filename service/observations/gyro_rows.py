@@ -35,8 +35,6 @@ class BlockRows(csv_rows.JoinedRows):
 
     def take(self, row: CsvRow) -> None:
         """Take the cells of a row; raises `BadCell`."""
-        if len(self.rates) == MAX_ROWS:
-            raise csv_rows.BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
         try:
             time = parse_utc(row["time"])
         except BadInput as error:
@@ -48,6 +46,8 @@ class BlockRows(csv_rows.JoinedRows):
         if (row_of := (time_s, *rates)) in self._taken:
             # The row was written twice, or the file to its own end.
             return
+        if len(self.rates) == MAX_ROWS:
+            raise csv_rows.BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
         self._taken.add(row_of)
         self.times_s.append(time_s)
         self.rates.append(rates)

@@ -10,6 +10,7 @@ from service.access import Caller
 from service.app.factory import open_app
 from service.errors import BadBatch, BadFile
 from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
+from service.observations import gyro_rows
 from service.observations.telemetry import read_lines
 from service.replay.in_process import replay_in_process
 from service.replay.items import Pace, items_of
@@ -277,3 +278,13 @@ def test_a_damaged_row_refuses_the_blocks_on_both_sides(tmp_path):
 def test_a_bad_header_refuses_the_file(tmp_path, header, message):
     with pytest.raises(BadFile, match=message):
         read(tmp_path, header)
+
+
+def test_rows_that_are_there_again_do_not_count_towards_the_most(tmp_path, monkeypatch):
+    """As of a file that was written to its own end."""
+    monkeypatch.setattr(gyro_rows, "MAX_ROWS", 3)
+    rows = [f"XTE,,a,{later(k)},0.001,0,{k}e-5" for k in range(4)]
+    (block,) = read(tmp_path, csv_of(*rows[:3], *rows[:3]))
+    assert len(block_from_line(block.body).times_s) == 3
+    (block,) = read(tmp_path, csv_of(*rows, *rows))
+    assert "has more than 3 rows" in block.fault.message
