@@ -43,10 +43,13 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
     """The field that an unknown one may stand for, or those that there are, as end of a message."""
     if model is None or fault["type"] != "extra_forbidden":
         return ""
-    allowed = allowed_keys(model, _fields_of(fault["loc"])[:-1])
+    # A field whose name is a word of Python, such as from, ends with a low line there.
+    keys = allowed_keys(model, _fields_of(fault["loc"])[:-1])
+    allowed = [key.removesuffix("_") for key in keys]
     if fault["loc"][-1] in allowed:
         # A field of another kind of a priori knowledge.
-        return f" beside {fault['loc'][-2]}"
+        kind = fault["loc"][-2]
+        return f" beside {PRIOR_KINDS.get(kind, kind)}"
     if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
         return f"; did you mean {near}?"
     return f"; there are {', '.join(allowed)}" if allowed else ""

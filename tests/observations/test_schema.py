@@ -317,3 +317,19 @@ def test_a_key_of_any_length_gets_a_message_of_a_few_words():
     fault = refusal.value.faults[0]
     assert fault.field == "x" * 80
     assert len(str(refusal.value)) < 500
+
+
+@pytest.mark.parametrize(
+    ("prior", "words"),
+    [
+        ({"from": "last", "fro": 1}, "did you mean from?"),
+        ({"from": "last", "boresigh": 1}, "did you mean boresight?"),
+        ({"from": "last", "sun_counts": [1, 1, 1, 1]}, "beside from"),
+        ({"quaternion": [0, 0, 0, 1], "from": "last"}, "beside quaternion"),
+    ],
+)
+def test_a_field_of_a_priori_knowledge_has_the_name_that_is_sent(prior, words):
+    with pytest.raises(BadBatch) as refused:
+        read(BATCH | {"a_priori": prior})
+    assert words in str(refused.value)
+    assert "from_" not in str(refused.value)
