@@ -163,3 +163,34 @@ def test_a_block_beside_those_of_attitudes_may_hold_anything(rng, tmp_path):
     text = HEAD.format(system="UTC", more="")
     one, other = (read(text + each, tmp_path) for each in (body, more + body))
     assert one.segments[0].quaternion.tobytes() == other.segments[0].quaternion.tobytes()
+
+
+def of_matrix(matrix, tmp_path):
+    numbers = " ".join(map(repr, np.ravel(matrix).tolist()))
+    told = {"a": "EME2000", "b": "SC_BODY_1", "size": 9, "type": "DCM", "rate": ""}
+    body = BLOCK.format(**told, states=f"0.0 {numbers}\n")
+    return read(HEAD.format(system="UTC", more="") + body, tmp_path)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        [[0, 1, 0.5], [0, 0, 1], [0, 0, 1]],
+        np.zeros((3, 3)),
+        np.diag([1, 1, -1]),
+        np.diag([1.01, 1, 1]),
+        np.full((3, 3), 1e308),
+    ],
+)
+def test_a_matrix_that_is_no_rotation_is_refused_by_line(matrix, tmp_path):
+    with pytest.raises(BadFile, match=r"x.acm, line 14: matrix: must be a rotation"):
+        of_matrix(np.asarray(matrix, float), tmp_path)
+
+
+def test_a_matrix_of_few_digits_is_read(rng, tmp_path):
+    from scipy.spatial.transform import Rotation
+
+    for q in random_quaternions(rng, 20):
+        matrix = np.round(Rotation.from_quat(q).as_matrix().T, 4)
+        (segment,) = of_matrix(matrix, tmp_path).segments
+        assert apart(segment.quaternion, q[None]) < 1e-4

@@ -5,8 +5,10 @@ manoeuvres and the description of the determination are passed over.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations_with_replacement
+from operator import mul
 from typing import IO
 
 import numpy as np
@@ -122,12 +124,18 @@ class _Reader(ccsds.MessageReader):
             self._count_state(token, token.words[0], time_ns, times)
             times.append(time_ns)
             states.append([self._source.number(token, word) for word in token.words[1:]])
-            if _type(block).attitude == "quaternion":
-                norm = math.hypot(*states[-1][:4])
-                if not abs(norm - 1.0) <= NORM_TOLERANCE:
-                    message = f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
-                    raise self._source.bad(token.line, "quaternion", message, states[-1][:4])
+            self._check_attitude(_type(block), token, states[-1])
         raise self._source.bad(line, "ATT_STOP", "is missing: the file was cut short")
+
+    def _check_attitude(self, type: AttitudeType, token: ccsds.Token, state: list[float]) -> None:
+        if type.attitude == "quaternion":
+            norm = math.hypot(*state[:4])
+            if not abs(norm - 1.0) <= NORM_TOLERANCE:
+                message = f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
+                raise self._source.bad(token.line, "quaternion", message, state[:4])
+        if type.attitude == "dcm" and not _is_rotation(state[:9]):
+            message = f"must be a rotation: M M^T = 1 within {NORM_TOLERANCE}, and det M above 0"
+            raise self._source.bad(token.line, "matrix", message, state[:9])
 
     def _size(self, block: ccsds.Metadata) -> int:
         """The numbers of a state after its time."""
@@ -166,6 +174,16 @@ class _Reader(ccsds.MessageReader):
         time_ns = np.array(times, dtype=np.int64)
         rate = told_rates(quaternion, rate)
         return Segment(f"line {block.line}", time_ns, times[0], times[-1], quaternion, rate)
+
+
+def _is_rotation(numbers: Sequence[float]) -> bool:
+    """True if nine numbers, row by row, are a rotation matrix."""
+    x, y, z = numbers[:3], numbers[3:6], numbers[6:]
+    is_orthonormal = all(
+        abs(sum(map(mul, one, other)) - (one is other)) <= NORM_TOLERANCE
+        for one, other in combinations_with_replacement((x, y, z), 2)
+    )
+    return is_orthonormal and float(np.linalg.det([x, y, z])) > 0.0
 
 
 def _type(block: ccsds.Metadata) -> AttitudeType:
