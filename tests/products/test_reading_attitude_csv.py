@@ -86,3 +86,16 @@ def test_an_orbit_in_fits_is_told_the_formats_of_orbits(tmp_path):
     (tmp_path / "x").write_bytes(b"SIMPLE  =".ljust(2880))
     with pytest.raises(BadFile, match=r"x, line 1.*OEM .*OMM .*and TLE"):
         read_ephemeris(tmp_path / "x", "--ephemeris")
+
+
+def test_without_a_column_of_stretches_a_step_of_more_than_ten_minutes_is_a_gap(tmp_path):
+    times = ["00:00:00", "00:10:00", "00:20:00.001", "12:00:00"]
+    told = [f"1996-01-10T{each}Z,0,0,0,1" for each in times]
+    known = read("\n".join(["time,q1,q2,q3,qc", *told]), tmp_path)
+    assert [len(each.time_ns) for each in known.segments] == [2, 1, 1]
+    first_ns = known.segments[0].time_ns[0]
+    seconds = np.array([300.0, 900.0, 20_000.0])
+    told = np.isfinite(known.at(first_ns + (seconds * 1e9).astype(np.int64))).all(axis=1)
+    assert told.tolist() == [True, False, False]
+    whole = ["time,q1,q2,q3,qc,stretch", *(f"1996-01-10T{each}Z,0,0,0,1,1" for each in times)]
+    assert len(read("\n".join(whole), tmp_path).segments) == 1

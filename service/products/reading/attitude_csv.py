@@ -3,6 +3,7 @@
 A row is a time of UTC and the quaternion q1, q2, q3, qc from inertial to body, its scalar last.
 Rates of the body in deg/s and the number of the unbroken stretch are read where there are columns
 for them, rows of another status than good are left out, and other columns are passed over.
+Without that number a step of more than ten minutes ends a stretch.
 """
 
 import csv
@@ -27,6 +28,7 @@ from service.times import parse_utc
 
 _QUATERNION, _RATES = ("q1", "q2", "q3", "qc"), ("rate_x", "rate_y", "rate_z")
 _HEADER = re.compile(rb"\A[^\n]*\bq1\b[^\n]*,|\A[^\n]*,[^\n]*\bq1\b")
+_LONGEST_STEP_NS = 600 * 10**9
 _Row = tuple[int, str, list[float], list[float]]
 
 
@@ -44,7 +46,7 @@ def read_attitude_csv(name: str, file: IO[bytes]) -> KnownAttitudes:
     for line, stretch, time_ns, numbers, rates in _rows(source, file):
         if rows and time_ns <= rows[-1][0]:
             raise source.bad(line, "time", "must be later than that of the row before")
-        if rows and stretch != rows[-1][1]:
+        if rows and (stretch != rows[-1][1] or _is_gap(stretch, time_ns - rows[-1][0])):
             segments.append(_segment(begun, rows))
             rows = []
         begun = begun if rows else line
@@ -54,6 +56,10 @@ def read_attitude_csv(name: str, file: IO[bytes]) -> KnownAttitudes:
     if rows:
         segments.append(_segment(begun, rows))
     return known_attitudes(name, "", segments)
+
+
+def _is_gap(stretch: str, step_ns: int) -> bool:
+    return not stretch and step_ns > _LONGEST_STEP_NS
 
 
 def _segment(line: int, rows: list[_Row]) -> Segment:
