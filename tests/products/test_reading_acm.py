@@ -142,6 +142,8 @@ def test_the_first_example_of_the_standard_begins_at_its_zero():
         ("0.25 ", "0.0 ", "EPOCH: must be later than that of the state before"),
         ("0.25 ", "0.25 0.1 ", "state: must have a time and 4 numbers"),
         ("0.25 ", "0.25x ", "state: must be a number"),
+        ("0.25 ", "1e10 ", "state: must have a time of the years from 1972 to 2099"),
+        ("0.25 ", "-1e300 ", "state: must have a time of the years from 1972 to 2099"),
         ("ATT_STOP\n", "", "ATT_STOP: is missing: the file was cut short"),
         ("0.0 0.", "0.0 9.", "quaternion: must have norm 1"),
     ],

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadFile
+from service.products.reading import files
 from service.products.reading.files import read_attitudes, read_ephemeris
 from tests.products.series import GOLDEN, random_quaternions, rows, slew, whole, written
 from tests.products.test_reading_aem import V2
@@ -99,3 +100,22 @@ def test_without_a_column_of_stretches_a_step_of_more_than_ten_minutes_is_a_gap(
     assert told.tolist() == [True, False, False]
     whole = ["time,q1,q2,q3,qc,stretch", *(f"1996-01-10T{each}Z,0,0,0,1,1" for each in times)]
     assert len(read("\n".join(whole), tmp_path).segments) == 1
+
+
+TRUTH = '{"spacecraft":"XTE","time":"1996-01-10T12:00:0%dZ","quaternion":[0,0,0,1]}\n'
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b'{"a":' + b"[" * 100_000, "line 1: is no truth"),
+        (gzip.compress(b"{" + b" " * (2 << 20)), "line 1: must have at most 1048576 bytes"),
+        ("".join(TRUTH % k for k in range(4)), "line 4: is more than the 3 lines"),
+    ],
+    ids=["deep", "long", "many"],
+)
+def test_a_truth_beyond_what_is_read_is_refused_by_line(data, words, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_RECORDS", 3)
+    with pytest.raises(BadFile, match=words):
+        read(data, tmp_path)
+    assert len(read("".join(TRUTH % k for k in range(3)), tmp_path)) == 3

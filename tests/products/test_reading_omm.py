@@ -172,6 +172,7 @@ def test_a_bad_element_is_refused_by_file_line_and_field(form, more, words, tmp_
     ("text", "words"),
     [
         ("[", "JSON: must be a set of elements"),
+        pytest.param('{"a":' + "[" * 100_000, "JSON: must be a set of elements", id="deep"),
         ("[1]", "JSON: must be a set of elements"),
         ("[]", "EPOCH: is missing: the file has no elements"),
         (as_kvn(fields_of(ISS)).replace("TEME", "EME2000"), "REF_FRAME: must be TEME"),

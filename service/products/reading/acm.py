@@ -17,6 +17,7 @@ from service.observations.schema import NORM_TOLERANCE
 from service.products.reading import tokens as ccsds
 from service.products.reading.attitude_types import AttitudeType, Frames, body_attitudes
 from service.products.reading.known import KnownAttitudes, Segment, known_attitudes, told_rates
+from service.times import FIRST_YEAR, LAST_YEAR
 
 _TYPES: dict[str, AttitudeType] = {
     "QUATERNION": AttitudeType("quaternion"),
@@ -28,6 +29,8 @@ _RATES: dict[str, AttitudeType] = {
     "Q_DOT": AttitudeType("quaternion", "q_dot"),
     "EULER_RATE": AttitudeType("quaternion", "euler"),
 }
+_FIRST_NS = ccsds.epoch_ns(f"{FIRST_YEAR}-01-01T00:00:00", "TAI")
+_LAST_NS = ccsds.epoch_ns(f"{LAST_YEAR}-12-31T23:59:59", "TAI")
 _NO_RATES = {"": 0, "NONE": 0, "GYRO_BIAS": 3}
 """Numbers that a state has in place of a rate."""
 _BLOCKS = ("ORB", "PHYS", "COV", "MAN", "AD", "SENSOR", "USER")
@@ -160,7 +163,11 @@ class _Reader(ccsds.MessageReader):
             return self._source.epoch_ns(token, word, time_system)
         zero_ns = metadata.moment("EPOCH_TZERO", time_system)
         assert zero_ns is not None
-        return zero_ns + round(self._source.number(token, word) * 1e9)
+        after_ns = self._source.number(token, word) * 1e9
+        if not _FIRST_NS <= zero_ns + after_ns <= _LAST_NS:
+            message = f"must have a time of the years from {FIRST_YEAR} to {LAST_YEAR}"
+            raise self._source.bad(token.line, "state", message, word)
+        return zero_ns + round(after_ns)
 
     def _made(self, block: ccsds.Metadata, times: list[int], states: list[list[float]]) -> Segment:
         type = _type(block)

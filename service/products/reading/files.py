@@ -4,7 +4,7 @@ import gzip
 import re
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, cast
@@ -13,11 +13,18 @@ import msgspec
 import numpy as np
 
 from service.errors import BadFile, BadInput, Fault, shown_value
+from service.observations.decompress import MAX_LINE_BYTES
 from service.products.reading.acm import read_acm
 from service.products.reading.aem import read_aem
 from service.products.reading.attitude_csv import is_attitude_csv, read_attitude_csv
 from service.products.reading.ck import read_ck
-from service.products.reading.known import Ephemeris, KnownAttitudes, Segment, known_attitudes
+from service.products.reading.known import (
+    MOST_RECORDS,
+    Ephemeris,
+    KnownAttitudes,
+    Segment,
+    known_attitudes,
+)
 from service.products.reading.oem import read_oem
 from service.products.reading.omm import is_omm, read_omm
 from service.products.reading.tle import read_tle
@@ -85,15 +92,20 @@ class _Truth(msgspec.Struct):
     quaternion: tuple[float, float, float, float]
 
 
-def _read_truth(file: str, lines: Iterable[bytes]) -> KnownAttitudes:
+def _read_truth(file: str, opened: IO[bytes]) -> KnownAttitudes:
     """The attitudes of a simulated pass, whose lines are in order of time."""
     decoder = msgspec.json.Decoder(_Truth)
     read: list[_Truth] = []
-    for number, line in enumerate(lines, 1):
+    while line := opened.readline(MAX_LINE_BYTES + 1):
+        place = f"{file}: line {len(read) + 1}"
+        if len(line) > MAX_LINE_BYTES:
+            raise BadFile(Fault(place, f"must have at most {MAX_LINE_BYTES} bytes"))
+        if len(read) == MOST_RECORDS:
+            raise BadFile(Fault(place, f"is more than the {MOST_RECORDS:,} lines that are read"))
         try:
             read.append(decoder.decode(line))
-        except msgspec.MsgspecError as error:
-            raise BadFile(Fault(f"{file}: line {number}", f"is no truth: {error}")) from None
+        except (msgspec.MsgspecError, UnicodeError, RecursionError) as error:
+            raise BadFile(Fault(place, f"is no truth: {error}")) from None
     time_ns = np.array([parse_utc(each.time, file).tai_ns for each in read], dtype=np.int64)
     if (np.diff(time_ns) <= 0).any():
         raise BadFile(Fault(file, "the times of its lines do not increase"))

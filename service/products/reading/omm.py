@@ -120,12 +120,16 @@ def _of_messages(source: ccsds.Source, file: IO[bytes]) -> Iterator[Fields]:
 def _of_json(source: ccsds.Source, text: str) -> Iterator[Fields]:
     try:
         found = msgspec.json.decode(text, type=list[dict[str, Any]] | dict[str, Any])
-    except msgspec.MsgspecError as error:
+        sets = [
+            {key: _text(value) for key, value in each.items() if value is not None}
+            for each in (found if isinstance(found, list) else [found])
+        ]
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise source.bad(
             1, "JSON", f"must be a set of elements, or a list of some: {error}"
         ) from None
-    for each in found if isinstance(found, list) else [found]:
-        yield 1, {key: _text(value) for key, value in each.items() if value is not None}
+    for each in sets:
+        yield 1, each
 
 
 def _text(value: Any) -> str:
