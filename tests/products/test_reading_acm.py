@@ -144,6 +144,7 @@ def test_the_first_example_of_the_standard_begins_at_its_zero():
         ("0.25 ", "0.25x ", "state: must be a number"),
         ("0.25 ", "1e10 ", "state: must have a time of the years from 1972 to 2099"),
         ("0.25 ", "-1e300 ", "state: must have a time of the years from 1972 to 2099"),
+        ("NUMBER_STATES = 4", "ATT_TYPE = DCM", "ATT_TYPE: is there already, in line 12"),
         ("ATT_STOP\n", "", "ATT_STOP: is missing: the file was cut short"),
         ("0.0 0.", "0.0 9.", "quaternion: must have norm 1"),
     ],

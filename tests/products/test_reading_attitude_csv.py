@@ -102,6 +102,21 @@ def test_without_a_column_of_stretches_a_step_of_more_than_ten_minutes_is_a_gap(
     assert len(read("\n".join(whole), tmp_path).segments) == 1
 
 
+def test_a_header_in_capitals_is_read(tmp_path):
+    head, rest = SPUN.split("\n", 1)
+    known = read(f"{head.upper()}\n{rest}", tmp_path)
+    assert (
+        known.segments[0].rate_rad_s.tobytes()
+        == read(SPUN, tmp_path).segments[0].rate_rad_s.tobytes()
+    )
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_an_aem_with_comments_before_its_version_is_read(end, tmp_path):
+    text = f"COMMENT made by hand\nCOMMENT\n\n{V2}".replace("\n", end)
+    assert len(read(text.encode(), tmp_path)) == 2
+
+
 TRUTH = '{"spacecraft":"XTE","time":"1996-01-10T12:00:0%dZ","quaternion":[0,0,0,1]}\n'
 
 

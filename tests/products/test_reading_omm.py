@@ -185,3 +185,11 @@ def test_a_bad_element_is_refused_by_file_line_and_field(form, more, words, tmp_
 def test_a_file_that_is_no_elements_of_one_object_is_refused(text, words, tmp_path):
     with pytest.raises(BadFile, match=rf"elements.txt, line \d+: {words}"):
         read(text, tmp_path)
+
+
+def test_digits_beyond_the_nanosecond_are_cut_off_and_empty_cells_are_none(tmp_path):
+    fields = fields_of(ISS)
+    usual = read(as_csv(fields), tmp_path)
+    more = fields | {"EPOCH": fields["EPOCH"] + "0009999", "EPHEMERIS_TYPE": ""}
+    known = read(as_csv(more), tmp_path)
+    assert np.array_equal(known.at(ISS_EPOCH), usual.at(ISS_EPOCH))

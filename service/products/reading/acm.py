@@ -113,6 +113,9 @@ class _Reader(ccsds.MessageReader):
                     raise self._source.bad(token.line, "ATT_STOP", "ends a block of no state")
                 return self._made(block, times, states)
             if token.kind == "key" and token.name in _BLOCK and not times:
+                if token.name in block.values:
+                    message = f"is there already, in line {block.lines[token.name]}"
+                    raise self._source.bad_token(token, message)
                 block.values[token.name], block.lines[token.name] = token.value, token.line
                 block.line = token.line
                 continue

@@ -27,7 +27,7 @@ from service.products.reading.tokens import MAX_LINE_BYTES, Source, Token
 from service.times import parse_utc
 
 _QUATERNION, _RATES = ("q1", "q2", "q3", "qc"), ("rate_x", "rate_y", "rate_z")
-_HEADER = re.compile(rb"\A[^\n]*\bq1\b[^\n]*,|\A[^\n]*,[^\n]*\bq1\b")
+_HEADER = re.compile(rb"\A[^\n]*\bq1\b[^\n]*,|\A[^\n]*,[^\n]*\bq1\b", re.IGNORECASE)
 _LONGEST_STEP_NS = 600 * 10**9
 _Row = tuple[int, str, list[float], list[float]]
 

@@ -31,6 +31,7 @@ from service.products.reading.tle import read_tle
 from service.times import parse_utc
 
 _LOOKED_AT_BYTES = 2048
+_COMMENTS = re.compile(rb"\A(COMMENT( [^\n]*)?\r?\n\s*)+(?=CCSDS_)")
 _IS_ACM = re.compile(rb"<(\w+:)?acm\b|\ACCSDS_ACM_VERS")
 
 READ = (
@@ -118,7 +119,7 @@ def _start(file: IO[bytes]) -> bytes:
     """The beginning of a file, of which the whole is left to read, without what stands before."""
     start = file.read(_LOOKED_AT_BYTES).lstrip(b"\xef\xbb\xbf \t\r\n")
     file.seek(0)
-    return start
+    return _COMMENTS.sub(b"", start)
 
 
 def read_ephemeris(file: Path, field: str) -> Ephemeris:

@@ -48,6 +48,7 @@ _FIXED = {
 leave most of them out."""
 _JD_OF_1950 = 2433281.5
 """The Julian date of the day 0 of 1950, from which SGP4 counts days."""
+_BEYOND_NS = re.compile(r"(\.\d{9})\d+")
 Fields = tuple[int, Mapping[str, str]]
 
 
@@ -151,7 +152,8 @@ def _set(source: ccsds.Source, line: int, fields: Mapping[str, str]) -> ElementS
     from sgp4.api import SGP4_ERRORS, WGS72, Satrec
 
     for name, known in _FIXED.items():
-        value = fields.get(name, known[0])
+        # A catalog leaves cells empty, too.
+        value = fields.get(name) or known[0]
         if value.upper() not in known:
             raise source.bad(line, name, f"must be {' or '.join(known)}", value)
     number = {name: _number(source, line, name, fields) for name in _NUMBERS}
@@ -161,7 +163,7 @@ def _set(source: ccsds.Source, line: int, fields: Mapping[str, str]) -> ElementS
         epoch_ns = ccsds.epoch_ns(fields["EPOCH"], "UTC")
     except ValueError as error:
         raise source.bad(line, "EPOCH", str(error), fields["EPOCH"]) from None
-    utc = parse_utc(fields["EPOCH"])
+    utc = parse_utc(_BEYOND_NS.sub(r"\1", fields["EPOCH"]))
     per_min = math.tau / (DAY_S / 60.0)
     elements = Satrec()
     elements.sgp4init(
