@@ -36,7 +36,7 @@ from service.sky.geometry.triangles import (
     pairs_of_slaves,
 )
 from service.sky.whole_sky.guide import Guide
-from service.vectors import ARCSEC_PER_RADIAN, Vector
+from service.vectors import ARCSEC_PER_RADIAN, Vector, locked
 
 IN_A_MIRROR = np.array([-1.0, 1.0, 1.0])
 SIGMA_FLOOR_ARCSEC = 1.0
@@ -125,7 +125,7 @@ def propose(
     """
     image, side = observed_triangles(direction, triangles)
     matched = np.empty((2, MAX_MATCHES), np.int32)
-    field = ImageTriangles(direction, sigma_rad, speed_c, image, side)
+    field = ImageTriangles(locked(direction), locked(sigma_rad), speed_c, image, side)
     count, searched, bounded = match_triangles(field, guide_triangles(triangles), *matched)
     pairs, held = np.empty((3, 3 * count), np.int32), np.empty(3 * count, np.bool_)
     kept = 0

@@ -34,6 +34,7 @@ from service.sky.geometry.triangles import (
     index_triangles,
     make_triangles,
 )
+from service.vectors import locked
 from studies.ptp_2015.rivals.proposed import Proposed, proposed_by_votes
 
 NEIGHBOURS_WITHIN_DEG = 5.0
@@ -66,7 +67,8 @@ class PVector:
         image, side = np.empty((n, 3), np.int32), np.empty((n, 3))
         count = make_triangles(scene.direction, near, image, side)
         matched, guide = np.empty((2, MAX_MATCHES), np.int32)
-        field = ImageTriangles(scene.direction, scene.sigma_rad, 0.0, image[:count], side[:count])
+        direction, sigma_rad = locked(scene.direction), locked(scene.sigma_rad)
+        field = ImageTriangles(direction, sigma_rad, 0.0, image[:count], side[:count])
         found, _, _ = match_triangles(field, guide_triangles(self.triangles), matched, guide)
         matched, guide = matched[:found], guide[:found]
         every = proposed_by_votes(image[matched], self.triangles.star[guide], self.stars, n, False)
