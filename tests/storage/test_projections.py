@@ -274,6 +274,21 @@ def test_a_result_that_cannot_be_projected_holds_up_no_other(app, make, monkeypa
         assert_passed(connection)
     assert taken == ["b0", "b2"]
     assert "could not be projected" in caplog.text
+    # The others have it.
+    (rates,) = app.spacecraft.rates("XTE")
+    assert rates.batches == 3
+    noted = [json.loads(row["data"]) for row in rows_of(app.store, events)]
+    assert sum(each["batches"] for each in noted) == 3
+
+
+def test_a_projection_whose_statement_is_wrong_holds_up_no_other(app, make, monkeypatch):
+    def of_a_missing_column(connection, new):
+        connection.exec_driver_sql("UPDATE projector SET no_such_column = 1")
+
+    monkeypatch.setattr(projecting, "PROJECTIONS", (of_a_missing_column, *projecting.PROJECTIONS))
+    app.submissions.submit_many([make(f"b{k}", after_s=60.0 * k) for k in range(3)])
+    (rates,) = app.spacecraft.rates("XTE")
+    assert rates.batches == 3
 
 
 def test_what_is_left_when_the_service_ends_is_projected_by_the_next(database, make, monkeypatch):

@@ -1,6 +1,6 @@
 """The projector: brings the projections up to date with the record, after the answers.
 
-    record ──► projector ──► rollups, alarms, events        one transaction, with its position
+    record ──► projector ──► rollups, events, features      one transaction, with its position
 
 It takes results in the order of the record, many at a time, and notes how far it came in the
 same transaction: after a crash it goes on from there, and no result is projected twice or not
@@ -31,9 +31,11 @@ from service.storage.recording import events
 from service.storage.recording.answer import state_in
 from service.storage.recording.chain import Statement
 from service.storage.recording.unsaved_result import AHEAD_NS, LIVE, STARS
+from service.storage.recording.writer import is_of_the_database, is_of_the_statement
 from service.storage.sql.columns import Row, unpack
 from service.storage.sql.dialects import dialect_of, next_transaction
 from service.storage.sql.projector_lock import NotProjecting
+from service.storage.sql.statements import execute
 from service.storage.sql.tables import projector, results
 from service.storage.store import Store
 
@@ -241,8 +243,8 @@ class Projector:
             if self._most > 1:
                 self._most = 1
                 return _Step(self._position, is_all=False)
-            log.exception("a result could not be projected, and is passed over")
-        return self._write(self._pass_over)
+            log.exception("a result could not be projected")
+        return self._write(self._step_around)
 
     def _write(self, step: Callable[[Connection], T]) -> T | None:
         try:
@@ -304,14 +306,32 @@ class Projector:
             return False
         return oldest >= gap.next
 
-    def _pass_over(self, connection: Connection) -> _Step:
-        """Move on by one result without projecting it."""
+    def _step_around(self, connection: Connection) -> _Step:
+        """Project one result by those projections that can, and move on."""
         position = lock_position(connection)
         for each in recorded_after(connection, position, 1):
             position = each.seq
             connection.execute(update(projector).values(seq=position))
-            seals.apply(connection, [each])
+            for apply in (*PROJECTIONS, *self._of_features):
+                _applied_or_left_out(connection, apply, each)
         return _Step(position, is_all=False)
+
+
+def _applied_or_left_out(
+    connection: Connection, apply: Callable[..., None], result: RecordedResult
+) -> None:
+    """Apply a projection to a result, or nothing of it; raises trouble of the database itself."""
+    noted = events.noted(connection)
+    execute(connection, "SAVEPOINT projection")
+    try:
+        apply(connection, [result])
+    except Exception as error:
+        events.undone(connection, noted)
+        if is_of_the_database(error) and not is_of_the_statement(error):
+            raise
+        execute(connection, "ROLLBACK TO SAVEPOINT projection")
+        log.exception("%s leaves out a result", apply.__module__)
+    execute(connection, "RELEASE SAVEPOINT projection")
 
 
 def _make_head(maker: HeadMaker, connection: Connection) -> Statement | None:

@@ -322,7 +322,7 @@ class Writer:
             if getattr(error.orig, "sqlstate", None) in _CROSSED:
                 raise Crossed("other transactions came in the way", RETRY_AFTER_S) from error
             log.error("%d records could not be written: %s", records, error.orig)
-            if not is_of_the_database(error):
+            if not is_of_the_database(error) or (is_projection and is_of_the_statement(error)):
                 raise
             if not is_projection:
                 self.note_failure(records)
@@ -381,6 +381,12 @@ def is_of_the_database(error: BaseException) -> bool:
     """True if an error is the database's, its disk's or its connection's, and no single row's."""
     about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
     return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
+
+
+def is_of_the_statement(error: BaseException) -> bool:
+    """True if SQLite, which calls it operational, says that a statement names what is not there."""
+    code = getattr(getattr(error, "orig", None), "sqlite_errorcode", None)
+    return code is not None and code & 0xFF == sqlite3.SQLITE_ERROR
 
 
 def may_pass(error: exc.DBAPIError) -> bool:
