@@ -8,8 +8,9 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   Another package also lists its tables as `TABLES`: they are made where the database lacks them,
   while those of the service are made by its migrations.
 - `projection`: `apply(connection, results)` is called with results in the order of the record,
-  each once, in the transaction that notes how far projections have come; `wants(connection, run)`
-  tells if it needs those of a reprocessed run, which come in order of time and without answers.
+  in the transaction that notes how far projections have come: each once, while the feature is on.
+  `wants(connection, run)` tells if it needs the results of a reprocessed run, which come in order
+  of time and without answers.
 - `state`: `active_alarms(connection, run, now)` gives what the overview and the badges of pages
   show as alarms, the one that is worst now first.
 - `shares`: `evaluate_day(connection, mission, day)` is called with a quantity of a smoothed day
@@ -29,7 +30,8 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   deadline; `collect(app, found)` makes metrics of what they returned in time.
 
 Another package brings a feature by an entry point of the group `acquire.features` that names its
-`Feature`.  `ACQUIRE_FEATURES_OFF` names features that are not to be imported at all.
+`Feature`.  Of features that `ACQUIRE_FEATURES_OFF` names, nothing but their package and `tables` is
+imported.  Results that are projected while a feature is off are not projected by it later.
 """
 
 from collections.abc import Mapping

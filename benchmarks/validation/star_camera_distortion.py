@@ -39,7 +39,7 @@ Array = npt.NDArray[np.float64]
 FILE = "star_obs_2020.fits.gz"
 DOCUMENT = ROOT / "docs" / "calibration.md"
 PLOTS = ROOT / "docs" / "plots"
-SOURCES = ("service/calibration", "service/vectors.py")
+SOURCES = ("service/features/calibration", "service/vectors.py")
 MODULE = "benchmarks.validation.star_camera_distortion"
 
 ROUGH_ARCSEC_PER_PX = 4.97

@@ -1,7 +1,5 @@
 """Live events: recorded events, sent to every listener without a gap.
 
-The same task checks every second for silent spacecraft, in the service that projects.
-
 One task reads new events, at once when they were recorded and every second, should another
 process not have been heard.  The latest are held in memory; each listener takes them
 at its own pace and, when it has fallen far behind, reads from the records.  So

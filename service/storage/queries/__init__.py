@@ -1,1 +1,1 @@
-"""Reading results, trends, alarms and settings."""
+"""Reading results, trends and settings."""

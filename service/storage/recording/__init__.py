@@ -1,1 +1,1 @@
-"""Writing results with their stars, trends, events and alarms."""
+"""Writing results with their stars, and the events that tell of them."""

@@ -180,6 +180,9 @@ def bound_tables() -> Mapping[Table, Bound]:
     columns are not, since another column has their digest.
     """
     declared = {each: each.info.get(BOUND) for each in all_tables()}
+    for table, bound in declared.items():
+        if isinstance(bound, Bound) and bound.rises and len(table.primary_key) != 1:
+            raise ValueError(f"{table.name}: a table whose rows are facts needs one key column")
     return {**_OWN, **{table: one for table, one in declared.items() if isinstance(one, Bound)}}
 
 

@@ -45,7 +45,7 @@ class Dialect(ABC):
 
     @abstractmethod
     def oldest_transaction(self, connection: Connection) -> int | None:
-        """The number of the oldest transaction that is not ended; None where there is one alone."""
+        """The number of the oldest transaction not ended; None where one process writes."""
 
     @abstractmethod
     def write_probe(self, connection: Connection, tables: Iterable[str]) -> None:

@@ -442,7 +442,7 @@ WRITTEN_BY_POSTS = (
     events,
     event_counter,
 )
-"""The tables that a batch is written to, by its post and by the projector; features have more."""
+"""The tables that a batch is written to, by its post and by the projector, without features'."""
 
 annotations = sa.Table(
     "annotations",
