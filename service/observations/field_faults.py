@@ -15,6 +15,9 @@ Value = TypeVar("Value")
 
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
+LONGEST_NAME, EXPLAINED = 40, 3
+"""The nearest field is looked for, which takes milliseconds, for names that may be meant as one of
+them, and for so many faults of a body."""
 
 PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
     "from_last": "from"
@@ -32,10 +35,10 @@ def faults_of(
     return [
         Fault(
             _field((*prefix, *fault["loc"])),
-            plain_message(fault) + _meant(model, fault),
+            plain_message(fault) + (_meant(model, fault) if place < EXPLAINED else ""),
             _value(fault),
         )
-        for fault in causes(error.errors(include_url=False))[:MAX_FAULTS_SHOWN]
+        for place, fault in enumerate(causes(error.errors(include_url=False))[:MAX_FAULTS_SHOWN])
     ]
 
 
@@ -50,7 +53,8 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
         # A field of another kind of a priori knowledge.
         kind = fault["loc"][-2]
         return f" beside {PRIOR_KINDS.get(kind, kind)}"
-    if (near := nearest(str(fault["loc"][-1])[:MAX_NAME_SHOWN], allowed)) is not None:
+    name = str(fault["loc"][-1])
+    if len(name) <= LONGEST_NAME and (near := nearest(name, allowed)) is not None:
         return f"; did you mean {near}?"
     return f"; there are {', '.join(allowed)}" if allowed else ""
 
