@@ -197,10 +197,16 @@ class Replays:
         caller = Caller(about.caller, frozenset(), bound, about.owner)
         options: ReplayOptions = {"check": caller.require, "owner": about.owner}
         file = self._spool.open(about.id)
-        replay = self._new(stored.run, options, stored, self._spool.drop)
-        log.info("replay %s continues after line %d", about.id, stored.lines.done)
         form = UploadForm(about.coding, about.longest_bytes, about.form_name, about.packets)
-        replay.resume(self._packet_lines(file, form) or self._lines_of(file, about, replay))
+        try:
+            # An archive that cannot be read any more must not leave a replay that never ends.
+            packets = self._packet_lines(file, form)
+            replay = self._new(stored.run, options, stored, self._spool.drop)
+        except BaseException:
+            file.close()
+            raise
+        log.info("replay %s continues after line %d", about.id, stored.lines.done)
+        replay.resume(packets or self._lines_of(file, about, replay))
 
     def _lines_of(
         self, file: IO[bytes], about: SpooledReplay, replay: RunningReplay
