@@ -28,6 +28,10 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   the page; each page says what it takes.
 - `metrics`: `reads(app)`, functions by name that are called together at each scrape, with a
   deadline; `collect(app, found)` makes metrics of what they returned in time.
+- `telemetry`: reads an input format whose files hold no lines, by its name `FORMAT`.
+  `opened_upload(file, missions, spacecraft)` reads an upload (`ingest.replays.CountedLines`);
+  `add_options(parser)` declares options of `acquire replay`, and `files_of(parsed)` are the files
+  that they name (`replay.items.OtherFiles`).
 
 Another package brings a feature by an entry point of the group `acquire.features` that names its
 `Feature`.  Of features that `ACQUIRE_FEATURES_OFF` names, nothing but their package and `tables` is
@@ -44,7 +48,7 @@ from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("advice", "alarms", "calibration", "follow", "tracks", "webhooks")
+SHIPPED = ("advice", "alarms", "calibration", "follow", "packets", "tracks", "webhooks")
 """The features that come with the service, in the order of their routes and commands."""
 
 KINDS = (
@@ -60,6 +64,7 @@ KINDS = (
     "pages",
     "panels",
     "metrics",
+    "telemetry",
 )
 """The names of the modules that a feature may bring."""
 

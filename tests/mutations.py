@@ -30,6 +30,8 @@ import zstandard
 from PIL import Image
 
 from service.errors import BadConfiguration, BadInput
+from service.features.packets.definition import PacketDefinition
+from service.features.packets.reader import PacketLines, PacketReader, archive_of
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.fits import write_fits
 from service.imaging.frames.frame import FrameLimits
@@ -38,8 +40,6 @@ from service.observations.csv_rows import write_batches_csv
 from service.observations.decompress import MAX_LINE_BYTES, unpacked_lines
 from service.observations.schema import BatchIn, submission_from_json
 from service.observations.telemetry import read_lines
-from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketLines, PacketReader, archive_of
 from service.products.reading.aem import read_aem
 from service.products.reading.oem import read_oem
 from service.products.reading.tle import read_tle
@@ -49,8 +49,8 @@ from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
 from service.times import parse_utc
+from tests.features.packets.packing import mission_of_pass, packed, xtce
 from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
-from tests.packets.packing import mission_of_pass, packed, xtce
 from tests.products.orbits import ISS, oem_text, with_checksum
 from tests.products.series import GOLDEN, rows, slew
 from tests.products.series import written as aem_file

@@ -12,11 +12,11 @@ from space_packet_parser import ccsds_generator, load_xtce
 
 from benchmarks.bounds import at_least, equal
 from benchmarks.report import Report
+from service.features.packets.definition import read_definition
+from service.features.packets.reader import PacketReader
 from service.missions.mission import SHIPPED_FOLDER, parse_mission
-from service.packets.definition import read_definition
-from service.packets.reader import PacketReader
 
-JPSS1 = Path(__file__).parents[2] / "tests" / "packets" / "jpss1"
+JPSS1 = Path(__file__).parents[2] / "tests" / "features" / "packets" / "jpss1"
 PACKETS = JPSS1 / "J01_G011_LZ_2021-04-09T00-00-00Z_V01.DAT1"
 XTCE = JPSS1 / "jpss1_geolocation_xtce_v1.xml"
 TABLE = """

@@ -14,21 +14,18 @@ from sqlalchemy import Connection
 from service.access import Caller, Entry
 from service.app.context import Context, checked_run_name, known_id
 from service.contract.runs import Replay, ReplayCounts, ReplayLines
-from service.errors import AcquisitionError, Busy, NotFound, Stopping
+from service.errors import AcquisitionError, Busy, Fault, NotAvailable, NotFound, Stopping
+from service.feature import SETTING, feature_modules
 from service.ingest.bulk import Bulk, Check, RecordBlocks
 from service.ingest.memory import require_memory_for_replay
 from service.ingest.missions_in_force import MissionsInForce
-from service.ingest.replays import RunningReplay
+from service.ingest.replays import CountedLines, RunningReplay
 from service.ingest.spool import Spool, SpooledReplay
 from service.ingest.submit import SubmissionService
 from service.ingest.worker_process import WorkerConfig
 from service.observations.decompress import Coding, Line, unpacked_lines
-from service.observations.input_formats import NDJSON, PACKETS
-from service.observations.telemetry import (
-    read_lines,
-    require_telemetry,
-)
-from service.packets.reader import PacketLines
+from service.observations.input_formats import NDJSON, input_formats
+from service.observations.telemetry import read_lines, require_telemetry
 from service.storage.queries import replays
 from service.storage.recording.ids import unguessable_ulid
 from service.storage.recording.results import set_run_alarms
@@ -67,9 +64,9 @@ class UploadForm:
     longest_bytes: int
     """A line is cut there."""
     form: str = NDJSON
-    """The name of an input format; `packets` is an archive of space packets and their XTCE file."""
+    """The name of an input format (`Replays.formats`)."""
     spacecraft: str | None = None
-    """The mission whose packets are read; None: the only one that reads packets."""
+    """The mission whose archive is read; None: the only one that reads archives."""
 
 
 class Replays:
@@ -98,6 +95,11 @@ class Replays:
         )
         in_force.when_changed(self.bulk.workers.restart)
         self._spool = Spool(context.settings.spool_folder)
+        off = context.settings.features_off
+        self._archives = {each.FORMAT: each for each in feature_modules("telemetry", off)}
+        """The features that read uploads of other forms than lines, by name of the format."""
+        self.formats = {k: each for k, each in input_formats(off).items() if each.media_types}
+        """The input formats of uploads, by name."""
         self._lock = threading.Lock()
         self._replays: list[RunningReplay] = []
         self._given_up: set[str] = set()
@@ -134,15 +136,15 @@ class Replays:
     ) -> str:
         """`start` with the lines of an upload, which is stored until the replay is over.
 
-        Raises `BadInput` for packets that the mission's table and the XTCE file do not fit, and
-        for CSV without the columns of a batch.
+        Raises `BadInput` for an archive that the feature which reads it refuses, and for CSV
+        without the columns of a batch.
         """
         bound = None if caller.spacecraft is None else sorted(caller.spacecraft)
         options |= {"check": caller.require, "owner": caller.token_id}
         with ExitStack() as on_failure:
             on_failure.callback(discard_upload, file)
-            packets = self._packet_lines(file, form)
-            if packets is None and form.coding == "identity":
+            archive = self._archive_lines(file, form)
+            if archive is None and form.coding == "identity":
                 file.flush()
                 require_telemetry(Path(file.name), form.form, "body")
             replay = self._new(run, options, drop=self._spool.drop)
@@ -154,13 +156,13 @@ class Replays:
                 caller.token_id,
                 caller.name,
                 bound,
-                packets.spacecraft if packets else None,
+                archive.spacecraft if archive else None,
                 form=form.form,
             )
             on_failure.callback(self._spool.drop, replay.id)
             self._spool.keep(file, about)
             file.seek(0)
-            lines = packets or self._lines_of(file, about, replay)
+            lines = archive or self._lines_of(file, about, replay)
             replay.start(lines, _stored_with(run, options))
             on_failure.pop_all()
         return replay.id
@@ -200,13 +202,13 @@ class Replays:
         form = UploadForm(about.coding, about.longest_bytes, about.form_name, about.packets)
         try:
             # An archive that cannot be read any more must not leave a replay that never ends.
-            packets = self._packet_lines(file, form)
+            archive = self._archive_lines(file, form)
             replay = self._new(stored.run, options, stored, self._spool.drop)
         except BaseException:
             file.close()
             raise
         log.info("replay %s continues after line %d", about.id, stored.lines.done)
-        replay.resume(packets or self._lines_of(file, about, replay))
+        replay.resume(archive or self._lines_of(file, about, replay))
 
     def _lines_of(
         self, file: IO[bytes], about: SpooledReplay, replay: RunningReplay
@@ -216,11 +218,19 @@ class Replays:
         file.close()
         return read_lines(self._spool.path(about.id), about.form_name)
 
-    def _packet_lines(self, file: IO[bytes], form: UploadForm) -> PacketLines | None:
-        """The batches of packets; None for an upload of lines."""
-        if form.form != PACKETS:
+    def _archive_lines(self, file: IO[bytes], form: UploadForm) -> CountedLines | None:
+        """The batches of an archive; None for an upload of lines.
+
+        Raises `NotAvailable` where the feature that reads it has been switched off since.
+        """
+        if form.form not in self.formats:
+            message = f"no feature reads it; see {SETTING}"
+            raise NotAvailable(Fault("body", message, form.form))
+        if form.form not in self._archives:
             return None
-        return PacketLines(file, self._context.missions, form.spacecraft)
+        module, missions = self._archives[form.form], self._context.missions
+        lines: CountedLines = module.opened_upload(file, missions, form.spacecraft)
+        return lines
 
     def _new(
         self,

@@ -95,6 +95,8 @@ def build_parser(features_off: str = "") -> argparse.ArgumentParser:
         import_module(f"{commands.__name__}.{found.name}").add(added)
     for module in feature_modules("command", features_off):
         module.add(added)
+    for module in feature_modules("telemetry", features_off):
+        module.add_options(added.choices["replay"])
     for entry in entry_points(group="acquire.commands"):
         entry.load()(added)
     return parser

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar, runtime_checkable
 
 import msgspec
 from msgspec import UNSET, structs
@@ -23,7 +23,6 @@ from service.contract.runs import Replay, ReplayStateName
 from service.errors import AcquisitionError, BadBatch, BadInput, Busy, Fault, Stopping, problem_of
 from service.ingest.bulk import Bulk, BulkChunk, Check, LineAnswer
 from service.observations.decompress import Line
-from service.packets.reader import PacketLines, PacketTotals
 from service.storage.gyro import Recorded
 from service.storage.queries import replays
 from service.storage.recording import events
@@ -34,8 +33,6 @@ MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3
 """The most faults of one line: each chunk that adds some stores all again, read as a whole."""
 MAX_TEXT_KEPT = 300
-MAX_APIDS_KEPT = 100
-"""The application ids with the most packets are kept; the sums are of all."""
 SAVE_EVERY_S = 0.2
 """The time between two stored states: each is a transaction, and an event for all listeners."""
 SAVE_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
@@ -74,7 +71,7 @@ class ProgressRecorder:
         self._refused = replay.lines.refused
         self._errors = list(replay.errors)
         self._errors_changed = False
-        self.packets: Callable[[], PacketTotals | None] = lambda: None
+        self.packet_counts: Callable[[], records.ReplayPackets | None] = lambda: None
         """The counts of the packets that the lines are made of."""
         self._saving: Future[None] | None = None
         self._is_saved = True
@@ -93,9 +90,7 @@ class ProgressRecorder:
     def insert(self, also: Callable[[Connection], object]) -> None:
         """Store the replay as new; `also` is called in the same transaction."""
         progress = self._progress("running", None)
-        replay = records.Replay(
-            **structs.asdict(progress), packets=self._packet_counts(), errors=[]
-        )
+        replay = records.Replay(**structs.asdict(progress), packets=self.packet_counts(), errors=[])
 
         def store(connection: Connection) -> None:
             replays.insert_replay(connection, replay)
@@ -140,7 +135,7 @@ class ProgressRecorder:
         """
         progress = self._progress(state, finished)
         errors = list(self._errors) if self._errors_changed else None
-        packets = self._packet_counts()
+        packets = self.packet_counts()
 
         def store(connection: Connection) -> None:
             stored = progress
@@ -195,14 +190,6 @@ class ProgressRecorder:
             finished=finished,
         )
 
-    def _packet_counts(self) -> records.ReplayPackets | None:
-        totals = self.packets()
-        if totals is None:
-            return None
-        most = sorted(totals.apids, key=lambda each: -each.packets)[:MAX_APIDS_KEPT]
-        kept = structs.replace(totals, apids=sorted(most, key=lambda each: each.apid))
-        return msgspec.convert(msgspec.to_builtins(kept), records.ReplayPackets)
-
     def _not_saved(self, error: Exception) -> None:
         # The next save has the same and more; the batches themselves are recorded.
         self._errors_changed = True
@@ -232,8 +219,26 @@ STOP_WITHIN_S = 0.2
 
 
 T = TypeVar("T")
-ReplaySource = Iterable[bytes | Line]
-"""Lines of telemetry, or of `PacketLines`, which count the packets that they are made of."""
+
+
+@runtime_checkable
+class CountedLines(Protocol):
+    """Lines of an upload that is no file of lines, which count what they are made of."""
+
+    spacecraft: str
+    """The mission that the lines are of."""
+
+    def __iter__(self) -> Iterator[Line]:
+        """Each batch and gyro block; iterated once."""
+
+    def counts(self) -> records.ReplayPackets:
+        """What the lines read so far were made of."""
+
+    def close(self) -> None:
+        """Close the upload."""
+
+
+ReplaySource = Iterable[bytes | Line] | CountedLines
 
 
 # The lines of a telemetry file, in groups that are computed together.
@@ -380,8 +385,8 @@ class RunningReplay:
         self._start_thread(lines)
 
     def _start_thread(self, lines: ReplaySource) -> None:
-        if isinstance(lines, PacketLines):
-            self._progress.packets = lines.totals
+        if isinstance(lines, CountedLines):
+            self._progress.packet_counts = lines.counts
         threading.Thread(target=self._work, args=(lines,), name=f"replay-{self.id}").start()
 
     @property

@@ -13,7 +13,7 @@ from typing import IO
 
 from service.errors import Busy
 from service.observations.decompress import Coding
-from service.observations.input_formats import CSV, NDJSON, PACKETS
+from service.observations.input_formats import CSV, NDJSON
 from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 
 PART, LINES, ABOUT = ".part", ".lines", ".json"
@@ -45,7 +45,7 @@ class SpooledReplay:
     @property
     def form_name(self) -> str:
         """The name of the file's format, of earlier versions too."""
-        earlier = PACKETS if self.packets is not None else CSV if self.is_csv else NDJSON
+        earlier = "packets" if self.packets is not None else CSV if self.is_csv else NDJSON
         return self.form or earlier
 
 

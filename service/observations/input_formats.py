@@ -20,8 +20,8 @@ from service.observations.csv_table import SEPARATORS, CsvTable
 from service.observations.decompress import Line, physical_lines
 from service.observations.gyro_rows import GYRO_ROWS, BlockRows
 
-NDJSON, CSV, PACKETS = "ndjson", "csv", "packets"
-"""Names of formats: what is not named by a suffix is NDJSON; space packets are no lines."""
+NDJSON, CSV = "ndjson", "csv"
+"""Names of formats: what is not named by a suffix is NDJSON."""
 
 
 def _is_this(start: bytes) -> str | None:
@@ -55,9 +55,12 @@ class InputFormat:
     uploaded: str = ""
 
 
-def input_formats() -> dict[str, InputFormat]:
-    """The formats by name: those of `INPUT_FORMATS`, then those that features bring."""
-    brought = feature_modules("formats", os.environ.get(SETTING, ""))
+def input_formats(off: str | None = None) -> dict[str, InputFormat]:
+    """The formats by name: those of `INPUT_FORMATS`, then those that features bring.
+
+    `off` are the features that are left out; None: those of the environment.
+    """
+    brought = feature_modules("formats", os.environ.get(SETTING, "") if off is None else off)
     return {**INPUT_FORMATS, **{k: v for each in brought for k, v in each.INPUT_FORMATS.items()}}
 
 
@@ -70,12 +73,6 @@ def telemetry_format(path: Path) -> str:
     """The name of a file's format, by its suffix; NDJSON for a suffix that no format has."""
     suffix = path.suffix.lower()
     named = (name for name, each in telemetry_formats().items() if suffix in each.suffixes)
-    return next(named, NDJSON)
-
-
-def format_of_media_type(media_type: str) -> str:
-    """The name of the format that has a media type; NDJSON for a type that none has."""
-    named = (name for name, each in input_formats().items() if media_type in each.media_types)
     return next(named, NDJSON)
 
 
@@ -288,14 +285,6 @@ INPUT_FORMATS: dict[str, InputFormat] = {
         read=_read_csv,
         refusal=_not_csv,
         uploaded="One star or one gyro sample a row; `.csv` or `.tsv` of `acquire replay`.",
-    ),
-    PACKETS: InputFormat(
-        "CCSDS space packets",
-        "batches and gyro blocks",
-        "--packets FILE --xtce FILE",
-        "The XTCE file says where a parameter lies in a packet and how it is calibrated, the table "
-        "[packets] of\nthe mission which parameters fill a batch.  Needs the extra `packets`.",
-        media_types=("application/x-tar",),
     ),
     "aem": InputFormat(
         "CCSDS AEM",

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -22,7 +22,6 @@ from service.observations.batch import ObservationBatch
 from service.observations.decompress import Line
 from service.observations.schema import RunName, Submission, submission_from_json
 from service.observations.telemetry import read_lines
-from service.packets.reader import PacketReader, file_lines
 from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.times import Utc
 
@@ -68,16 +67,31 @@ def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
     """Every line of the files, in order, checked as a batch or a gyro block of that run."""
     for file in files:
         for line in read_lines(file):
-            yield _item(file, line, run)
+            yield item_of(file, line, run)
 
 
-def packet_items(reader: PacketReader, files: Sequence[Path], run: str) -> Iterator[Item]:
-    """Every batch that files of space packets hold, as `items_of` gives those of telemetry."""
-    for file, line in file_lines(reader, files):
-        yield _item(file, line, run)
+class OtherFiles(Protocol):
+    """Files of another form than lines, which a feature reads; see `service.feature`."""
+
+    files: Sequence[Path]
+    spacecraft: str | None
+    """The mission of the files, where it is named."""
+
+    def items(self, run: str) -> Iterator[Item]:
+        """Every batch and gyro block in the files, read in this process."""
+
+    def counts(self) -> dict[str, Any] | None:
+        """The counts of what was read in this process; None where nothing was."""
+
+    def __iter__(self) -> Iterator[bytes]:
+        """The files as they are sent to a service."""
+
+    def item(self, number: int) -> Item:
+        """The place of a batch that the service refused by its number."""
 
 
-def _item(file: Path, line: Line, run: str) -> Item:
+def item_of(file: Path, line: Line, run: str) -> Item:
+    """A line of a file, checked as a batch or a gyro block of that run."""
     if line.body is None:
         assert line.fault is not None
         return Item(file, line.number, None, problem_of_faults([line.fault]))

@@ -20,11 +20,11 @@ from msgspec import to_builtins
 from service import errors
 from service.gyro import json_of_block
 from service.observations.telemetry import read_lines
-from service.packets.reader import archive_of
 from service.replay.items import (
     AttitudeCarrier,
     Item,
     LineOutcome,
+    OtherFiles,
     Pace,
     Problem,
     Report,
@@ -193,7 +193,7 @@ def _problem(problem: answers.Problem) -> Problem:
 
 # Replay through a running service as one upload, and poll its progress.
 #
-# Lines of telemetry are sent as NDJSON, files of space packets with their XTCE file as an archive.
+# Lines of telemetry are sent as NDJSON, other files in the form of the feature that reads them.
 #
 # Suited to files of any length: no single answer is waited for.  Repeating a replay
 # adds nothing, as with single posts.
@@ -230,35 +230,17 @@ class _SentLines:
         return Item(self._files[which], self._places[index], None)
 
 
-class _SentPackets:
-    """Files of packets and their XTCE file as they are sent."""
-
-    def __init__(self, files: Sequence[Path], xtce: Path) -> None:
-        self._files, self._xtce = files, xtce
-
-    def __iter__(self) -> Iterator[bytes]:
-        return archive_of([self._xtce, *self._files])
-
-    def item(self, number: int) -> Item:
-        """A packet by its number; of several files the problem names the one."""
-        return Item(self._files[0], number, None)
-
-
 def replay_in_bulk(
     url: str,
-    files: Sequence[Path],
+    files: Sequence[Path] | OtherFiles,
     run: str,
     report: Report,
     progress: Callable[[Replay], object],
     *,
     token: str | None = None,
     alarms: bool = False,
-    spacecraft: str | None = None,
-    xtce: Path | None = None,
 ) -> None:
     """Send files as one replay and follow it to its end.
-
-    With `xtce` they are files of space packets that this file describes.
 
     `progress` receives the state of the replay repeatedly and at the end;
     `report` receives every refused line, those beyond the first thousand without
@@ -267,7 +249,8 @@ def replay_in_bulk(
     does not answer or stopped early.  Interrupted, it has the service
     cancel the replay.
     """
-    lines = _SentLines(files, report) if xtce is None else _SentPackets(files, xtce)
+    lines = _SentLines(files, report) if isinstance(files, Sequence) else files
+    spacecraft = None if isinstance(lines, _SentLines) else lines.spacecraft
     with (
         translated(url),
         Client(
@@ -276,7 +259,11 @@ def replay_in_bulk(
     ):
         try:
             begun = client.start_replay(
-                lines, run, alarms=alarms, packets=xtce is not None, spacecraft=spacecraft
+                lines,
+                run,
+                alarms=alarms,
+                packets=not isinstance(lines, _SentLines),
+                spacecraft=spacecraft,
             )
         except answers.NoAnswer as error:
             raise no_service(url, error) from None

@@ -21,7 +21,7 @@ from starlette.responses import Response
 from service import __version__
 from service.contract.base import Record, component_name, described
 from service.contract.events import EVENT_DATA
-from service.observations.input_formats import INPUT_FORMATS, NDJSON, PACKETS, input_formats
+from service.observations.input_formats import INPUT_FORMATS, NDJSON, input_formats
 from service.products.formats import attitude_formats, table_formats
 from service.web.middleware import API
 from service.web.requests.access import POLICIES
@@ -128,7 +128,7 @@ class ApiRouter(APIRouter):
         body: type[BaseModel] | None = None,
         body_required: bool = True,
         lines_of: type[BaseModel] | None = None,
-        archive: str | None = None,
+        uploads: bool = False,
         array_of: tuple[type[BaseModel], int] | None = None,
         frame: bool = False,
         problems: Sequence[int] = (),
@@ -140,7 +140,7 @@ class ApiRouter(APIRouter):
 
         What a path names may not be there, so 404 is described, unless the route creates it.
         Without `body_required` the body may be left out: its fields all have defaults.
-        `archive` says what an archive holds that can be sent in place of lines.
+        With `uploads` every input format that has a media type can be sent in place of lines.
         `array_of` is the model of an array's elements, and how many there may be.
         """
         content: dict[str, Any] = {}
@@ -156,11 +156,10 @@ class ApiRouter(APIRouter):
             lines = {"schema": _BINARY | {"description": description}}
             types = INPUT_FORMATS[NDJSON].media_types[0], BINARY
             content, reading = dict.fromkeys(types, lines), READING_NDJSON
-            if archive is not None:
+            if uploads:
                 for name, each in input_formats().items():
                     if name != NDJSON and each.media_types:
-                        text = archive if name == PACKETS else each.uploaded
-                        schema = _BINARY | {"description": text}
+                        schema = _BINARY | {"description": each.uploaded}
                         content[each.media_types[0]] = {"schema": schema}
         if frame:
             file = {"schema": _BINARY}

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from service.cli import build_parser
 from service.errors import BadConfiguration
-from service.feature import SHIPPED, Feature, features_on, known_features
+from service.feature import SETTING, SHIPPED, Feature, features_on, known_features
 
 FEATURES = Path(__file__).parents[2] / "service" / "features"
 
@@ -37,6 +37,14 @@ def test_a_feature_brings_what_it_says_and_has_a_folder_of_tests(name):
 def test_a_command_of_a_feature_that_is_off_is_not_there():
     assert "follow" in commands_of(build_parser())
     assert "follow" not in commands_of(build_parser(features_off="follow"))
+
+
+def test_options_of_a_feature_that_is_off_are_not_there():
+    def options_of(parser):
+        return {each.dest for each in parser.commands.choices["replay"]._actions}
+
+    found = options_of(build_parser()) - options_of(build_parser("packets"))
+    assert found == {"packets", "xtce", "spacecraft"}
 
 
 def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypatch):
@@ -83,7 +91,7 @@ def served(folder, off, *addresses, path=()):
     run = subprocess.run(
         [sys.executable, "-c", SERVED, str(folder / "acquire.db"), off, *addresses],
         cwd=ROOT,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path))},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, path)), SETTING: off},
         capture_output=True,
         text=True,
         check=True,

@@ -51,7 +51,7 @@ AREAS = {
     "webhooks": ("service/features/webhooks",),
     "recording": ("service/storage/recording",),
     "ingest": ("service/ingest",),
-    "packets": ("service/packets",),
+    "packets": ("service/features/packets",),
     "products": ("service/products",),
     "requests": (
         "service/web/requests",

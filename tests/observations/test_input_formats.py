@@ -14,7 +14,12 @@ from service.acquire import acquire
 from service.errors import BadInput
 from service.gyro import block_from_line
 from service.observations.csv_rows import COLUMNS
-from service.observations.input_formats import CSV_COLUMNS, INPUT_FORMATS, input_format
+from service.observations.input_formats import (
+    CSV_COLUMNS,
+    INPUT_FORMATS,
+    input_format,
+    input_formats,
+)
 from service.observations.schema import submission_from_json
 from service.observations.telemetry import read_lines
 from service.products.reading.files import read_attitudes, read_ephemeris
@@ -38,11 +43,11 @@ def test_every_column_of_csv_is_described_once():
 
 def test_the_page_has_every_format_column_and_example():
     rows = dict(re.findall(r"^\| `([\w-]+)` \| `([^|]+)` \|", PAGE, re.MULTILINE))
-    assert rows == {name: each.given for name, each in INPUT_FORMATS.items()}
+    assert rows == {name: each.given for name, each in input_formats().items()}
     for names, unit, meaning in CSV_COLUMNS:
         cells = ", ".join(f"`{name}`" for name in names.split())
         assert f"| {cells} | {unit} | {meaning} |" in PAGE
-    for each in INPUT_FORMATS.values():
+    for each in input_formats().values():
         assert f"## {each.title}\n" in PAGE
         assert each.example in PAGE
 
@@ -83,8 +88,9 @@ def test_the_set_of_elements_of_the_example_is_in_low_orbit(tmp_path):
 def test_the_list_and_each_format_are_printed(acquire):
     code, out, _ = acquire("replay", "--formats")
     assert code == 0
-    assert [line.split()[0] for line in out.splitlines()[: len(INPUT_FORMATS)]] == [*INPUT_FORMATS]
-    for name, each in INPUT_FORMATS.items():
+    formats = input_formats()
+    assert [line.split()[0] for line in out.splitlines()[: len(formats)]] == [*formats]
+    for name, each in formats.items():
         code, out, _ = acquire("replay", "--formats", name)
         assert (code, each.example in out, each.given in out) == (0, True, True)
     assert max(len(line) for line in acquire("replay", "--formats")[1].splitlines()) <= 100

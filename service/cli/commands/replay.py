@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Any
 from service.cli import arguments
 from service.cli.arguments import service_url, settings_of
 from service.errors import BadFile, BadInput, Fault, shown_value
+from service.feature import feature_modules
 
 if TYPE_CHECKING:
-    from service.packets.reader import PacketReader
-    from service.replay.items import AttitudeCarrier, FromFile, Item, Pace
+    from service.replay.items import AttitudeCarrier, FromFile, Item, OtherFiles, Pace
     from service.replay.summary import ReplaySummary
 
 DEFAULT_CONCURRENCY = 4
@@ -33,7 +33,6 @@ def add(commands: Any) -> None:
         metavar="NAME",
         help="print the list of input formats; with NAME its fields, and an example",
     )
-    _add_packets(parser)
     arguments.add_url_or_in_process(parser)
     parser.add_argument(
         "--run", help="the run for every batch; default: the first file's name without its ending"
@@ -93,26 +92,6 @@ def _add_knowledge(parser: ArgumentParser) -> None:
     )
 
 
-def _add_packets(parser: ArgumentParser) -> None:
-    parser.add_argument(
-        "--packets",
-        nargs="+",
-        type=Path,
-        default=[],
-        metavar="FILE",
-        help="files of CCSDS space packets, in place of FILE; the mission's table [packets] says "
-        "which parameters fill a batch",
-    )
-    parser.add_argument(
-        "--xtce", type=Path, metavar="FILE", help="the XTCE file that describes the packets"
-    )
-    parser.add_argument(
-        "--spacecraft",
-        metavar="NAME",
-        help="the mission of the packets; default: the only one with a table [packets]",
-    )
-
-
 def run(parsed: Namespace) -> int:
     """Send files of batches and gyro blocks (NDJSON, or CSV if the name ends in .csv or .tsv) to
     the service.  You can send a file twice: nothing is recorded twice.
@@ -130,21 +109,19 @@ def run(parsed: Namespace) -> int:
     if parsed.formats is not None:
         print(_formats_text(parsed.formats))
         return 0
-    from msgspec import to_builtins
-
-    from service.replay.items import AttitudeCarrier, Pace, items_of, packet_items, run_name
+    from service.replay.items import AttitudeCarrier, Pace, items_of, run_name
     from service.replay.summary import ReplaySummary
 
-    files = _checked_files(parsed)
+    other = _other_files(parsed)
+    files = _checked_files(parsed, other)
     run = run_name(files, parsed.run)
     pace = Pace(parsed.speed)
     in_bulk = _is_in_bulk(parsed)
-    reader = _packet_reader(parsed) if parsed.packets and not in_bulk else None
-    items = items_of(files, run) if reader is None else packet_items(reader, files, run)
+    items = items_of(files, run) if other is None or in_bulk else other.items(run)
     sources = _sources(parsed)
     for source in sources:
         items = map(source.prepared, items)
-    sized = [] if parsed.packets else files
+    sized = files if other is None else []
     progress = True if parsed.progress else None
     carrier = AttitudeCarrier() if parsed.carry_attitude else None
     if parsed.in_process:
@@ -163,11 +140,11 @@ def run(parsed: Namespace) -> int:
             raise BadInput(Fault("--database", message, shown_value(parsed.database)))
         with ReplaySummary(sized, parsed.results, progress) as summary:
             if in_bulk:
-                _send_files(parsed, files, run, summary)
+                _send_files(parsed, files if other is None else other, run, summary)
             else:
                 _send_batches(parsed, items, run, summary, pace, carrier)
-    if reader is not None:
-        summary.packets = to_builtins(reader.totals())
+    if other is not None and not in_bulk:
+        summary.packets = other.counts()
     _print_counts(run, summary, sources, parsed.json)
     if not parsed.json and summary.batches:
         print(f"{'next':<20}{_next_step(parsed, run)}")
@@ -175,7 +152,7 @@ def run(parsed: Namespace) -> int:
 
 
 def _send_files(
-    parsed: Namespace, files: Sequence[Path], run: str, summary: "ReplaySummary"
+    parsed: Namespace, files: "Sequence[Path] | OtherFiles", run: str, summary: "ReplaySummary"
 ) -> None:
     from service.replay.over_http import replay_in_bulk
 
@@ -187,8 +164,6 @@ def _send_files(
         summary.follow,
         token=settings_of(parsed).token,
         alarms=parsed.alarms,
-        spacecraft=parsed.spacecraft,
-        xtce=parsed.xtce,
     )
 
 
@@ -275,42 +250,33 @@ def _is_in_bulk(parsed: Namespace) -> bool:
     )
 
 
-def _checked_files(parsed: Namespace) -> list[Path]:
+def _other_files(parsed: Namespace) -> "OtherFiles | None":
+    """The files of another form than lines that the options name, if they do.
+
+    Raises `BadInput` unless there are files of one form.
+    """
+    from service.observations.input_formats import input_formats
+
+    off = settings_of(parsed).features_off
+    modules, formats = feature_modules("telemetry", off), input_formats(off)
+    found = [each for each in (module.files_of(parsed) for module in modules) if each is not None]
+    if len(found) + bool(parsed.files) != 1:
+        hints = "".join(f", or else {formats[module.FORMAT].given}" for module in modules)
+        message = f"is required{hints} (see `acquire replay --help`)"
+        raise BadInput(Fault("FILE", message))
+    return found[0] if found else None
+
+
+def _checked_files(parsed: Namespace, other: "OtherFiles | None") -> Sequence[Path]:
     """The files to send; one that is missing or is no telemetry is refused before that."""
     from service.observations.telemetry import require_telemetry
 
-    if bool(parsed.files) == bool(parsed.packets):
-        raise BadInput(
-            Fault(
-                "FILE",
-                "is required, or else --packets FILE --xtce FILE (see `acquire replay --help`)",
-            )
-        )
-    if bool(parsed.packets) != (parsed.xtce is not None):
-        raise BadInput(Fault("--xtce", "goes with --packets, and --packets needs it"))
-    if parsed.spacecraft is not None and not parsed.packets:
-        message = "goes with --packets; a batch names its own spacecraft"
-        raise BadInput(Fault("--spacecraft", message, shown_value(parsed.spacecraft)))
-    files: list[Path] = parsed.packets or parsed.files
+    files: Sequence[Path] = parsed.files if other is None else other.files
     for file in files:
-        if not parsed.packets:
+        if other is None:
             require_telemetry(file)
         elif not file.is_file():
             raise BadFile(Fault(str(file), "is not there, or is no file"))
         if parsed.results is not None and parsed.results.resolve() == file.resolve():
             raise BadInput(Fault("--results", "must not be a file that is replayed", str(file)))
     return files
-
-
-def _packet_reader(parsed: Namespace) -> "PacketReader":
-    """The reader of packets in this process, with the missions of the settings."""
-    from service.missions.mission import load_missions
-    from service.packets.definition import read_definition
-    from service.packets.mapping import packet_mission
-    from service.packets.reader import PacketReader
-
-    settings = settings_of(parsed)
-    missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
-    mission = packet_mission(missions, parsed.spacecraft)
-    assert mission.packets is not None
-    return PacketReader(mission, read_definition(parsed.xtce, mission.packets.root_container))

@@ -12,7 +12,6 @@ from starlette.responses import Response
 from service.app.replays import UploadForm, discard_upload
 from service.contract.runs import Forgotten, Replay, ReplayList, RunList, RunState
 from service.errors import BadBatch, Fault, shown_value
-from service.observations.input_formats import PACKETS
 from service.observations.schema import BatchIn, Key, RunName, Wire
 from service.storage.upkeep.forget import MOST_NAMES, ForgetFilter
 from service.web.openapi import LOCATION, ApiRouter, Returns
@@ -94,7 +93,10 @@ async def _telemetry(
         require_all_spacecraft(caller)
         request.state.changes = request.scope["route"].name
     body = await request_body.telemetry_body(
-        request, partial(app.replays.new_upload, caller), discard_upload
+        request,
+        partial(app.replays.new_upload, caller),
+        discard_upload,
+        app.replays.formats,
     )
     return ReplayUpload(query, body)
 
@@ -149,7 +151,7 @@ def list_replays(app: AppDep, caller: CallerDep) -> Response:
     "POST /replays",
     Returns("The replay, now running.", Replay, LOCATION, status=202),
     lines_of=BatchIn,
-    archive="Files of CCSDS space packets, and one XTCE file (.xml or .xtce).",
+    uploads=True,
     problems=(503,),
 )
 def start_replay(
@@ -162,7 +164,7 @@ def start_replay(
     ends as `failed`.
     """
     query, body = upload.query, upload.body
-    if query.spacecraft is not None and body.form != PACKETS:
+    if query.spacecraft is not None and app.replays.formats[body.form].read is not None:
         discard_upload(body.file)
         message = "goes with space packets; a batch names its own spacecraft"
         raise BadBatch(Fault("spacecraft", message, shown_value(query.spacecraft)))

@@ -9,7 +9,7 @@ together may take `Limits.budget_bytes` of memory until their requests are answe
 import asyncio
 import ctypes
 import tempfile
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import dataclass
 from typing import IO, Annotated, Any, TypeVar
 
@@ -23,7 +23,7 @@ from starlette.types import Scope
 from service.errors import BadBatch, BadInput, Busy, Fault, shown_value
 from service.observations.decompress import Coding
 from service.observations.field_faults import checked_by
-from service.observations.input_formats import NDJSON, format_of_media_type, input_formats
+from service.observations.input_formats import NDJSON, InputFormat
 from service.web.requests.problems import NotJson
 
 JSON = "application/json"
@@ -200,15 +200,17 @@ class Spooled:
 
 
 async def telemetry_body(
-    request: Request, new_file: Callable[[], IO[bytes]], discard: Callable[[IO[bytes]], object]
+    request: Request,
+    new_file: Callable[[], IO[bytes]],
+    discard: Callable[[IO[bytes]], object],
+    formats: Mapping[str, InputFormat],
 ) -> Spooled:
-    """A body in one of the input formats in a new file; one that did not arrive is discarded.
+    """A body in one of the formats in a new file; one that did not arrive is discarded.
 
-    One with a batch a line may be compressed.
+    One with a batch a line may be compressed.  `formats` are input formats by name.
     """
-    formats = input_formats()
     kind = _require_type(request, sum((each.media_types for each in formats.values()), ()))
-    form = format_of_media_type(kind)
+    form = next(name for name, each in formats.items() if kind in each.media_types)
     codings: tuple[Coding, ...] = (
         ("identity", "gzip", "zstd") if formats[form].one_a_line else ("identity",)
     )

@@ -10,11 +10,18 @@ import pytest
 
 from service.acquire import acquire
 from service.errors import BadConfiguration, BadInput
+from service.features.packets.definition import PacketDefinition
+from service.features.packets.reader import PacketReader
 from service.observations.schema import submission_from_json
-from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketReader
 from service.vectors import matrix_from_quaternion
-from tests.packets.packing import ATTITUDE_APID, NAMESPACES, cds, mission_with, packet, xtce
+from tests.features.packets.packing import (
+    ATTITUDE_APID,
+    NAMESPACES,
+    cds,
+    mission_with,
+    packet,
+    xtce,
+)
 
 TIME = "1999-03-01T00:00:00.250Z"
 THIRTY_DEG = [0.0, 0.0, math.sin(math.radians(15.0)), math.cos(math.radians(15.0))]

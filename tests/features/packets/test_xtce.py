@@ -6,8 +6,8 @@ import struct
 import pytest
 
 from service.errors import BadFile
-from service.packets.definition import PacketDefinition
-from tests.packets.packing import NAMESPACES, packet, xtce
+from service.features.packets.definition import PacketDefinition
+from tests.features.packets.packing import NAMESPACES, packet, xtce
 
 DOCTYPE = '<!DOCTYPE SpaceSystem [<!ENTITY a "aaaaaaaaaa">]>\n'
 BOMB = (

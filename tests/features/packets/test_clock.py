@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from astropy.time import Time
 
+from service.features.packets.clock import moment_of
+from service.features.packets.definition import PacketFault
 from service.missions.packets import CdsTime, CucTime
-from service.packets.clock import moment_of
-from service.packets.definition import PacketFault
 from service.times import FIRST_YEAR, LAST_YEAR, parse_utc
 
 CDS = CdsTime(kind="cds", day="D", millisecond="MS", microsecond="US")

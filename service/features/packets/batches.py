@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from service.errors import BadBatch, Fault
+from service.features.packets import clock
+from service.features.packets.definition import PacketFault
+from service.features.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns
+from service.features.packets.stream import SpacePacket
 from service.missions.packets import PacketGyro, PacketMeasurement, PacketPrior
 from service.observations.field_faults import checked_by
 from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
-from service.packets import clock
-from service.packets.definition import PacketFault
-from service.packets.mapping import MeasurementColumns, PacketMap, TrackerColumns
-from service.packets.stream import SpacePacket
 
 CARRIED_WITHIN_S = 10.0
 """Rates, velocity and position of another packet serve stars that are so near in time."""

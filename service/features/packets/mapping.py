@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 from service.errors import BadInput, Fault, shown_value
+from service.features.packets.clock import names_of
+from service.features.packets.definition import PacketDefinition, ParameterKind
 from service.missions.mission import Mission
 from service.missions.packets import (
     PacketGyroBlocks,
@@ -15,8 +17,6 @@ from service.missions.packets import (
     PacketTracker,
     element_names,
 )
-from service.packets.clock import names_of
-from service.packets.definition import PacketDefinition, ParameterKind
 
 DEG_OF_UNIT = {"deg": 1.0, "arcmin": 1.0 / 60.0, "arcsec": 1.0 / 3600.0, "rad": 180.0 / math.pi}
 

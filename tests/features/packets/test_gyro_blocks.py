@@ -10,15 +10,15 @@ import pytest
 from service.app.factory import open_app
 from service.cli import main
 from service.errors import BadConfiguration, BadInput
+from service.features.packets.definition import PacketDefinition
+from service.features.packets.reader import PacketReader
 from service.gyro import block_from_line
 from service.missions.mission import SHIPPED_FOLDER
-from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketReader
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
 from service.times import parse_utc, shifted
-from tests.packets.packing import (
+from tests.features.packets.packing import (
     APID,
     NAMESPACES,
     TABLE,

@@ -15,22 +15,26 @@ from functools import partial
 from pathlib import Path
 from typing import IO
 
-from msgspec import Struct
+from msgspec import Struct, convert, structs, to_builtins
 
+from service.contract.runs import ReplayPackets
 from service.errors import BadFile, BadInput, Fault, shown_value
-from service.missions.mission import Mission
-from service.observations.decompress import Line
-from service.packets.batches import (
+from service.features.packets.batches import (
     BatchMaker,
     MeasuredBatch,
     MeasurementMaker,
     PacketAttitude,
     StarBatch,
 )
-from service.packets.definition import MAX_BYTES, PacketDefinition, PacketFault, UnknownPacket
-from service.packets.gyro_blocks import GyroBlockMaker, PacketBlock
-from service.packets.mapping import packet_map, packet_mission
-from service.packets.stream import (
+from service.features.packets.definition import (
+    MAX_BYTES,
+    PacketDefinition,
+    PacketFault,
+    UnknownPacket,
+)
+from service.features.packets.gyro_blocks import GyroBlockMaker, PacketBlock
+from service.features.packets.mapping import packet_map, packet_mission
+from service.features.packets.stream import (
     IDLE_APID,
     ApidCounts,
     EndOfPackets,
@@ -39,6 +43,8 @@ from service.packets.stream import (
     SpacePacket,
     packets_in,
 )
+from service.missions.mission import Mission
+from service.observations.decompress import Line
 
 _OF_SEGMENTS = (
     "; it is joined of {} segments: if each has a secondary header, set "
@@ -47,6 +53,8 @@ _OF_SEGMENTS = (
 )
 
 READ_BYTES = 1 << 16
+MOST_APIDS = 100
+"""The application ids with the most packets are reported; the sums are of all."""
 
 
 class PacketTotals(Struct, kw_only=True):
@@ -275,7 +283,6 @@ BLOCK_BYTES = 512
 MAX_MEMBERS = 1_000
 PIECE_BYTES = 1 << 18
 XTCE_SUFFIXES = (".xml", ".xtce")
-MEDIA_TYPE = "application/x-tar"
 
 _REGULAR, _FOLDER, _EXTENDED = b"\x000", b"5", b"xgLK"
 _FIELD = "body"
@@ -368,9 +375,12 @@ class PacketLines:
             part = io.BufferedReader(_Part(self._file, member), 1 << 16)
             yield from self._reader.lines(part, member.name)
 
-    def totals(self) -> PacketTotals:
-        """The counts of the packets so far."""
-        return self._reader.totals()
+    def counts(self) -> ReplayPackets:
+        """The counts of the packets so far, of APIDs those with the most packets."""
+        totals = self._reader.totals()
+        most = sorted(totals.apids, key=lambda each: -each.packets)[:MOST_APIDS]
+        kept = structs.replace(totals, apids=sorted(most, key=lambda each: each.apid))
+        return convert(to_builtins(kept), ReplayPackets)
 
     def close(self) -> None:
         """Close the archive."""

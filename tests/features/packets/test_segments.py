@@ -5,8 +5,8 @@ import io
 import pytest
 from space_packet_parser.generators.ccsds import create_ccsds_packet
 
-from service.packets.stream import MOST_BYTES, SegmentJoiner, packets_in
-from tests.packets.packing import (
+from service.features.packets.stream import MOST_BYTES, SegmentJoiner, packets_in
+from tests.features.packets.packing import (
     APID,
     TABLE,
     fields,
@@ -14,7 +14,7 @@ from tests.packets.packing import (
     packed,
     packet,
 )
-from tests.packets.test_reader import ANGLES, canonical, drawn, read, reader_of
+from tests.features.packets.test_reader import ANGLES, canonical, drawn, read, reader_of
 
 CONTINUATION, FIRST, LAST, WHOLE = range(4)
 

@@ -14,13 +14,13 @@ import pytest
 from space_packet_parser import ccsds_generator, load_xtce
 
 from service.errors import BadFile, BadInput
+from service.features.packets.definition import PacketDefinition, read_definition
+from service.features.packets.reader import PacketReader
+from service.features.packets.stream import packets_in
 from service.observations.schema import checked_from_json
-from service.packets.definition import PacketDefinition, read_definition
-from service.packets.reader import PacketReader
-from service.packets.stream import packets_in
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
-from tests.packets.packing import (
+from tests.features.packets.packing import (
     ANGLES,
     APID,
     ATTITUDE_APID,
@@ -357,7 +357,7 @@ def two_packets(data):
 
 
 def test_the_example_of_the_documents_works(acquire, tmp_path, monkeypatch):
-    docs = Path(__file__).parents[2] / "docs"
+    docs = Path(__file__).parents[3] / "docs"
     (tmp_path / "missions").mkdir()
     shutil.copy(docs / "example-packets.toml", tmp_path / "missions")
     monkeypatch.setenv("ACQUIRE_MISSIONS", str(tmp_path / "missions"))

@@ -9,7 +9,7 @@ from typing import IO
 
 from msgspec import Struct
 
-from service.packets.definition import PacketFault
+from service.features.packets.definition import PacketFault
 
 HEADER_BYTES = 6
 IDLE_APID = 2047

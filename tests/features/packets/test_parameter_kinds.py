@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 
 from service.errors import BadInput
+from service.features.packets.definition import PacketDefinition
+from service.features.packets.reader import PacketReader
 from service.observations.schema import submission_from_json
-from service.packets.definition import PacketDefinition
-from service.packets.reader import PacketReader
-from tests.packets.packing import TABLE, VECTORS, mission_with, xtce
+from tests.features.packets.packing import TABLE, VECTORS, mission_with, xtce
 
 FOLDER = Path(__file__).parent / "enumerated"
 XTCE = (FOLDER / "enum.xml").read_text()

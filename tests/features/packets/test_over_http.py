@@ -1,22 +1,30 @@
 """Space packets enter over HTTP as on the command line; the replay shows what was in them."""
 
+import dataclasses
 import io
 import json
 import tarfile
+from contextlib import closing
 
 import httpx
 import pytest
+from sqlalchemy import update
 
 from service.app.factory import open_app
+from service.cli import build_parser
+from service.features.packets.reader import file_lines
+from service.features.packets.telemetry import files_of
+from service.ingest.spool import Spool, SpooledReplay
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import checked_from_json
 from service.replay.in_process import replay_in_process
-from service.replay.items import packet_items
+from service.replay.items import item_of
 from service.replay.over_http import replay_in_bulk
 from service.replay.summary import ReplaySummary
+from service.storage.sql.tables import replays
 from service.web.app import create_app
-from tests.packets.packing import ANGLES, TABLE, mission_of_pass, packed, packet, xtce
-from tests.packets.test_reader import reader_of
+from tests.features.packets.packing import ANGLES, TABLE, mission_of_pass, packed, packet, xtce
+from tests.features.packets.test_reader import reader_of
 from tests.storage.samples import without_accidents
 from tests.web.conformance import check
 from tests.web.serving import Server, ended, in_process_settings
@@ -124,11 +132,10 @@ def test_the_command_uploads_packets_and_reports_their_counts(
 ):
     (tmp_path / "pass.dat").write_bytes(content)
     (tmp_path / "test.xml").write_bytes(xtce())
-    file, outcomes = tmp_path / "pass.dat", []
+    options = ["--packets", str(tmp_path / "pass.dat"), "--xtce", str(tmp_path / "test.xml")]
+    files, outcomes = files_of(build_parser().parse_args(["replay", *options])), []
     with ReplaySummary([], None, False) as summary:
-        replay_in_bulk(
-            packet_address, [file], run, outcomes.append, summary.follow, xtce=tmp_path / "test.xml"
-        )
+        replay_in_bulk(packet_address, files, run, outcomes.append, summary.follow)
     assert summary.packets["missing"] == 2
     assert "unknown APIDs     77" in summary.table()
     assert [each.item.number for each in outcomes] == [9]
@@ -140,7 +147,7 @@ def test_in_this_process_packets_give_the_answers_of_the_batches(
     (tmp_path / "pass.dat").write_bytes(content)
     outcomes = []
     reader = reader_of(mission_of_pass())
-    items = packet_items(reader, [tmp_path / "pass.dat"], run)
+    items = (item_of(*each, run) for each in file_lines(reader, [tmp_path / "pass.dat"]))
     replay_in_process(packet_app, items, outcomes.append)
     answers = [json.loads(each.answer) for each in outcomes if each.answer is not None]
     assert [each["batch"] for each in answers] == [each["batch"] for each in batches]
@@ -219,3 +226,42 @@ def test_a_file_that_ends_within_a_packet_is_recorded_up_to_there(packet_client,
     state = ended(packet_client, begun)
     assert (state["state"], state["counts"]["new"]) == ("done", 3)
     assert "packet 4 at byte" in state["errors"][0]["problem"]["detail"]
+
+
+@pytest.fixture
+def off_client(tmp_path, missions_folder):
+    settings = in_process_settings(f"sqlite:///{tmp_path}/off.db", missions=missions_folder)
+    app = open_app(dataclasses.replace(settings, features_off="packets"))
+    with Server(create_app(app)) as url, httpx.Client(base_url=url, timeout=60) as client:
+        yield client
+
+
+def test_switched_off_neither_uploads_nor_the_command_take_packets(off_client, capsys, run):
+    data = archive(test_xml=xtce(), pass_dat=b"x")
+    answer = off_client.post(f"{API}/replays?run={run}", content=data, headers=HEADERS)
+    assert answer.status_code == 415
+    with pytest.raises(SystemExit):
+        build_parser(features_off="packets").parse_args(["replay", "--packets", "a"])
+    assert "there is no option --packets" in capsys.readouterr().err
+
+
+def test_an_archive_left_from_before_it_was_switched_off_does_not_keep_the_service(
+    tmp_path, missions_folder
+):
+    settings = in_process_settings(f"sqlite:///{tmp_path}/left.db", missions=missions_folder)
+    settings = dataclasses.replace(settings, features_off="packets")
+    with closing(open_app(settings)) as app:
+        spool = Spool(settings.spool_folder)
+        replay = app.replays.start([], "left")
+        app.replays.stop()
+        file = spool.new_file()
+        file.write(archive(test_xml=xtce(), pass_dat=b"x"))
+        spool.keep(file, SpooledReplay(replay, "identity", 1000, None, "local", None, "XTE"))
+        file.close()
+        spool.release(replay)
+        mark = update(replays).where(replays.c.id == replay).values(state="interrupted")
+        app.context.change(lambda connection: connection.execute(mark))
+    with closing(open_app(settings)) as app:
+        app.replays.resume()
+        assert app.replays.at_work == []
+        assert app.replays.get(replay).state != "running"

@@ -8,8 +8,8 @@ from functools import lru_cache
 from typing import Any
 
 from service.errors import BadInput
+from service.features.packets.definition import PacketFault
 from service.missions.packets import CdsTime, CucTime, PacketTime
-from service.packets.definition import PacketFault
 from service.times import DAY_S, FIRST_YEAR, LAST_YEAR, parse_utc, recorded_utc
 
 NS = 1_000_000_000

@@ -10,13 +10,13 @@ from typing import Any
 import msgspec
 
 from service.errors import shown_value
+from service.features.packets.batches import counted_change
+from service.features.packets.clock import NS, Moment, finite, moment_of, whole
+from service.features.packets.definition import PacketFault
+from service.features.packets.mapping import PacketMap
+from service.features.packets.stream import SpacePacket
 from service.missions.mission import Mission
 from service.missions.motion import largest_rate_deg_per_s
-from service.packets.batches import counted_change
-from service.packets.clock import NS, Moment, finite, moment_of, whole
-from service.packets.definition import PacketFault
-from service.packets.mapping import PacketMap
-from service.packets.stream import SpacePacket
 from service.times import parse_utc, shifted
 
 MOST_SAMPLES = 10_000

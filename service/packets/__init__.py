@@ -1,1 +1,0 @@
-"""CCSDS space packets, described by an XTCE file and mapped by a mission, read as batches."""
