@@ -5,7 +5,7 @@ from typing import Annotated, Any, Literal
 from urllib.parse import quote, urlencode
 
 from fastapi import Path
-from msgspec import structs
+from msgspec import json, structs
 from pydantic import Field
 from starlette.requests import Request
 from starlette.responses import RedirectResponse, Response
@@ -17,7 +17,7 @@ from service.contract.base import Page
 from service.errors import BadBatch, BadInput, Fault, NotFound, shown_value
 from service.identify.hypotheses.verified import UNIQUE_PROBABILITY
 from service.observations.schema import Key
-from service.storage.queries.results import OutcomeName, StatusName, answer_from_json
+from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.star_field import ObservedStarPlace, StarField
 from service.storage.recording.ids import is_ulid
 from service.storage.recording.unsaved_result import LIVE
@@ -122,7 +122,8 @@ def batch_page(request: Request, id: ResultId, context: ContextDep) -> Response:
     options = changed_options(asked, held)
     tried = None
     if options.model_fields_set:
-        tried = answer_from_json(context.app.results.what_if(id, options).body)
+        # Without an id, unlike one that is recorded.
+        tried = json.decode(context.app.results.what_if(id, options).body, type=Answer)
     shown = tried or answer
     field = context.app.results.star_field(id, tried)
     mission = context.app.context.known[answer.spacecraft]
