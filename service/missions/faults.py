@@ -98,6 +98,8 @@ FORMS: dict[str, str] = {
 """The patterns of names, in words."""
 
 
+LONGEST_NAME = 40
+"""Longer names are meant as none that is known; comparing them takes long."""
 LEAST_CUT = 3
 """Letters of a name that stands for a longer one."""
 MOST_COMPARED = 20
@@ -175,6 +177,8 @@ def of_the_form_given(
 
 def nearest(name: Any, known: Sequence[Any]) -> str | None:
     """The name among those known that is spelt most like another, or None."""
+    if len(str(name)) > LONGEST_NAME:
+        return None
     names = [*map(str, known)]
     # A unit that was left out, as in sigma for sigma_arcsec, or a word that was cut, as mag.
     longer = [each for each in names if each.startswith(f"{name}_")] or [

@@ -15,9 +15,8 @@ Value = TypeVar("Value")
 
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
-LONGEST_NAME, EXPLAINED = 40, 3
-"""The nearest field is looked for, which takes milliseconds, for names that may be meant as one of
-them, and for so many faults of a body."""
+EXPLAINED = 3
+"""Faults of a body for which the nearest field is looked for, which takes milliseconds."""
 
 PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
     "from_last": "from"
@@ -53,8 +52,7 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
         # A field of another kind of a priori knowledge.
         kind = fault["loc"][-2]
         return f" beside {PRIOR_KINDS.get(kind, kind)}"
-    name = str(fault["loc"][-1])
-    if len(name) <= LONGEST_NAME and (near := nearest(name, allowed)) is not None:
+    if (near := nearest(str(fault["loc"][-1]), allowed)) is not None:
         return f"; did you mean {near}?"
     return f"; there are {', '.join(allowed)}" if allowed else ""
 

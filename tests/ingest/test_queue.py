@@ -393,8 +393,10 @@ def test_a_thread_that_ended_or_stalls_is_noticed(app, send, make, monkeypatch):
     stalled.exception(PATIENCE_S)
     wait_until(is_alive, why="the thread counts as stalled though it goes on")
 
-    monkeypatch.setattr(queue, "look_up", lambda *given: sys.exit())
+    both_sent = threading.Event()
+    monkeypatch.setattr(queue, "look_up", lambda *given: (both_sent.wait(PATIENCE_S), sys.exit()))
     waiting = [send(make(name)) for name in ("b2", "b3")]
+    both_sent.set()
     for each in waiting:
         assert isinstance(each.exception(PATIENCE_S), Stopping)
     with pytest.raises(Stopping):
