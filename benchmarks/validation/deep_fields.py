@@ -25,7 +25,7 @@ from studies.paper_1994.views import EPOCH, batch_of, draw_zone, paper_mission
 FIELDS, QUICK_FIELDS = 30, 4
 STARS = (10, 30, 100, 250)
 FAINTEST_MAG = 7.5
-"""Of fainter stars the catalog may lack one as faint, and they are left unmatched."""
+"""The faintest stars drawn: the catalog may lack fainter ones, which then stay unmatched."""
 LEAST_RIGHT, LEAST_FIELDS = 0.97, 0.98
 
 

@@ -103,7 +103,7 @@ def read(text, tmp_path, name="elements.txt"):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_every_form_gives_the_states_of_the_two_line_set(form, tmp_path):
-    """Of low, eccentric and far orbits: as well as microseconds tell the epoch."""
+    """Low, eccentric and far orbits agree as well as microseconds tell the epoch."""
     sets = [(ISS, ISS_EPOCH), (MOLNIYA, parse_utc("2006-06-25T08:00:00Z"))]
     for lines, epoch in sets:
         known, wanted = read(FORMS[form](fields_of(lines)), tmp_path), read_set(lines)

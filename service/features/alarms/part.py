@@ -42,7 +42,7 @@ class Alarms:
         self.limits = Limits(context)
 
     def close(self) -> None:
-        """Nothing runs by itself here."""
+        """Do nothing: this part starts no thread and holds no file."""
 
     def page(
         self,
@@ -76,7 +76,7 @@ class Alarms:
             return alarm_spans(connection, run, spacecraft, start, end)
 
     def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
-        """For each alarm, when it was out of its limits; see `state.times_out`."""
+        """When each alarm was out of its limits; see `state.times_out`."""
         with self._context.reading() as connection:
             return times_out(connection, found)
 

@@ -58,7 +58,7 @@ def metrics_of(acquisition: Acquisition, stars: MeasuredStars | None = None) -> 
 
 
 def _measures(stars: MeasuredStars) -> Row:
-    """What is measured alike in the stars of a batch and of one tracker, by name."""
+    """The values, by name, that are measured alike in the stars of a batch and of one tracker."""
     return {
         name: source.measure(stars)
         for name, source in STORED.items()
