@@ -132,7 +132,7 @@ def test_a_calibration_that_one_service_adopted_holds_for_the_next_batch_of_the_
         # Whatever the clocks of two machines say, a later change has a later id.
         back = other.adoptions.revert("TWO", None, WHO)
         assert back.id > adopted.id
-        one.adoptions.follow()
+        one.in_force.follow()
         assert one.missions["TWO"].digest == file
         assert used(sent[32]) == file
 
