@@ -284,7 +284,7 @@ def alarms(quick: bool, pass_: Telemetry, folder: Path) -> tuple[dict[str, Any],
             load = [request(f"{API}/batches", _in_run(each, "load")) for each in others]
             loading = threading.Thread(
                 target=lambda load=load, rate=per_second: drive(
-                    served.port, load, CONNECTIONS, per_second=rate
+                    served.port, load, min(CONNECTIONS, rate), per_second=rate
                 )
             )
             loading.start()
