@@ -21,7 +21,7 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
 - `formats`: `INPUT_FORMATS`, input formats by name (`service.observations.input_formats`).
 - `serving`: `serving(app, metrics)`, an asynchronous context manager entered while the service
   serves; `check(settings)` raises `BadConfiguration` before anything is opened.
-- `routes`: `ROUTERS` are its routes of the API, `POLICIES` their policies by name.
+- `routes`: `ROUTERS` are its routes of the API.
 - `pages`: importing it registers its pages of the console; its templates and scripts lie in the
   folders `templates` and `static` of the package.
 - `panels`: `PANELS`, what it adds to pages of others: functions of the `PageContext`, by name of

@@ -40,7 +40,7 @@ from service.web.console.page import page_or_problem
 from service.web.event_stream import Live
 from service.web.middleware import AroundRequests, BelowPath, ConditionalAnswers, warm_request
 from service.web.openapi import add_reference
-from service.web.requests.access import POLICIES, authorize
+from service.web.requests.access import authorize
 from service.web.requests.exports import Exports
 from service.web.requests.metrics import Metrics
 from service.web.requests.problems import add_error_handlers
@@ -145,8 +145,6 @@ def bare_app(features_off: str = "") -> FastAPI:
     """The app without anything behind it: enough to describe it."""
     feature_modules("pages", features_off)
     features = feature_modules("routes", features_off)
-    for module in features:
-        POLICIES.update(module.POLICIES)
     of_features = [router for each in features for router in each.ROUTERS]
     web_app = FastAPI(
         title="Attitude acquisition",

@@ -24,7 +24,7 @@ from service.contract.events import EVENT_DATA
 from service.observations.input_formats import INPUT_FORMATS, NDJSON, input_formats
 from service.products.formats import attitude_formats, table_formats
 from service.web.middleware import API
-from service.web.requests.access import POLICIES
+from service.web.requests.access import POLICIES, Policy
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
 from service.web.requests.query_parameters import NO_QUERY, TIME_SCHEMA
 from service.web.requests.request_body import BINARY, FRAMES, JSON
@@ -124,6 +124,7 @@ class ApiRouter(APIRouter):
     def serves(
         self,
         method_and_path: str,
+        policy: Policy,
         *answers: Returns,
         body: type[BaseModel] | None = None,
         body_required: bool = True,
@@ -138,6 +139,7 @@ class ApiRouter(APIRouter):
     ) -> Callable[[Handler], Handler]:
         """Register the decorated handler; one that declares no query parameter refuses any.
 
+        `policy` is the access that it requires.
         What a path names may not be there, so 404 is described, unless the route creates it.
         Without `body_required` the body may be left out: its fields all have defaults.
         With `uploads` every input format that has a media type can be sent in place of lines.
@@ -180,6 +182,7 @@ class ApiRouter(APIRouter):
         method, _, path = method_and_path.partition(" ")
 
         def register(handler: Handler) -> Handler:
+            POLICIES[handler.__name__] = policy
             takes_query = _takes_query(get_dependant(path=path, call=handler))
             self.add_api_route(
                 path,

@@ -235,9 +235,10 @@ class DwellOut(Record, frozen=True, kw_only=True):
 
 router = ApiRouter("dwell")
 ROUTERS = (router,)
-POLICIES = {"get_dwell": Policy("read", "path")}
 
-@router.serves("GET /spacecraft/{name}/dwell", Returns("The dwell.", DwellOut))
+@router.serves(
+    "GET /spacecraft/{name}/dwell", Policy("read", "path"), Returns("The dwell.", DwellOut)
+)
 def get_dwell(name: SpacecraftPath, query: FromQuery[RunQuery], app: AppDep):
     \"\"\"How often the axis +Z of a spacecraft was in each band of declination.\"\"\"
     return json_response({"batches": app.part(Dwell).of(name, query.run or "live")})

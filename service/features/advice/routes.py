@@ -15,7 +15,6 @@ from service.web.requests.query_parameters import FromQuery, PeriodQuery, Spacec
 
 router = ApiRouter("spacecraft")
 ROUTERS = (router,)
-POLICIES = {"get_advice": Policy("read", "path")}
 
 
 async def _advice(app: AppDep) -> AdviceService:
@@ -50,7 +49,12 @@ class AdviceQuery(PeriodQuery):
         return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
 
 
-@router.serves("GET /spacecraft/{name}/advice", Returns("The advice.", Advice), problems=(503,))
+@router.serves(
+    "GET /spacecraft/{name}/advice",
+    Policy("read", "path"),
+    Returns("The advice.", Advice),
+    problems=(503,),
+)
 def get_advice(name: SpacecraftPath, query: FromQuery[AdviceQuery], advice: AdviceDep) -> Response:
     """Recommended mission settings from recorded batches: tolerances, noise, alignment."""
     return json_response(advice.of_spacecraft(name, **query.asked(), limit_s=ADVICE_LIMIT_S))

@@ -31,19 +31,6 @@ from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("alarms")
 ROUTERS = (router,)
-POLICIES = {
-    "list_limits": Policy("read", "path"),
-    "get_limit": Policy("read", "path"),
-    "preview_limit": Policy("read", "path"),
-    "set_limit": Policy("operate", "path"),
-    "reset_limit": Policy("operate", "path"),
-    "list_alarms": Policy("read", "query"),
-    "get_alarm": Policy("read", "nothing"),
-    "acknowledge_alarm": Policy("operate", "nothing"),
-    "shelve_alarm": Policy("operate", "nothing"),
-    "unshelve_alarm": Policy("operate", "nothing"),
-    "comment_alarm": Policy("operate", "nothing"),
-}
 
 QuantityPath = Annotated[str, Path(description="A quantity, such as `ambiguous_share`.")]
 AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
@@ -121,7 +108,11 @@ class LimitIn(_Statement):
     settings: LimitSettings
 
 
-@router.serves("GET /spacecraft/{name}/limits", Returns("Every limit.", records.LimitList))
+@router.serves(
+    "GET /spacecraft/{name}/limits",
+    Policy("read", "path"),
+    Returns("Every limit.", records.LimitList),
+)
 def list_limits(name: SpacecraftPath, query: FromQuery[LimitQuery], app: AppDep) -> Response:
     """The limits of every quantity of a spacecraft or a tracker, set or shipped."""
     return json_response({"items": app.part(Alarms).limits.all(name, query.tracker)})
@@ -129,6 +120,7 @@ def list_limits(name: SpacecraftPath, query: FromQuery[LimitQuery], app: AppDep)
 
 @router.serves(
     "GET /spacecraft/{name}/limits/{quantity}",
+    Policy("read", "path"),
     Returns("The limit and its history.", records.LimitHistory),
 )
 def get_limit(
@@ -142,6 +134,7 @@ def get_limit(
 
 @router.serves(
     "PUT /spacecraft/{name}/limits/{quantity}",
+    Policy("operate", "path"),
     Returns("The limit, which applies from the next batch on.", Limit),
     body=LimitIn,
 )
@@ -160,6 +153,7 @@ def set_limit(
 
 @router.serves(
     "POST /spacecraft/{name}/limits/{quantity}/preview",
+    Policy("read", "path"),
     Returns("How this limit and the one in force evaluate them.", records.LimitPreview),
     body=LimitTrialIn,
 )
@@ -180,6 +174,7 @@ def preview_limit(
 
 @router.serves(
     "DELETE /spacecraft/{name}/limits/{quantity}",
+    Policy("operate", "path"),
     Returns("The shipped limit, which applies again.", Limit),
     problems=(503,),
 )
@@ -216,13 +211,17 @@ def _set(
     )
 
 
-@router.serves("GET /alarms", Returns("A page of alarms.", records.AlarmPage, LINK))
+@router.serves(
+    "GET /alarms", Policy("read", "query"), Returns("A page of alarms.", records.AlarmPage, LINK)
+)
 def list_alarms(request: Request, query: FromQuery[AlarmQuery], app: AppDep) -> Response:
     """Alarms, newest first; by default those that are not cleared."""
     return page_response(request, app.part(Alarms).page(**query.asked()))
 
 
-@router.serves("GET /alarms/{id}", Returns("The alarm.", records.AlarmWithActions))
+@router.serves(
+    "GET /alarms/{id}", Policy("read", "nothing"), Returns("The alarm.", records.AlarmWithActions)
+)
 def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     """One alarm with its history."""
     return json_response(_visible_alarm(app, id, caller))
@@ -230,6 +229,7 @@ def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
 
 @router.serves(
     "POST /alarms/{id}/acknowledge",
+    Policy("operate", "nothing"),
     Returns("The alarm, now acknowledged.", records.AlarmWithActions),
     body=StatementIn,
     problems=(409,),
@@ -244,6 +244,7 @@ def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDe
 
 @router.serves(
     "POST /alarms/{id}/shelve",
+    Policy("operate", "nothing"),
     Returns("The alarm, now shelved.", records.AlarmWithActions),
     body=ShelveIn,
     problems=(409,),
@@ -260,6 +261,7 @@ def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) ->
 
 @router.serves(
     "POST /alarms/{id}/unshelve",
+    Policy("operate", "nothing"),
     Returns("The alarm.", records.AlarmWithActions),
     body=StatementIn,
     problems=(409,),
@@ -273,7 +275,10 @@ def unshelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) 
 
 
 @router.serves(
-    "POST /alarms/{id}/comment", Returns("The alarm.", records.AlarmWithActions), body=CommentIn
+    "POST /alarms/{id}/comment",
+    Policy("operate", "nothing"),
+    Returns("The alarm.", records.AlarmWithActions),
+    body=CommentIn,
 )
 def comment_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     """Add a comment to an alarm."""

@@ -33,16 +33,6 @@ from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("calibrations")
 ROUTERS = (router,)
-POLICIES = {
-    "list_calibrations": Policy("read", "query"),
-    "start_calibration": Policy("operate", "body"),
-    # Of tokens that are bound to spacecraft only calibrations of these: see the handlers.
-    "get_calibration": Policy("read", "nothing"),
-    "try_calibration": Policy("read", "nothing"),
-    "adopt_calibration": Policy("operate", "nothing"),
-    "get_calibration_in_force": Policy("read", "path"),
-    "revert_calibration": Policy("operate", "path"),
-}
 
 CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
 
@@ -138,7 +128,9 @@ class CalibrationQuery(Query):
 
 
 @router.serves(
-    "GET /calibrations", Returns("A page of calibrations.", models.CalibrationPage, LINK)
+    "GET /calibrations",
+    Policy("read", "query"),
+    Returns("A page of calibrations.", models.CalibrationPage, LINK),
 )
 def list_calibrations(
     request: Request, query: FromQuery[CalibrationQuery], app: AppDep
@@ -149,6 +141,7 @@ def list_calibrations(
 
 @router.serves(
     "POST /calibrations",
+    Policy("operate", "body"),
     Returns("The calibration, which is computed now.", models.Calibration, LOCATION, status=202),
     body=CalibrationIn,
     problems=(404,),
@@ -163,7 +156,12 @@ def start_calibration(body: JsonBody, app: AppDep, change: ChangeDep) -> Respons
     return json_response(begun, 202, {"Location": f"/api/v1/calibrations/{begun.id}"})
 
 
-@router.serves("GET /calibrations/{id}", Returns("The calibration.", models.Calibration))
+@router.serves(
+    "GET /calibrations/{id}",
+    # Of tokens that are bound to spacecraft only calibrations of these: see the handlers.
+    Policy("read", "nothing"),
+    Returns("The calibration.", models.Calibration),
+)
 def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Response:
     """One calibration with covariance and residual maps."""
     return json_response(_visible(app, id, caller))
@@ -171,6 +169,7 @@ def get_calibration(id: CalibrationId, app: AppDep, caller: CallerDep) -> Respon
 
 @router.serves(
     "POST /calibrations/{id}/trial",
+    Policy("read", "nothing"),
     Returns("In force (a), and with the calibration (b).", Comparison),
     body=CalibrationTrialIn,
     problems=(409,),
@@ -184,6 +183,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
 
 @router.serves(
     "POST /calibrations/{id}/adopt",
+    Policy("operate", "nothing"),
     Returns("The adoption.", CalibrationAdoption),
     body=CalibrationAdoptIn,
     problems=(409,),
@@ -200,6 +200,7 @@ def adopt_calibration(
 
 @router.serves(
     "GET /spacecraft/{name}/calibration",
+    Policy("read", "path"),
     Returns("The calibration in force.", CalibrationInForce),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
@@ -209,6 +210,7 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
 
 @router.serves(
     "POST /spacecraft/{name}/calibration/revert",
+    Policy("operate", "path"),
     Returns("The change.", CalibrationAdoption),
     body=CalibrationRevertIn,
     problems=(409,),

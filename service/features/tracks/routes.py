@@ -16,7 +16,6 @@ TDM_MEDIA_TYPE = "text/plain"
 
 router = ApiRouter("products")
 ROUTERS = (router,)
-POLICIES = {"list_tracks": Policy("read", "path")}
 
 
 async def _tracks(app: AppDep) -> Tracks:
@@ -37,6 +36,7 @@ class TracksQuery(PeriodQuery):
 
 @router.serves(
     "GET /spacecraft/{name}/tracks",
+    Policy("read", "path"),
     Returns("The tracks.", TrackList, also=TDM_MEDIA_TYPE),
     problems=(503,),
 )

@@ -28,15 +28,6 @@ from service.web.requests.request_body import JsonBody, OptionalJsonBody, read_m
 
 router = ApiRouter("webhooks")
 ROUTERS = (router,)
-# What a webhook sends is about every spacecraft, and its URL may be a secret.
-POLICIES = dict.fromkeys(
-    (
-        *("list_webhooks", "get_webhook", "add_webhook", "change_webhook", "delete_webhook"),
-        *("rotate_webhook_secret", "test_webhook", "list_webhook_deliveries"),
-        *("retry_dead_letters", "replay_events"),
-    ),
-    OPERATE,
-)
 
 WebhookId = Annotated[str, Path(description="The `id` of a webhook.")]
 ALL = "*"
@@ -135,13 +126,13 @@ class DeliveryQuery(Query):
     cursor: Cursor = None
 
 
-@router.serves("GET /webhooks", Returns("All webhooks.", records.WebhookList))
+@router.serves("GET /webhooks", OPERATE, Returns("All webhooks.", records.WebhookList))
 def list_webhooks(webhooks: WebhooksDep) -> Response:
     """Every webhook, with its state and its last failure."""
     return json_response({"items": webhooks.all()})
 
 
-@router.serves("GET /webhooks/{id}", Returns("The webhook.", records.Webhook))
+@router.serves("GET /webhooks/{id}", OPERATE, Returns("The webhook.", records.Webhook))
 def get_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
     """One webhook."""
     return json_response(webhooks.get(id))
@@ -149,6 +140,7 @@ def get_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
 
 @router.serves(
     "POST /webhooks",
+    OPERATE,
     Returns(
         "The webhook, and its secret this once.", records.WebhookWithSecret, LOCATION, status=201
     ),
@@ -163,7 +155,9 @@ def add_webhook(body: JsonBody, webhooks: WebhooksDep, change: ChangeDep) -> Res
     return json_response(added, 201, {"Location": f"/api/v1/webhooks/{added.id}"})
 
 
-@router.serves("PUT /webhooks/{id}", Returns("The webhook.", records.Webhook), body=WebhookIn)
+@router.serves(
+    "PUT /webhooks/{id}", OPERATE, Returns("The webhook.", records.Webhook), body=WebhookIn
+)
 def change_webhook(
     id: WebhookId, body: JsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
@@ -175,6 +169,7 @@ def change_webhook(
 
 @router.serves(
     "DELETE /webhooks/{id}",
+    OPERATE,
     Returns("The webhook that was deleted.", records.Webhook),
     problems=(503,),
 )
@@ -185,6 +180,7 @@ def delete_webhook(id: WebhookId, webhooks: WebhooksDep, change: ChangeDep) -> R
 
 @router.serves(
     "POST /webhooks/{id}/secret",
+    OPERATE,
     Returns("The webhook, and its new secret this once.", records.WebhookWithSecret),
     body=SecretIn,
     body_required=False,
@@ -203,6 +199,7 @@ def rotate_webhook_secret(
 
 @router.serves(
     "POST /webhooks/{id}/test",
+    OPERATE,
     Returns("What came of the attempt.", records.WebhookTest),
     problems=(409, 503),
 )
@@ -213,6 +210,7 @@ def test_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
 
 @router.serves(
     "GET /webhooks/{id}/deliveries",
+    OPERATE,
     Returns("A page of deliveries.", records.WebhookDeliveryPage, LINK),
 )
 def list_webhook_deliveries(
@@ -228,6 +226,7 @@ def list_webhook_deliveries(
 
 @router.serves(
     "POST /webhooks/{id}/retry",
+    OPERATE,
     Returns("How many were queued.", records.WebhookQueued),
     body=RetryIn,
     body_required=False,
@@ -242,6 +241,7 @@ def retry_dead_letters(
 
 @router.serves(
     "POST /webhooks/{id}/replay",
+    OPERATE,
     Returns("How many were queued.", records.WebhookQueued),
     body=ReplayEventsIn,
 )

@@ -16,6 +16,7 @@ from service.web.requests import query_parameters as params
 from service.web.requests.access import (
     AppDep,
     ChangeDep,
+    Policy,
     json_response,
     page_response,
     require_all_spacecraft,
@@ -54,7 +55,11 @@ class AnnotationIn(Wire):
         return self
 
 
-@router.serves("GET /annotations", Returns("A page of annotations.", models.AnnotationPage, LINK))
+@router.serves(
+    "GET /annotations",
+    Policy("read", "query"),
+    Returns("A page of annotations.", models.AnnotationPage, LINK),
+)
 def list_annotations(
     request: Request, query: FromQuery[params.AnnotationQuery], app: AppDep
 ) -> Response:
@@ -64,6 +69,7 @@ def list_annotations(
 
 @router.serves(
     "POST /annotations",
+    Policy("operate", "body"),
     Returns("The annotation.", models.Annotation, status=201),
     body=AnnotationIn,
 )
@@ -84,6 +90,8 @@ def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
 
 @router.serves(
     "DELETE /annotations/{id}",
+    # Of tokens that are bound to spacecraft only notes on these: see the handler.
+    Policy("operate", "nothing"),
     Returns("The annotation that was deleted.", models.Annotation),
     problems=(503,),
 )

@@ -23,6 +23,7 @@ from service.web.requests.access import (
     CallerDep,
     ChangeDep,
     MetricsDep,
+    Policy,
     json_response,
     page_response,
     require_scope,
@@ -78,6 +79,7 @@ def answer_response(answered: Answered, recorded: bool = True) -> Response:
 
 @router.serves(
     "POST /batches",
+    Policy("submit", "body"),
     Returns("The answer, now recorded.", Answer, LOCATION, status=201),
     Returns("The answer that was recorded before.", Answer, REPLAYED),
     body=BatchIn,
@@ -101,6 +103,7 @@ async def submit_batch(request: Request) -> Response:
 
 @router.serves(
     "POST /batches/many",
+    Policy("submit", "body"),
     Returns("An outcome for each batch, in the order sent.", BatchOutcomes),
     array_of=(BatchIn, MAX_ARRAY),
     dependencies=[NO_KEY_OF_MANY],
@@ -134,19 +137,27 @@ def _outcome(request: Request, outcome: Outcome) -> BatchOutcome:
     return BatchOutcome(status=problem.status, answer=None, problem=problem)
 
 
-@router.serves("GET /batches", Returns("A page of results.", BatchPage, LINK))
+@router.serves(
+    "GET /batches", Policy("read", "query"), Returns("A page of results.", BatchPage, LINK)
+)
 def list_batches(request: Request, query: FromQuery[params.BatchQuery], app: AppDep) -> Response:
     """The current results of recorded batches, newest first by batch time."""
     return page_response(request, app.results.page(**query.asked()))
 
 
-@router.serves("GET /batches/{id}", Returns("The result and its batch.", Result))
+@router.serves(
+    "GET /batches/{id}", Policy("read", "result"), Returns("The result and its batch.", Result)
+)
 def get_batch(id: ResultId, app: AppDep) -> Response:
     """One recorded result with its batch."""
     return json_response(app.results.get(id))
 
 
-@router.serves("GET /batches/{id}/overlay", Returns("The image.", media_type=PNG, also=BINARY))
+@router.serves(
+    "GET /batches/{id}/overlay",
+    Policy("read", "result"),
+    Returns("The image.", media_type=PNG, also=BINARY),
+)
 def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
     """An image of a frame's result: the stars, their names, and residual arrows.
 
@@ -159,6 +170,7 @@ def get_overlay(request: Request, id: ResultId, app: AppDep) -> Response:
 
 @router.serves(
     "POST /batches/{id}/what-if",
+    Policy("read", "result"),
     Returns("The answer, which was not recorded.", Answer),
     Returns("The answer, now recorded in addition to the first one.", Answer, LOCATION, status=201),
     body=WhatIfIn,
@@ -204,6 +216,7 @@ class CompareIn(Wire):
 
 @compare_router.serves(
     "POST /compare",
+    Policy("read", "body"),
     Returns("The results of both sides.", Comparison),
     body=CompareIn,
     problems=(404,),
@@ -234,6 +247,7 @@ BlockId = Annotated[str, Path(description="The `id` of a recorded gyro block.")]
 
 @gyro_router.serves(
     "POST /spacecraft/{name}/gyro",
+    Policy("submit", "path"),
     Returns("The block, now recorded.", GyroBlockRow, LOCATION, status=201),
     Returns("The block that was recorded before.", GyroBlockRow, REPLAYED),
     body=GyroBlockIn,
@@ -258,7 +272,9 @@ def submit_gyro(name: SpacecraftPath, body: JsonBody, app: AppDep, metrics: Metr
 
 
 @gyro_router.serves(
-    "GET /spacecraft/{name}/gyro", Returns("A page of blocks.", GyroBlockPage, LINK)
+    "GET /spacecraft/{name}/gyro",
+    Policy("read", "path"),
+    Returns("A page of blocks.", GyroBlockPage, LINK),
 )
 def list_gyro(
     request: Request, name: SpacecraftPath, query: FromQuery[PeriodPageQuery], app: AppDep
@@ -271,7 +287,9 @@ def list_gyro(
 
 
 @gyro_router.serves(
-    "GET /spacecraft/{name}/gyro/{id}", Returns("The block and its samples.", GyroSamples)
+    "GET /spacecraft/{name}/gyro/{id}",
+    Policy("read", "path"),
+    Returns("The block and its samples.", GyroSamples),
 )
 def get_gyro(name: SpacecraftPath, id: BlockId, app: AppDep) -> Response:
     """One gyro block with its samples."""

@@ -15,7 +15,7 @@ from service.errors import BadBatch, Fault, shown_value
 from service.observations.schema import RunName
 from service.web.event_stream import Listener, Live
 from service.web.openapi import EVENT_STREAM, LAST_EVENT_ID, ApiRouter, Returns
-from service.web.requests.access import CallerDep, credentials
+from service.web.requests.access import CallerDep, Policy, credentials
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter
 
 router = ApiRouter("events")
@@ -85,6 +85,7 @@ async def _live(request: Request) -> Live:
 
 @router.serves(
     "GET /events",
+    Policy("read", "query"),
     Returns("The stream of events.", None, media_type=EVENT_STREAM),
     problems=(503,),
     parameters=(LAST_EVENT_ID,),

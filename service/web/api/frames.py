@@ -18,7 +18,7 @@ from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
 from service.web.api.batches import answer_response
 from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
-from service.web.requests.access import AppDep, CallerDep, MetricsDep, json_response
+from service.web.requests.access import AppDep, CallerDep, MetricsDep, Policy, json_response
 from service.web.requests.query_parameters import TIME_SCHEMA, FromQuery, Query, SpacecraftPath
 from service.web.requests.request_body import IdempotencyKey, frame_body
 
@@ -118,6 +118,7 @@ async def _frame(request: Request, query: FromQuery[FrameQuery], app: AppDep) ->
 
 @router.serves(
     "POST /spacecraft/{name}/frames",
+    Policy("submit", "path"),
     Returns("The answer, now recorded.", Answer, LOCATION, status=201),
     Returns("The answer that was recorded before.", Answer, REPLAYED),
     frame=True,
@@ -165,6 +166,8 @@ async def _picture(request: Request, query: FromQuery[PictureQuery], app: AppDep
 
 @router.serves(
     "POST /pictures",
+    # It records nothing; the handler asks for access to the spacecraft that is named.
+    Policy("read", "nothing"),
     Returns("What was found; nothing is recorded.", Picture),
     frame=True,
     problems=(404, 503),

@@ -12,7 +12,7 @@ from service.app.factory import App
 from service.errors import Busy
 from service.storage.progress import WAIT_S, Lag
 from service.web.openapi import ApiRouter, Returns
-from service.web.requests.access import AppDep, MetricsDep
+from service.web.requests.access import OPEN, AppDep, MetricsDep, Policy
 
 router = ApiRouter("probes", prefix="")
 
@@ -23,14 +23,14 @@ READY_WAIT_S = 1.5
 log = logging.getLogger(__name__)
 
 
-@router.serves("GET /livez", Returns("Alive.", media_type=TEXT))
+@router.serves("GET /livez", OPEN, Returns("Alive.", media_type=TEXT))
 async def livez(app: AppDep) -> Response:
     """Tell that the process answers and works on what is submitted."""
     app.submissions.require_alive()
     return PlainTextResponse("alive\n")
 
 
-@router.serves("GET /readyz", Returns("Ready.", media_type=TEXT), problems=(503,))
+@router.serves("GET /readyz", OPEN, Returns("Ready.", media_type=TEXT), problems=(503,))
 async def readyz(request: Request, app: AppDep) -> Response:
     """Tell that the service is ready: catalog loaded, database reachable, last write succeeded."""
     state = request.app.state
@@ -63,7 +63,9 @@ def _ready(app: App) -> Lag:
     return app.store.progress.lag()
 
 
-@router.serves("GET /metrics", Returns("The counters.", media_type=TEXT))
+@router.serves(
+    "GET /metrics", Policy("read", without_database=True), Returns("The counters.", media_type=TEXT)
+)
 def metrics(counted: MetricsDep) -> Response:
     """Counters in the text format of Prometheus."""
     return Response(counted.text(), media_type=CONTENT_TYPE_LATEST)

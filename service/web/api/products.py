@@ -14,7 +14,14 @@ from service.observations.schema import RunName, Wire
 from service.products import formats
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AppDep, CallerDep, author, json_response, page_response
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    Policy,
+    author,
+    json_response,
+    page_response,
+)
 from service.web.requests.exports import ExportsDep, attached_as
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
@@ -24,6 +31,7 @@ router = ApiRouter("products")
 
 @router.serves(
     "GET /spacecraft/{name}/attitude",
+    Policy("read", "path"),
     Returns("The attitudes, in the requested format.", products.AttitudeProduct, attitudes=True),
     problems=(503,),
 )
@@ -51,7 +59,9 @@ def get_attitude(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/attitude/at", Returns("The attitude.", products.AttitudeAtMoment)
+    "GET /spacecraft/{name}/attitude/at",
+    Policy("read", "path"),
+    Returns("The attitude.", products.AttitudeAtMoment),
 )
 def get_attitude_at(
     name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
@@ -68,6 +78,7 @@ def get_attitude_at(
 
 @router.serves(
     "GET /spacecraft/{name}/tables/{kind}",
+    Policy("read", "path"),
     Returns(
         "The table, in the requested format.",
         media_type=formats.OUTPUT_FORMATS["csv"].media_type,
@@ -98,7 +109,9 @@ def get_table(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/attitude/latest", Returns("The attitude.", products.LiveAttitude)
+    "GET /spacecraft/{name}/attitude/latest",
+    Policy("read", "path"),
+    Returns("The attitude.", products.LiveAttitude),
 )
 def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
     """The filtered attitude at the last epoch of live data, where the mission keeps it up.
@@ -110,6 +123,7 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
 
 @router.serves(
     "GET /spacecraft/{name}/innovations",
+    Policy("read", "path"),
     Returns("A page of innovations.", products.InnovationPage, LINK),
 )
 def list_innovations(
@@ -138,6 +152,7 @@ class DefinitiveIn(Wire):
 
 @router.serves(
     "POST /spacecraft/{name}/definitive-attitude",
+    Policy("operate", "path"),
     Returns("The job, which is queued.", products.DefinitiveJob, LOCATION, status=202),
     body=DefinitiveIn,
 )
@@ -157,7 +172,9 @@ def make_definitive_attitude(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude", Returns("The jobs.", products.DefinitiveJobList)
+    "GET /spacecraft/{name}/definitive-attitude",
+    Policy("read", "path"),
+    Returns("The jobs.", products.DefinitiveJobList),
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
     """The jobs of a spacecraft since the start of the service, the newest first."""
@@ -165,7 +182,9 @@ def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
 
 
 @router.serves(
-    "GET /spacecraft/{name}/definitive-attitude/{id}", Returns("The job.", products.DefinitiveJob)
+    "GET /spacecraft/{name}/definitive-attitude/{id}",
+    Policy("read", "path"),
+    Returns("The job.", products.DefinitiveJob),
 )
 def get_definitive_attitude(
     name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep

@@ -20,6 +20,7 @@ from service.web.requests.access import (
     AppDep,
     CallerDep,
     ChangeDep,
+    Policy,
     json_response,
     require_all_spacecraft,
 )
@@ -101,13 +102,19 @@ async def _telemetry(
     return ReplayUpload(query, body)
 
 
-@router.serves("GET /runs", Returns("Every run.", RunList))
+@router.serves("GET /runs", Policy("read", "nothing"), Returns("Every run.", RunList))
 def list_runs(app: AppDep, caller: CallerDep) -> Response:
     """Every run with batches; of a token that is bound to spacecraft, with theirs."""
     return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
-@router.serves("PUT /runs/{run}", Returns("The run.", RunState), body=RunIn, may_create=True)
+@router.serves(
+    "PUT /runs/{run}",
+    Policy("submit", audited=True),
+    Returns("The run.", RunState),
+    body=RunIn,
+    may_create=True,
+)
 def watch_run(
     run: RunPath, body: request_body.JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
@@ -117,7 +124,10 @@ def watch_run(
 
 
 @router.serves(
-    "POST /runs/{run}/forget", Returns("What is removed, or would be.", Forgotten), body=ForgetIn
+    "POST /runs/{run}/forget",
+    Policy("operate", "body"),
+    Returns("What is removed, or would be.", Forgotten),
+    body=ForgetIn,
 )
 def forget_run(
     run: RunPath, body: request_body.JsonBody, app: AppDep, change: ChangeDep
@@ -138,7 +148,9 @@ def forget_run(
     return json_response(app.runs.forget(selected, change.entry()))
 
 
-@router.serves("GET /replays", Returns("The latest hundred replays.", ReplayList))
+@router.serves(
+    "GET /replays", Policy("read", "nothing"), Returns("The latest hundred replays.", ReplayList)
+)
 def list_replays(app: AppDep, caller: CallerDep) -> Response:
     """The latest replays and their progress, newest first.
 
@@ -149,6 +161,7 @@ def list_replays(app: AppDep, caller: CallerDep) -> Response:
 
 @router.serves(
     "POST /replays",
+    Policy("submit", "body"),
     Returns("The replay, now running.", Replay, LOCATION, status=202),
     lines_of=BatchIn,
     uploads=True,
@@ -183,7 +196,12 @@ def start_replay(
     return json_response(app.replays.get(id), 202, location)
 
 
-@router.serves("GET /replays/{id}", Returns("The replay.", Replay))
+@router.serves(
+    "GET /replays/{id}",
+    # Its id is unguessable: only the client that started it and readers of everything know it.
+    Policy("read", "nothing", or_scope="submit"),
+    Returns("The replay.", Replay),
+)
 def get_replay(id: ReplayId, app: AppDep) -> Response:
     """A replay and its progress."""
     return json_response(app.replays.get(id))
@@ -191,6 +209,8 @@ def get_replay(id: ReplayId, app: AppDep) -> Response:
 
 @router.serves(
     "DELETE /replays/{id}",
+    # Of tokens that are bound to spacecraft only the one that started it: see the handler.
+    Policy("submit", "nothing", audited=True),
     Returns("The replay, now cancelled.", Replay),
     Returns("The replay, which will end soon.", Replay, status=202),
     problems=(409, 503),

@@ -10,7 +10,7 @@ from service.contract.spacecraft import About, Overview
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
-from service.web.requests.access import AppDep, CallerDep, json_response, page_response
+from service.web.requests.access import AppDep, CallerDep, Policy, json_response, page_response
 from service.web.requests.exports import (
     THINNED,
     ExportsDep,
@@ -25,14 +25,22 @@ router = ApiRouter("spacecraft")
 DEFAULT_SIZE = 500
 
 
-@router.serves("GET /spacecraft", Returns("Every spacecraft.", models.SpacecraftList))
+@router.serves(
+    "GET /spacecraft",
+    Policy("read", "nothing"),
+    Returns("Every spacecraft.", models.SpacecraftList),
+)
 def list_spacecraft(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft with a mission file, with its state in a run."""
     theirs = [each for each in app.spacecraft.states(query.run) if caller.may_see(each.name)]
     return json_response({"items": theirs})
 
 
-@router.serves("GET /spacecraft/{name}", Returns("The spacecraft.", models.SpacecraftState))
+@router.serves(
+    "GET /spacecraft/{name}",
+    Policy("read", "path"),
+    Returns("The spacecraft.", models.SpacecraftState),
+)
 def get_spacecraft(
     name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep
 ) -> Response:
@@ -41,7 +49,9 @@ def get_spacecraft(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/latest", Returns("The result and its batch.", Result, CONTENT_LOCATION)
+    "GET /spacecraft/{name}/latest",
+    Policy("read", "path"),
+    Returns("The result and its batch.", Result, CONTENT_LOCATION),
 )
 def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: AppDep) -> Response:
     """The newest current result of a run, by batch time; it may have no attitude.
@@ -55,7 +65,9 @@ def get_latest(name: SpacecraftPath, query: FromQuery[params.RunQuery], app: App
 
 
 @router.serves(
-    "GET /spacecraft/{name}/attitudes", Returns("A page of attitudes.", models.AttitudePage, LINK)
+    "GET /spacecraft/{name}/attitudes",
+    Policy("read", "path"),
+    Returns("A page of attitudes.", models.AttitudePage, LINK),
 )
 def list_attitudes(
     request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
@@ -65,7 +77,9 @@ def list_attitudes(
 
 
 @router.serves(
-    "GET /spacecraft/{name}/rates", Returns("The buckets with batches.", models.RateList)
+    "GET /spacecraft/{name}/rates",
+    Policy("read", "path"),
+    Returns("The buckets with batches.", models.RateList),
 )
 def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: AppDep) -> Response:
     """Stars by outcome, in at most 20,000 buckets of batch time."""
@@ -74,6 +88,7 @@ def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: A
 
 @router.serves(
     "GET /spacecraft/{name}/history",
+    Policy("read", "path"),
     Returns("The history, in the requested format.", models.History, THINNED, tables=True),
     problems=(503,),
 )
@@ -113,7 +128,11 @@ def get_history(
     return json_response(history, headers=thinned_header(history.thinned))
 
 
-@router.serves("GET /spacecraft/{name}/worst", Returns("The worst batches.", models.Ranking))
+@router.serves(
+    "GET /spacecraft/{name}/worst",
+    Policy("read", "path"),
+    Returns("The worst batches.", models.Ranking),
+)
 def list_worst(name: SpacecraftPath, query: FromQuery[params.WorstQuery], app: AppDep) -> Response:
     """The batches with the worst values of a quantity in a period, worst first."""
     return json_response(app.spacecraft.ranking(name, **query.asked()))
@@ -122,13 +141,19 @@ def list_worst(name: SpacecraftPath, query: FromQuery[params.WorstQuery], app: A
 overview_router = ApiRouter("spacecraft")
 
 
-@overview_router.serves("GET /overview", Returns("Every spacecraft in the run.", Overview))
+@overview_router.serves(
+    "GET /overview", Policy("read", "nothing"), Returns("Every spacecraft in the run.", Overview)
+)
 def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerDep) -> Response:
     """Every spacecraft in a run: state, last attitude, the last hour and day, active alarms."""
     return json_response(app.spacecraft.overview(query.run, caller.spacecraft))
 
 
-@overview_router.serves("GET /about", Returns("The version of the service and its data.", About))
+@overview_router.serves(
+    "GET /about",
+    Policy("read", "nothing"),
+    Returns("The version of the service and its data.", About),
+)
 def get_about(app: AppDep, caller: CallerDep) -> Response:
     """Version, catalog, missions, database and credits."""
     return json_response(app.service.about(caller.spacecraft))

@@ -14,9 +14,12 @@ from service.observations.schema import Key, Wire
 from service.web.openapi import LINK, ApiRouter, Returns
 from service.web.requests.access import (
     COOKIE,
+    OPEN,
+    OPERATE,
     AppDep,
     CallerDep,
     ChangeDep,
+    Policy,
     json_response,
     page_response,
 )
@@ -33,7 +36,7 @@ class SignIn(Wire):
 
 
 @router.serves(
-    "POST /session", Returns("The signed-in caller.", Session), body=SignIn, problems=(401,)
+    "POST /session", OPEN, Returns("The signed-in caller.", Session), body=SignIn, problems=(401,)
 )
 def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     """Exchange a token for a session cookie (`HttpOnly`, `SameSite=Strict`)."""
@@ -50,13 +53,13 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
     return response
 
 
-@router.serves("GET /session", Returns("The caller.", Session))
+@router.serves("GET /session", Policy("read", "nothing"), Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
     """The caller and its scopes."""
     return json_response(_shown(caller))
 
 
-@router.serves("DELETE /session", Returns("The session has ended.", Session), problems=(401,))
+@router.serves("DELETE /session", OPEN, Returns("The session has ended.", Session), problems=(401,))
 def sign_out(request: Request, app: AppDep) -> Response:
     """End the browser's session."""
     cookie = request.cookies.get(COOKIE)
@@ -95,7 +98,7 @@ class TokenIn(Wire):
 TokenName = Annotated[str, Path(max_length=64, description="The `name` of a token.")]
 
 
-@router.serves("GET /tokens", Returns("All tokens, without their secrets.", TokenList))
+@router.serves("GET /tokens", OPERATE, Returns("All tokens, without their secrets.", TokenList))
 def list_tokens(app: AppDep) -> Response:
     """Every token, with its scopes, spacecraft, end and state."""
     return json_response(TokenList(items=app.tokens.all()))
@@ -103,6 +106,7 @@ def list_tokens(app: AppDep) -> Response:
 
 @router.serves(
     "POST /tokens",
+    OPERATE,
     Returns("The token, and its secret this once.", NewToken, status=201),
     body=TokenIn,
     problems=(409,),
@@ -116,7 +120,10 @@ def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
 
 
 @router.serves(
-    "DELETE /tokens/{token}", Returns("The token that was revoked.", Token), problems=(503,)
+    "DELETE /tokens/{token}",
+    OPERATE,
+    Returns("The token that was revoked.", Token),
+    problems=(503,),
 )
 def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     """Revoke a token at once, with the browser sessions that were begun with it."""
@@ -125,7 +132,7 @@ def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
     return json_response(revoked)
 
 
-@router.serves("GET /audit", Returns("A page of changes.", AuditPage, LINK))
+@router.serves("GET /audit", OPERATE, Returns("A page of changes.", AuditPage, LINK))
 def list_audit(request: Request, query: FromQuery[AuditQuery], app: AppDep) -> Response:
     """The audit list of changes, newest first."""
     with app.context.reading() as connection:

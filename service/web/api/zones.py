@@ -8,7 +8,7 @@ from starlette.responses import Response
 from service.contract.spacecraft import Dropped, ZoneCache, ZoneList
 from service.observations.schema import APrioriIn, Key, Wire
 from service.web.openapi import ApiRouter, Returns
-from service.web.requests.access import AppDep, CallerDep, json_response
+from service.web.requests.access import READ, AppDep, CallerDep, Policy, json_response
 from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFilter, Time
 from service.web.requests.request_body import JsonBody, read_model
 
@@ -33,7 +33,7 @@ class DropQuery(Query):
     spacecraft: SpacecraftFilter = None
 
 
-@router.serves("GET /zones", Returns("The cache.", ZoneCache))
+@router.serves("GET /zones", READ, Returns("The cache.", ZoneCache))
 def list_zones(app: AppDep) -> Response:
     """The cached zones, their size, hits, misses and build times.
 
@@ -42,7 +42,12 @@ def list_zones(app: AppDep) -> Response:
     return json_response(app.zones.state())
 
 
-@router.serves("POST /zones", Returns("The zones, now cached.", ZoneList), body=WarmIn)
+@router.serves(
+    "POST /zones",
+    Policy("operate", "body"),
+    Returns("The zones, now cached.", ZoneList),
+    body=WarmIn,
+)
 def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     """Build the zones that batches with these a priori attitudes will use."""
     asked = read_model(WarmIn, body)
@@ -51,7 +56,9 @@ def warm_zones(body: JsonBody, app: AppDep, caller: CallerDep) -> Response:
     return json_response(ZoneList(items=warmed))
 
 
-@router.serves("DELETE /zones", Returns("The number of dropped zones.", Dropped))
+@router.serves(
+    "DELETE /zones", Policy("operate", "query"), Returns("The number of dropped zones.", Dropped)
+)
 def drop_zones(query: FromQuery[DropQuery], app: AppDep) -> Response:
     """Drop cached zones; the next batch builds its zones again."""
     return json_response(Dropped(dropped=app.zones.drop(query.spacecraft)))

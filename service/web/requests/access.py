@@ -1,7 +1,7 @@
 """Access to routes: which scope each requires, and for which spacecraft; what handlers depend on.
 
-`POLICIES` has the policy of every route by its name.  A route without one is
-refused to every caller, so a new route cannot be forgotten.
+A handler declares its policy with its address.  A route without one is refused to every
+caller, so a new route cannot be forgotten.
 
 All dependencies are asynchronous: they never wait for a worker thread, because
 all of them may be busy when a probe arrives.
@@ -68,66 +68,8 @@ class Policy:
 READ, OPERATE = Policy("read"), Policy("operate")
 OPEN = Policy("read", "nothing", open=True)
 
-POLICIES: dict[str, Policy] = {
-    "livez": OPEN,
-    "readyz": OPEN,
-    "metrics": Policy("read", without_database=True),
-    "sign_in": OPEN,
-    "sign_out": OPEN,
-    "session": Policy("read", "nothing"),
-    "submit_batch": Policy("submit", "body"),
-    "submit_batches": Policy("submit", "body"),
-    "list_batches": Policy("read", "query"),
-    "get_batch": Policy("read", "result"),
-    "what_if": Policy("read", "result"),
-    "list_spacecraft": Policy("read", "nothing"),
-    "get_spacecraft": Policy("read", "path"),
-    "submit_frame": Policy("submit", "path"),
-    # It records nothing; the handler asks for access to the spacecraft that is named.
-    "solve_picture": Policy("read", "nothing"),
-    "get_overlay": Policy("read", "result"),
-    "get_latest": Policy("read", "path"),
-    "list_attitudes": Policy("read", "path"),
-    "get_attitude": Policy("read", "path"),
-    "get_attitude_at": Policy("read", "path"),
-    "get_live_attitude": Policy("read", "path"),
-    "get_table": Policy("read", "path"),
-    "submit_gyro": Policy("submit", "path"),
-    "list_gyro": Policy("read", "path"),
-    "get_gyro": Policy("read", "path"),
-    "list_innovations": Policy("read", "path"),
-    "make_definitive_attitude": Policy("operate", "path"),
-    "list_definitive_attitudes": Policy("read", "path"),
-    "get_definitive_attitude": Policy("read", "path"),
-    "list_rates": Policy("read", "path"),
-    "get_history": Policy("read", "path"),
-    "list_worst": Policy("read", "path"),
-    "list_zones": READ,
-    "warm_zones": Policy("operate", "body"),
-    "drop_zones": Policy("operate", "query"),
-    "list_runs": Policy("read", "nothing"),
-    "start_replay": Policy("submit", "body"),
-    "list_replays": Policy("read", "nothing"),
-    # Its id is unguessable: only the client that started it and readers of everything know it.
-    "get_replay": Policy("read", "nothing", or_scope="submit"),
-    # Of tokens that are bound to spacecraft only the one that started it: see the handler.
-    "cancel_replay": Policy("submit", "nothing", audited=True),
-    "watch_run": Policy("submit", audited=True),
-    "forget_run": Policy("operate", "body"),
-    "compare": Policy("read", "body"),
-    "list_annotations": Policy("read", "query"),
-    "add_annotation": Policy("operate", "body"),
-    # Of tokens that are bound to spacecraft only notes on these: see the handler.
-    "delete_annotation": Policy("operate", "nothing"),
-    "get_about": Policy("read", "nothing"),
-    "get_overview": Policy("read", "nothing"),
-    "events": Policy("read", "query"),
-    "list_audit": OPERATE,
-    "list_tokens": OPERATE,
-    "add_token": OPERATE,
-    "revoke_token": OPERATE,
-}
-"""The policy of every route by its name; pages of the console and features add theirs."""
+POLICIES: dict[str, Policy] = {}
+"""The policy of every route by its name: its handler declares it with its address."""
 
 _LINK_NAVIGATION = (
     ("sec-fetch-mode", "navigate"),
