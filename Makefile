@@ -44,11 +44,12 @@ RUNTIME = $(VENV)/.installed-runtime
 DEV = $(VENV)/.installed-dev
 
 .DEFAULT_GOAL = help
-.PHONY: help run test full kernels torture mutants check static format-check lint types floors \
+.PHONY: help install run test full kernels torture mutants check static format-check lint types floors \
 	migrations-check openapi-check client client-check \
 	format lock bench compare stale pythons dist openapi clean
 
 help:
+	@echo "make install  set up the service and its client in .venv, for the command .venv/bin/acquire"
 	@echo "make run      set up, serve on http://$(HOST):$(PORT), replay sample telemetry, print a table"
 	@echo "make test     set up and run the tests of a sitting (minutes)"
 	@echo "make full     run all tests (an hour)"
@@ -70,6 +71,8 @@ help:
 	@echo
 	@echo "Variables: PORT, HOST, BATCHES, PYTHON, WORKERS, TEST_POSTGRESQL_URL,"
 	@echo "           DEMO_ARGS, PYTEST_ARGS, PARTS, MUTANTS_ARGS, BENCH_ARGS, BASE, COMPARE_ARGS"
+
+install: $(RUNTIME)
 
 run: $(RUNTIME)
 	@exec $(BIN)/acquire demo --host $(HOST) --port $(PORT) $(if $(BATCHES),--batches $(BATCHES)) $(DEMO_ARGS)

@@ -18,6 +18,7 @@ DOCUMENTS = sorted(
     if ".venv" not in path.parts
 )
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
+MAKE = re.compile(r"(?:^|`)make +([^\s`]+)", re.MULTILINE)
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 
 
@@ -32,6 +33,14 @@ def test_every_link_to_a_file_leads_somewhere(document):
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
 def test_no_document_is_left_with_a_gap(document):
     assert "@@" not in document.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
+def test_every_make_command_that_a_document_names_is_a_target(document):
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    targets = set(re.findall(r"^([\w-]+):", makefile, re.MULTILINE))
+    named = MAKE.findall(document.read_text(encoding="utf-8"))
+    assert set(named) <= targets
 
 
 PARTS = {

@@ -38,6 +38,8 @@ RESERVE = 1.2
 """Times the largest usual error that was seen: the next one may be larger."""
 TOO_LARGE = 1.5
 """Times the size with that reserve."""
+CERTAIN_SIGMAS = 4.0
+"""Sigmas of the found attitude by which an error must exceed the zone's room to count."""
 LARGEST_DEG = {"cap": 180.0, "band": 90.0}
 
 
@@ -65,8 +67,8 @@ class ZoneCost:
 class AprioriErrors:
     """How far a priori attitudes were from those found.
 
-    `gross` of them are errors beyond what is usual; `usual_deg` is the largest of the others,
-    of which the zone leaves no room for `beyond`.
+    `gross` of them are errors beyond what is usual; `usual_deg` is the largest of the others.
+    `beyond` of these exceed the room of the zone by more than the found attitude's own error.
     """
 
     batches: int
@@ -100,17 +102,20 @@ class ZoneSize:
         return sorted({self.size_deg, self.covering_deg or self.size_deg})
 
 
-def zone_size(mission: Mission, angles_deg: Sequence[float]) -> ZoneSize:
+def zone_size(
+    mission: Mission, angles_deg: Sequence[float], sigmas_deg: Sequence[float]
+) -> ZoneSize:
     """Advice on the size of a mission's zone.
 
-    `angles_deg` are the recorded angles from a priori to found attitudes.
+    `angles_deg` are the recorded angles from a priori to found attitudes, `sigmas_deg` the
+    standard deviations of the found ones.
     """
     is_band = isinstance(mission.zone, Band)
     setting = "zone.half_width_deg" if is_band else "zone.radius_deg"
     now_deg = _size_deg(mission)
     view_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
     margin_deg = max(0.0, now_deg - view_deg)
-    errors = _errors(angles_deg, margin_deg)
+    errors = _errors(angles_deg, sigmas_deg, margin_deg)
     covering_deg = None
     verdict: Verdict = "too_few"
     if errors is not None and errors.batches >= LEAST_BATCHES:
@@ -174,17 +179,21 @@ def _bounds_deg(mission: Mission, size_deg: float) -> tuple[float, float]:
     return max(0.0, zone.coelevation_deg - size_deg), min(180.0, zone.coelevation_deg + size_deg)
 
 
-def _errors(angles_deg: Sequence[float], margin_deg: float) -> AprioriErrors | None:
+def _errors(
+    angles_deg: Sequence[float], sigmas_deg: Sequence[float], margin_deg: float
+) -> AprioriErrors | None:
     if not angles_deg:
         return None
     angles = np.asarray(angles_deg)
     median_deg, most_deg = np.percentile(angles, (50.0, USUAL_PERCENT)).tolist()
-    usual = angles[angles <= GROSS * most_deg]
+    is_usual = angles <= GROSS * most_deg
+    usual = angles[is_usual]
+    certain = angles - CERTAIN_SIGMAS * np.asarray(sigmas_deg)
     return AprioriErrors(
         batches=len(angles),
         median_deg=median_deg,
         usual_deg=float(usual.max()),
-        beyond=int(np.count_nonzero(usual > margin_deg)),
+        beyond=int(np.count_nonzero(is_usual & (certain > margin_deg))),
         gross=len(angles) - len(usual),
         largest_deg=float(angles.max()),
     )

@@ -15,7 +15,7 @@ from service.sky.cache import CacheEntry, Sized
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.zones import Zone
 from service.storage.queries.pages import ResultFilter, latest_time
-from service.storage.queries.trends import latest_samples
+from service.storage.queries.trends import latest_prior_errors
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, utc_now
 
@@ -65,9 +65,9 @@ class Zones:
         place = ResultFilter(run or LIVE, name)
         with self._context.reading_record() as connection:
             time = latest_time(connection, place, utc_now())
-            _, samples = latest_samples(connection, place, "a_priori_angle_deg", MOST_ERRORS)
+            angles_deg, sigmas_deg = latest_prior_errors(connection, place, MOST_ERRORS)
         run_catalog = self._context.sky.run_catalog(mission, time or utc_now())
-        size = zone_size(mission, [angle_deg for _, angle_deg, _ in samples])
+        size = zone_size(mission, angles_deg, sigmas_deg)
         return size, partial(self._cost, mission, run_catalog)
 
     def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:

@@ -17,6 +17,7 @@ from service import vectors
 from service.missions.mission import Band, Identifier, Mission, load_missions
 from service.observations.batch import ObservationBatch, Options, QuaternionPrior, TrackerStars
 from service.simulate.motion import across, pointed, random_axis
+from service.simulate.sightings import in_field
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_direction
 from service.times import parse_utc
@@ -121,7 +122,11 @@ def _view(
     attitude = pointed(mission.axis_body, near, rng.uniform(0.0, math.tau))
     boresight = attitude.T @ tracker.body_from_tracker[:, 2]
     edge = math.cos(math.radians(tracker.field_of_view_radius_deg))
-    star = rng.permutation(np.flatnonzero(catalog.direction @ boresight >= edge))[:most_stars]
+    inside = np.flatnonzero(catalog.direction @ boresight >= edge)
+    if tracker.field_of_view_deg is not None:
+        tracker_from_inertial = tracker.body_from_tracker.T @ attitude
+        inside = inside[in_field(tracker, catalog.direction[inside] @ tracker_from_inertial.T)]
+    star = rng.permutation(inside)[:most_stars]
     count = len(star)
     return View(
         axis=axis,

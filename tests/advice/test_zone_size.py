@@ -15,7 +15,7 @@ TIME = parse_utc("1996-01-10T12:00:00Z")
 @pytest.mark.parametrize(("name", "k_g"), [("XTE", 0.4224), ("SWAS", 0.4224), ("SOHO", 0.0249)])
 def test_k_g_is_that_of_the_paper_s_tables_13_and_14(missions, name, k_g):
     mission = missions[name]
-    size_deg = zone_size(mission, []).size_deg
+    size_deg = zone_size(mission, [], []).size_deg
     assert round(geometric_k_g(mission, size_deg), 4) == k_g
 
 
@@ -51,15 +51,26 @@ def test_the_richest_zone_is_that_of_the_census(sky, missions):
     ],
 )
 def test_the_size_follows_the_usual_errors(missions, angles, verdict, covering):
-    found = zone_size(missions["XTE"], angles)
+    found = zone_size(missions["XTE"], angles, [0.0] * len(angles))
     assert found.margin_deg == pytest.approx(6.66)
     assert (found.verdict, found.covering_deg) == (verdict, covering)
     assert found.errors.gross == sum(each > 50 for each in angles)
     assert found.errors.largest_deg == max(angles)
 
 
+@pytest.mark.parametrize(("sigma_deg", "beyond"), [(0.08, 1), (0.09, 0)])
+def test_an_error_counts_as_beyond_the_room_by_more_than_the_attitude_s_own(
+    missions, sigma_deg, beyond
+):
+    """The room is 6.66 deg, and the last error 0.34 deg more."""
+    sigmas_deg = [0.0] * 50 + [sigma_deg]
+    found = zone_size(missions["XTE"], [5.0] * 50 + [7.0], sigmas_deg)
+    assert found.errors.beyond == beyond
+    assert found.verdict == ("too_small" if beyond else "fits")
+
+
 def test_without_errors_only_the_present_size_is_weighed(missions):
-    found = zone_size(missions["SOHO"], [])
+    found = zone_size(missions["SOHO"], [], [])
     assert (found.errors, found.sizes_deg) == (None, [2.1])
     assert found.setting == "zone.half_width_deg"
     assert np.isclose(found.margin_deg, 0.1)
@@ -81,7 +92,7 @@ def test_without_errors_only_the_present_size_is_weighed(missions):
     ],
 )
 def test_the_size_is_told_in_words_with_what_it_costs(missions, angles, action, says):
-    size = zone_size(missions["XTE"], angles)
+    size = zone_size(missions["XTE"], angles, [0.0] * len(angles))
     costs = [ZoneCost(each, 10, round(100 * each), 0.4) for each in size.sizes_deg]
     told, _ = zone_statements(missions["XTE"], size, costs)
     assert told.action == action
@@ -95,5 +106,5 @@ def test_hmax_is_the_width_of_the_field_of_view(missions, limit_deg, action):
     mission = missions["XTE"]
     tolerances = mission.tolerances.model_copy(update={"pair_separation_max_deg": limit_deg})
     mission = mission.model_copy(update={"tolerances": tolerances})
-    *_, told = zone_statements(mission, zone_size(mission, []), [])
+    *_, told = zone_statements(mission, zone_size(mission, [], []), [])
     assert (told.action, "HMAX" in told.text) == (action, True)

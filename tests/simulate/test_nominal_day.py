@@ -42,6 +42,4 @@ def test_a_nominal_day_raises_no_alarm_and_no_advice(name, tmp_path, sky, seed):
         advice = app.part(AdviceService).of_spacecraft(name, run=RUN, sample=100)
     assert refused == []
     assert [(each.quantity, each.value) for each in alarms] == []
-    # SOHO's band of the paper has less room than the errors of its pole: it is advised to widen.
-    if name != "SOHO":
-        assert [each.line for each in advice.changes] == []
+    assert [each.line for each in advice.changes] == []
