@@ -1,4 +1,4 @@
-"""Texts in cells of CSV files that a spreadsheet does not take for formulas.
+"""Texts in cells of CSV files that a spreadsheet takes for one cell, and not for a formula.
 
 As the OWASP page on CSV injection recommends, an apostrophe goes before a text that begins with a
 character that begins a formula.  Reading takes it away.
@@ -9,6 +9,8 @@ import re
 _STARTS = "=+\\-@\t\r\n＝＋－＠"
 _IS_FORMULA = re.compile(f"'*[{_STARTS}]")
 _IS_NEUTRALISED = re.compile(f"'+[{_STARTS}]")
+NEEDS_QUOTES = re.compile('[",;\t\r\n]')
+"""A spreadsheet of another country takes a semicolon or a tab for the end of a cell."""
 
 
 def neutralised(text: str) -> str:
@@ -19,3 +21,8 @@ def neutralised(text: str) -> str:
 def original(cell: str) -> str:
     """The text of a cell that `neutralised` may have written."""
     return cell[1:] if _IS_NEUTRALISED.match(cell) else cell
+
+
+def quoted(text: str) -> str:
+    """The text as it stands between two separators: in quotes where one is in it."""
+    return '"{}"'.format(text.replace('"', '""')) if NEEDS_QUOTES.search(text) else text

@@ -15,7 +15,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, TextIO
 
-from service.csv_cells import neutralised
+from service.csv_cells import neutralised, quoted
 from service.errors import BadFile, Fault, shown_value
 from service.observations import schema
 from service.observations.batch import MAX_STARS_PER_TRACKER, MAX_TRACKERS
@@ -415,16 +415,20 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
     A Sun vector or position inside an a priori attitude is written as the
     batch's own, which means the same.
     """
-    writer = _RowWriter(stream)
-    writer.writerow(dict(zip(COLUMNS, COLUMNS, strict=True)))
+
+    def write_row(cells: Mapping[str, object]) -> None:
+        texts = (quoted(str(cells.get(name, ""))) for name in COLUMNS)
+        stream.write(",".join(texts) + "\n")
+
+    write_row(dict(zip(COLUMNS, COLUMNS, strict=True)))
     for batch in batches:
         common = _neutralised(batch_cells(batch))
         if batch.measurement is not None:
-            writer.writerow(common)
+            write_row(common)
         for tracker in batch.observations:
             tracker_cells = {**common, "tracker": neutralised(tracker.tracker)}
             if not tracker.stars:
-                writer.writerow({**tracker_cells, **list_cells(tracker)})
+                write_row({**tracker_cells, **list_cells(tracker)})
             for star in tracker.stars:
                 numbers = star.model_dump(exclude_none=True, include={*STAR_NUMBERS})
                 direction = zip(DIRECTION, star.vector or (), strict=False)
@@ -432,28 +436,7 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
                     **number_cells(direction),
                     **number_cells(numbers.items()),
                 }
-                writer.writerow({**tracker_cells, **cells, **list_cells(star)})
-
-
-class _RowWriter:
-    """Writes rows as `csv.DictWriter` does, and quotes semicolons and tabs as well.
-
-    A spreadsheet of another country takes either for the end of a cell.
-    """
-
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
-
-    def writerow(self, cells: Mapping[str, object]) -> None:
-        """Write one row; a column without a cell is empty."""
-        texts = (str(cells.get(name, "")) for name in COLUMNS)
-        quoted = (
-            '"{}"'.format(each.replace('"', '""')) if _TO_QUOTE(each) else each for each in texts
-        )
-        self._stream.write(",".join(quoted) + "\n")
-
-
-_TO_QUOTE = re.compile('[",;\t\r\n]').search
+                write_row({**tracker_cells, **cells, **list_cells(star)})
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:

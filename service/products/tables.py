@@ -1,13 +1,12 @@
 """Tables: columns with units and frames, and their values page by page."""
 
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 
-from service.csv_cells import neutralised
+from service.csv_cells import NEEDS_QUOTES, neutralised, quoted
 
 if TYPE_CHECKING:
     # numpy takes long to load, and `acquire --help` names the formats.
@@ -17,8 +16,6 @@ if TYPE_CHECKING:
 Kind = Literal["number", "integer", "flag", "text", "utc"]
 Page = Sequence[Sequence[Any]]
 """The values of each column, in the order of the columns; None: not known."""
-_NEEDS_QUOTES = re.compile('[",;\t\r\n]')
-"""A spreadsheet of another country takes a semicolon or a tab for the end of a cell."""
 
 
 @dataclass(frozen=True)
@@ -75,13 +72,7 @@ def _csv_texts(values: Sequence[object]) -> list[str]:
     """Values as fields: what is not known as nothing."""
     texts = ["" if value is None else str(value) for value in values]
     # Most columns need no quotes: one search over all of a column is faster than one a field.
-    if _NEEDS_QUOTES.search("".join(texts)) is None:
-        return texts
-    return [_in_quotes(text) if _NEEDS_QUOTES.search(text) else text for text in texts]
-
-
-def _in_quotes(text: str) -> str:
-    return '"{}"'.format(text.replace('"', '""'))
+    return texts if NEEDS_QUOTES.search("".join(texts)) is None else [*map(quoted, texts)]
 
 
 _ENCODER = msgspec.json.Encoder()

@@ -293,6 +293,18 @@ def test_the_export_of_the_rejected_gives_every_reason(tmp_path):
     assert text == "id,reason\nA 2,merged into A 1\n"
 
 
+def test_an_identifier_with_a_separator_of_any_country_is_one_cell(tmp_path):
+    rows = ["A;1,10,0,5", f"A;2,10,{40 / 3600},6", '"B,3",20,0,5']
+    run = run_of(site_catalog(tmp_path, *rows))
+    export_csv(run, tmp_path / "run.csv")
+    export_rejected_csv(run, tmp_path / "rejected.csv")
+    lines = (tmp_path / "run.csv").read_text(encoding="utf-8").splitlines()
+    assert {line.partition('",')[0] for line in lines[1:]} == {'"A;1', '"B,3'}
+    assert (tmp_path / "rejected.csv").read_text(encoding="utf-8") == (
+        'id,reason\n"A;2","merged into A;1"\n'
+    )
+
+
 def test_the_digest_tells_run_catalogs_apart(catalog):
     """The same settings and epoch give the same digest; another epoch or limit another one."""
     made = [(2000.0, 4.0), (2000.0, 4.0), (2001.0, 4.0), (2000.0, 4.1)]

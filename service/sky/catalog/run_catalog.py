@@ -10,18 +10,18 @@ its epoch, and zones are made of them.  `direction_at` gives those seen from the
 Earth on the day of a batch, of which attitudes and residuals are made.
 """
 
-import csv
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 from erfa import ufunc
 
-from service.csv_cells import neutralised
+from service.csv_cells import neutralised, quoted
 from service.missions.mission import RunCatalogSettings
 from service.sky.catalog.star_catalog import Catalog, motion_in, moved
 from service.sky.files import Content
@@ -199,18 +199,18 @@ def export_csv(run_catalog: RunCatalog, path: Path) -> None:
         run_catalog.magnitude_mag.tolist(),
         strict=True,
     )
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["id", "ra_deg", "dec_deg", "magnitude"])
-        writer.writerows(rows)
+    _write_csv(path, chain([("id", "ra_deg", "dec_deg", "magnitude")], rows))
 
 
 def export_rejected_csv(run_catalog: RunCatalog, path: Path) -> None:
     """Writes `id,reason` of every rejected star, in catalog order."""
+    rows = [(neutralised(one.star_id), one.reason) for one in run_catalog.rejected]
+    _write_csv(path, [("id", "reason"), *rows])
+
+
+def _write_csv(path: Path, rows: Iterable[Sequence[object]]) -> None:
     with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(["id", "reason"])
-        writer.writerows((neutralised(one.star_id), one.reason) for one in run_catalog.rejected)
+        file.writelines(",".join(quoted(str(cell)) for cell in row) + "\n" for row in rows)
 
 
 def rejections(
