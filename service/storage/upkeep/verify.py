@@ -29,6 +29,7 @@ from service.grades.day import (
 from service.gyro import SAME_TIME_NS, Nanoseconds, first_shared_ns
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
+from service.storage.grades.days import DaySummary
 from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
 from service.storage.queries.time_buckets import Bucket
@@ -406,6 +407,13 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
             yield f"{name}: it has samples, though it is not the current revision"
         return
     digest, samples = hashlib.sha256(), Counter[str]()
+    try:
+        stretches = msgspec.json.decode(row["summary"], type=DaySummary).stretches
+    except msgspec.MsgspecError:
+        yield f"{name}: its summary cannot be read"
+        return
+    # Of each sample of a grade; that of measurements is not used.
+    models = [each.model for each in stretches for _ in range(each.samples)]
     for grade in (*GRADES, INNOVATIONS):
         end_ns = row["start_ns"]
         chosen = sa.select(graded_blocks).where(c.day_id == row["id"], c.grade == grade)
@@ -417,6 +425,9 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
                 yield f"{where}: its samples cannot be read: {error}"
                 continue
             digest.update(block["packed"])
+            of_samples = models[samples[grade] :][: block["samples"]]
+            if grade != INNOVATIONS and set(of_samples) != {block["model"]}:
+                yield f"{where}: its model is not the one that its day has"
             samples[grade] += block["samples"]
             times = found.tai_ns
             bounds = block["start_ns"], block["end_ns"]
