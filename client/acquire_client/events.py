@@ -74,6 +74,13 @@ class CalibrationEvent(_Numbered, frozen=True):
     data: models.CalibrationChange
 
 
+class HeadEvent(_Numbered, frozen=True):
+    """An event `head`."""
+
+    kind: Literal["head"]
+    data: models.RecordHead
+
+
 KnownEvent = (
     BatchesEvent
     | AdoptedEvent
@@ -84,4 +91,5 @@ KnownEvent = (
     | GyroEvent
     | TrackingEvent
     | CalibrationEvent
+    | HeadEvent
 )

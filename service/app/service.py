@@ -13,6 +13,7 @@ from service.acquire.prewarm import prewarm_kernels, prewarm_sky
 from service.app.context import Context
 from service.app.replays import Replays
 from service.app.single_projector import SingleProjector
+from service.contract.events import RecordHead
 from service.contract.spacecraft import About, CatalogAbout, MissionAbout
 from service.errors import AcquisitionError, Busy
 from service.ingest.solver_pool import mission_in_input
@@ -20,6 +21,7 @@ from service.ingest.submit import SubmissionService
 from service.missions.identifiers import IDENTIFIERS
 from service.missions.mission import Mission
 from service.observations.schema import submission_from_json
+from service.storage.projections.heads import require_head
 from service.storage.queries.fleet import latest_inputs
 from service.storage.recording import events
 from service.storage.recording.events import Event
@@ -190,6 +192,11 @@ class Service:
             ],
             credits=list(CREDITS),
         )
+
+    def record_head(self) -> RecordHead:
+        """The last head of the record; raises `NotFound` before the first."""
+        with self._context.reading_record() as connection:
+            return require_head(connection)
 
 
 class Events:

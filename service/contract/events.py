@@ -3,6 +3,8 @@
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
 
+from pydantic import Field
+
 from service.acquire.result import TrackingState
 from service.contract.alarms import Alarm, AnnotationChange, Limit
 from service.contract.answers import StarCounts
@@ -80,6 +82,24 @@ class CalibrationChange(Record, frozen=True, kw_only=True):
     mission: Annotated[Digest, doc("The settings in force since then.")]
 
 
+class RecordHead(Record, frozen=True, kw_only=True):
+    """A head of the record's chain, to be kept where nobody can write who can change the record."""
+
+    number: Annotated[int, Field(ge=1)]
+    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="Of the statement.")]
+    made: Stamp
+    statement: Annotated[str, doc("JSON, byte for byte as it is hashed and signed.")]
+    signature: Annotated[
+        str | None,
+        doc("Ed25519, in hexadecimal digits; null: the service has no key."),
+    ]
+
+    @property
+    def text(self) -> str:
+        """Number, SHA-256 and time, as `acquire database verify --head` reads them."""
+        return f"{self.number} {self.sha256} {self.made}"
+
+
 EVENT_DATA: Mapping[str, type[Record]] = {
     "batches": Recorded,
     "adopted": Adopted,
@@ -90,4 +110,5 @@ EVENT_DATA: Mapping[str, type[Record]] = {
     "gyro": GyroBlockRow,
     "tracking": TrackingChange,
     "calibration": CalibrationChange,
+    "head": RecordHead,
 }

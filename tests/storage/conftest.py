@@ -4,7 +4,10 @@ import pytest
 
 from service.app.factory import open_app
 from service.settings import Settings
-from tests.storage import samples
+from service.storage.recording.signing import PublicKey, make_key
+from service.storage.upkeep.verify import verify
+from tests.grades.passes import GYRO, mission_with
+from tests.storage import samples, sealed
 
 
 @pytest.fixture
@@ -41,3 +44,29 @@ def make(sky, missions):
         return samples.submission(sky, missions, name, **wanted)
 
     return submission
+
+
+@pytest.fixture
+def key(tmp_path):
+    """A private key and the file of its public key."""
+    (tmp_path / "public.pem").write_text(make_key(tmp_path / "key.pem"))
+    return tmp_path / "key.pem", tmp_path / "public.pem"
+
+
+@pytest.fixture
+def signed(opened, make, key, missions):
+    """Fills the test's database with results and rows of every kind, all in signed heads."""
+    app = opened(mission_with(missions["XTE"], gyro=GYRO), record_key=str(key[0]))
+    sealed.fill(app, make, missions)
+    app.close()
+    return app
+
+
+@pytest.fixture
+def faults(database, key):
+    """Faults of the database, with the key; `faults(public=False)` without."""
+
+    def found(public=True, anchors=()):
+        return verify(database, public_key=PublicKey(key[1]) if public else None, anchors=anchors)
+
+    return found

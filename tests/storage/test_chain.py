@@ -4,165 +4,38 @@ import hashlib
 import json
 import re
 import subprocess
-from contextlib import closing, contextmanager
+from contextlib import closing
 
 import pytest
-from sqlalchemy import create_engine, select, text, update
+from sqlalchemy import select, text, update
 
+from service.cli import main
 from service.errors import BadConfiguration
-from service.observations.schema import OptionsIn
+from service.storage.projections import heads
 from service.storage.recording import chain
 from service.storage.recording.signing import PublicKey, Signer, make_key
 from service.storage.sql.chain_tables import record_facts, record_heads, record_leaves
 from service.storage.sql.columns import BOUND, metadata
-from service.storage.sql.engines import database_url
 from service.storage.sql.migrations import all_tables
 from service.storage.sql.tables import results
-from service.storage.upkeep import proofs, verify_chain
+from service.storage.upkeep import archiving, proofs, verify_chain
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify
 from service.times import shifted
 from tests.storage.samples import START
+from tests.storage.sealed import ID, ROWS, chain_anew, changing, heads_of
 
 pytestmark = pytest.mark.both_databases
 
 LATER = shifted(START, 30 * 86_400.0)
-TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 
 
-@pytest.fixture
-def key(tmp_path):
-    """A private key and the file of its public key."""
-    (tmp_path / "public.pem").write_text(make_key(tmp_path / "key.pem"))
-    return tmp_path / "key.pem", tmp_path / "public.pem"
-
-
-@pytest.fixture
-def sealed(opened, make, key, database):
-    """A database with results of every kind and rows of other tables, all in signed heads."""
-    app = opened(record_key=str(key[0]))
-    ids = [
-        app.submissions.submit(make(f"b{k}", kind=kind, after_s=6_000.0 * k)).id
-        for k, kind in enumerate(("good", "suspect", "one_star", "spurious", "good", "good"))
-    ]
-    app.projector.make_heads()
-    app.results.what_if(ids[0], TIGHT, adopt=True)
-    app.results.what_if(ids[1], TIGHT, record=True)
-    with changing(database) as connection:
-        # As the service writes them; people would have to wait for its routes here.
-        moment = START.text
-        for table, row in ROWS.items():
-            names = ", ".join(f'"{name}"' for name in row)
-            values = ", ".join(f":{name}" for name in row)
-            statement = text(f"INSERT INTO {table} ({names}) VALUES ({values})")
-            connection.execute(statement, {n: v or moment for n, v in row.items()})
-    app.projector.make_heads()
-    app.close()
-    return app
-
-
-ID = "01JD000000000000000000000{}"
-ROWS = {
-    "audit": {"id": ID.format(1), "moment": "", "who": "A", "action": "x", "about": "y"},
-    "access_tokens": {"id": ID.format(2), "name": "A", "digest": "d", "scopes": "read"}
-    | {"created": "", "expires": ""},
-    "limits": {"spacecraft": "XTE", "quantity": "unique", "who": "A", "since": ""},
-    "annotations": {"id": ID.format(3), "spacecraft": "XTE", "start": "", "start_ns": 1}
-    | {"end_ns": 2, "text": "a note", "who": "A", "created": ""},
-    "webhooks": {"id": ID.format(4), "name": "w", "url": "https://x.example/", "enabled": True}
-    | {"who": "A", "created": "", "secret": "s", "position": 1},
-}
-
-
-@contextmanager
-def changing(database):
-    """A connection of a person with access to the database."""
-    engine = create_engine(database_url(database))
-    with engine.begin() as connection:
-        yield connection
-    engine.dispose()
-
-
-@pytest.fixture
-def faults(database, key):
-    """Faults of the database, with the key; `faults(public=False)` without."""
-
-    def found(public=True, anchors=()):
-        return verify(database, public_key=PublicKey(key[1]) if public else None, anchors=anchors)
-
-    return found
-
-
-CHANGES = {
-    "a digest that is missing": "UPDATE results SET digest = NULL WHERE status = 'good'",
-    "a place that is missing": "UPDATE results SET seq = 0, digest = NULL WHERE status = 'suspect'",
-    "an answer": "UPDATE results SET reason = 'x' WHERE status IS NULL",
-    "an attitude": "UPDATE solutions SET q1 = q1 + 1e-9",
-    "a covariance": "UPDATE solutions SET p11 = p11 * 1.000000000001",
-    "a star": "UPDATE star_results SET votes = votes + 1",
-    "an outcome": "UPDATE star_results SET outcome = 'unmatched' WHERE outcome = 'unique'",
-    "the time of receipt": "UPDATE batches SET received = '2001-01-01T00:00:00Z'",
-    "a mission": "UPDATE missions SET settings = settings || ' '",
-    "a mission and its digest": "UPDATE missions SET spacecraft = 'X', row_digest = NULL",
-    "a use of a mission": "UPDATE mission_uses SET since = '1990-01-01', row_digest = NULL",
-    "the digest of a use": "UPDATE mission_uses SET row_digest = NULL",
-    "a use that is removed": "DELETE FROM mission_uses",
-    "a catalog": "UPDATE catalogs SET name = 'x', row_digest = NULL",
-    "the audit list": "UPDATE audit SET who = 'B'",
-    "an entry that is removed": "DELETE FROM audit",
-    "a token's scopes": "UPDATE access_tokens SET scopes = 'read operate'",
-    "a token's end": "UPDATE access_tokens SET expires = '2100-01-01T00:00:00Z'",
-    "a token that is removed": "DELETE FROM access_tokens",
-    "a limit": "UPDATE limits SET settings = '{}'",
-    "a limit that is removed": "DELETE FROM limits",
-    "a note": "UPDATE annotations SET text = 'another'",
-    "a note that is removed": "DELETE FROM annotations",
-    "an address": "UPDATE webhooks SET url = 'https://y.example/'",
-    "a webhook that is removed": "DELETE FROM webhooks",
-    "a fact": "UPDATE record_facts SET sha256 = 'x' WHERE kind = 'audit'",
-    "a fact that is removed": "DELETE FROM record_facts WHERE kind = 'audit'",
-    "a leaf": "UPDATE record_leaves SET leaf = (SELECT leaf FROM record_leaves LIMIT 1)",
-    "a leaf that is removed": (
-        "DELETE FROM record_leaves WHERE seq = (SELECT min(seq) FROM results)"
-    ),
-    "a head": "UPDATE record_heads SET statement = replace(statement, 'results', 'audit')",
-    "a head that is removed": "DELETE FROM record_heads WHERE number = 1",
-    "a signature": "UPDATE record_heads SET signature = NULL",
-    "the current result": (
-        "UPDATE results SET current = NOT current WHERE batch_id IN "
-        "(SELECT batch_id FROM results WHERE parent_id IS NOT NULL)"
-    ),
-}
-
-
-def test_a_record_that_nobody_changed_has_no_fault(sealed, faults):
+def test_a_record_that_nobody_changed_has_no_fault(signed, faults):
     assert faults() == []
     assert faults(public=False) == []
 
 
-@pytest.mark.parametrize("change", CHANGES.values(), ids=CHANGES)
-def test_a_change_of_the_tables_is_found(sealed, faults, database, change):
-    with changing(database) as connection:
-        if database.startswith("sqlite"):
-            connection.execute(text("PRAGMA foreign_keys = OFF"))
-        else:
-            connection.execute(text("SET session_replication_role = replica"))
-        if "NOT current" in change:
-            # One after the other: there is never more than one.
-            ids = "SELECT id FROM results WHERE batch_id IN (SELECT batch_id FROM results WHERE "
-            ids += "parent_id IS NOT NULL AND current = {}) AND id = batch_id"
-            true = "1" if database.startswith("sqlite") else "true"
-            (id,) = connection.scalars(text(ids.format(true))).all()
-            connection.execute(
-                text("UPDATE results SET current = NOT current WHERE batch_id = :id AND current"),
-                {"id": id},
-            )
-            change = f"UPDATE results SET current = NOT current WHERE id = '{id}'"
-        assert connection.execute(text(change)).rowcount
-    assert faults()
-
-
-def test_two_results_whose_places_are_exchanged_are_found(sealed, faults, database):
+def test_two_results_whose_places_are_exchanged_are_found(signed, faults, database):
     with changing(database) as connection:
         one, other, *_ = connection.scalars(select(results.c.seq)).all()
         for before, after in ((one, 0), (other, one), (0, other)):
@@ -170,23 +43,11 @@ def test_two_results_whose_places_are_exchanged_are_found(sealed, faults, databa
     assert len([fault for fault in faults() if "at its place" in fault]) == 2
 
 
-def remade(connection, sign=None):
-    """All leaves, facts and heads made anew, as one who knows every algorithm can."""
-    from service.storage.projections import heads
-    from service.storage.projections.rollups import lock_position
-
-    for table in (record_heads, record_facts, record_leaves):
-        connection.execute(table.delete())
-    maker = heads.HeadMaker(sign)
-    while maker.make(connection, lock_position(connection)):
-        pass
-
-
-def test_a_chain_that_is_made_anew_has_no_signature_of_the_key(sealed, faults, database, key):
+def test_a_chain_that_is_made_anew_has_no_signature_of_the_key(signed, faults, database, key):
     (first, *_, last) = heads_of(database)
     with changing(database) as connection:
         connection.execute(text("UPDATE audit SET who = 'B'"))
-        remade(connection)
+        chain_anew(connection)
     assert faults(public=False) == []
     assert any("it is not signed" in fault for fault in faults())
     (named,) = faults(public=False, anchors=[first])
@@ -195,22 +56,16 @@ def test_a_chain_that_is_made_anew_has_no_signature_of_the_key(sealed, faults, d
     other = key[0].with_name("other.pem")
     make_key(other)
     with changing(database) as connection:
-        remade(connection, Signer(str(other)).sign)
+        chain_anew(connection, Signer(str(other)).sign)
     assert any("its signature is not of this key" in fault for fault in faults())
     # With the key itself only a head that was noted outside tells.
     with changing(database) as connection:
-        remade(connection, Signer(str(key[0])).sign)
+        chain_anew(connection, Signer(str(key[0])).sign)
     assert faults() == []
     assert faults(anchors=[last])
 
 
-def heads_of(database):
-    with changing(database) as connection:
-        query = select(record_heads.c.number, record_heads.c.sha256).order_by(record_heads.c.number)
-        return [verify_chain.Anchor(*row) for row in connection.execute(query)]
-
-
-def test_a_record_that_was_rolled_back_is_told_by_a_head_of_before(sealed, faults, database):
+def test_a_record_that_was_rolled_back_is_told_by_a_head_of_before(signed, faults, database):
     noted = heads_of(database)
     assert len(noted) >= 2
     with changing(database) as connection:
@@ -239,7 +94,7 @@ def test_every_table_is_bound_or_listed_as_not():
     assert sorted(name for group in groups for name in group) == sorted(tables)
 
 
-def test_what_is_pruned_leaves_its_leaf_and_is_no_fault(sealed, opened, faults, database, key):
+def test_what_is_pruned_leaves_its_leaf_and_is_no_fault(signed, opened, faults, database, key):
     with closing(opened(record_key=str(key[0]))) as app:
         before = len(leaves_in(app))
         assert prune(app.store, LATER).batches == 6
@@ -264,7 +119,7 @@ def test_notes_and_webhooks_may_be_changed_by_the_service(opened, faults, key):
         app.projector.make_heads()
         moment = START.text
         note = {"id": ID.format(5), "start": moment, "start_ns": 1, "end_ns": 2, "text": "a"}
-        hook = ROWS["webhooks"] | {"created": moment}
+        hook = dict(ROWS)["webhooks"] | {"created": moment}
 
         def change(act):
             app.store.writer.change(act)
@@ -282,10 +137,61 @@ def test_notes_and_webhooks_may_be_changed_by_the_service(opened, faults, key):
     assert faults() == []
 
 
+# ---- heads that are given away -----------------------------------------------------------------
+
+
+def test_a_head_is_in_the_answer_a_backup_and_an_archive_and_verify_reads_each(
+    signed, opened, faults, database, tmp_path, capsys
+):
+    (*_, last) = heads_of(database)
+    place = tmp_path / "archive"
+    place.mkdir()
+    with closing(opened(archive_folder=place)) as app:
+        head = app.service.record_head()
+        assert (head.number, head.sha256) == (last.number, last.sha256)
+        assert hashlib.sha256(head.statement.encode()).hexdigest() == head.sha256
+        assert archiving.archive(app.store, place, LATER).batches
+    (manifest,) = place.glob("spacecraft=XTE/day=*/manifest.json")
+    assert main(["database", "backup", str(tmp_path / "b"), "--database", database]) == 0
+    backup = capsys.readouterr().out
+    for text_with_head in (head.text, backup.splitlines()[-1], manifest.read_text()):
+        assert verify_chain.anchors_in(text_with_head)[0].number >= last.number
+        assert faults(public=False, anchors=verify_chain.anchors_in(text_with_head)) == []
+
+
+def test_the_first_head_of_an_hour_is_an_event(signed, opened, key, make):
+    with closing(opened(record_key=str(key[0]))) as app:
+
+        def events():
+            after = app.events.after(0, 1_000)
+            return [each for each in after if each.kind == "head"]
+
+        def record(name):
+            app.submissions.submit(make(name))
+            app.store.progress.catch_up()
+            app.projector.make_heads()
+
+        before = len(events())
+        record("in-this-hour")
+        with app.store.reading_record() as connection:
+            newest = heads.newest_head(connection)
+        earlier = json.loads(newest.statement) | {"made": "2001-01-01T00:59:00.000Z"}
+        of_earlier = json.dumps(earlier, sort_keys=True, separators=(",", ":"))
+        chosen = record_heads.c.number == newest.number
+        change = update(record_heads).where(chosen).values(statement=of_earlier)
+        app.store.writer.change(lambda connection: connection.execute(change))
+        record("in-the-next")
+        record("in-the-next-too")
+        assert len(events()) == before + 1
+        data = json.loads(events()[-1].data)
+        assert data["number"] == newest.number + 1
+        assert PublicKey(key[1]).has_signed(data["statement"].encode(), data["signature"])
+
+
 # ---- proofs ------------------------------------------------------------------------------------
 
 
-def test_a_proof_is_small_and_convinces_without_the_database(sealed, database, key, tmp_path):
+def test_a_proof_is_small_and_convinces_without_the_database(signed, database, key, tmp_path):
     with changing(database) as connection:
         rows = connection.execute(select(results.c.id, results.c.answer)).all()
         made = [(proofs.prove(connection, id), answer.encode()) for id, answer in rows]
@@ -304,7 +210,7 @@ def vars_of(proof):
     return {name: getattr(proof, name) for name in proof.__struct_fields__}
 
 
-def test_a_proof_is_checked_with_openssl_and_a_few_lines(sealed, database, key, tmp_path):
+def test_a_proof_is_checked_with_openssl_and_a_few_lines(signed, database, key, tmp_path):
     """Hashes with openssl alone, as somebody without this program would."""
 
     def sha256(content):
@@ -373,7 +279,7 @@ def test_a_key_that_others_can_read_is_refused_and_never_shown(opened, key):
 # ---- earlier databases, archives, copies -------------------------------------------------------
 
 
-def test_results_of_before_the_chain_get_their_leaves_and_verify(sealed, opened, faults, database):
+def test_results_of_before_the_chain_get_their_leaves_and_verify(signed, opened, faults, database):
     """As the migration leaves them: no leaf, and no place in the order."""
     with changing(database) as connection:
         for table in (record_heads, record_facts, record_leaves):
@@ -383,7 +289,7 @@ def test_results_of_before_the_chain_get_their_leaves_and_verify(sealed, opened,
     with closing(opened()) as app:
         app.projector.make_heads()
         places = leaves_in(app)
-    assert len(places) == 8
+    assert len(places) == 9
     assert max(places) < 0
     assert faults(public=False) == []
     with changing(database) as connection:
@@ -391,9 +297,7 @@ def test_results_of_before_the_chain_get_their_leaves_and_verify(sealed, opened,
     assert any("at its place -" in fault for fault in faults(public=False))
 
 
-def test_an_archive_keeps_the_chain_and_brings_its_results_back(sealed, opened, faults, tmp_path):
-    from service.storage.upkeep import archiving
-
+def test_an_archive_keeps_the_chain_and_brings_its_results_back(signed, opened, faults, tmp_path):
     place = tmp_path / "archive"
     place.mkdir()
     with closing(opened(archive_folder=place)) as app:
@@ -408,7 +312,7 @@ def test_an_archive_keeps_the_chain_and_brings_its_results_back(sealed, opened, 
     assert faults(public=False) == []
 
 
-def test_an_archive_in_another_database_gets_leaves_of_its_own(sealed, opened, tmp_path, key):
+def test_an_archive_in_another_database_gets_leaves_of_its_own(signed, opened, tmp_path, key):
     from service.storage.upkeep import archiving
     from tests.fresh_databases import sqlite_at
 

@@ -102,6 +102,8 @@ def walk(client: httpx.Client, app: App) -> Json:
     take("get_spacecraft", client.get(f"{API}/spacecraft/NOPE"), "unknown")
     take("get_overview", client.get(f"{API}/overview"), "live")
     take("get_about", client.get(f"{API}/about"), "here")
+    app.projector.make_heads()
+    take("get_record_head", client.get(f"{API}/record/head"), "first")
     asked = {
         "spacecraft": "XTE",
         "sample": 5,

@@ -62,6 +62,7 @@ from .events import Adopted as Adopted
 from .events import CalibrationChange as CalibrationChange
 from .events import LatestBatch as LatestBatch
 from .events import Recorded as Recorded
+from .events import RecordHead as RecordHead
 from .events import TrackingChange as TrackingChange
 from .pictures import Picture as Picture
 from .pictures import PictureAttitude as PictureAttitude

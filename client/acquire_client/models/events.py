@@ -64,3 +64,16 @@ class CalibrationChange(Model, frozen=True, kw_only=True):
     version: int | None
     mission: str
     """The settings in force since then."""
+
+
+class RecordHead(Model, frozen=True, kw_only=True):
+    """A head of the record's chain, to be kept where nobody can write who can change the record."""
+
+    number: int
+    sha256: str
+    """Of the statement."""
+    made: str
+    statement: str
+    """JSON, byte for byte as it is hashed and signed."""
+    signature: str | None
+    """Ed25519, in hexadecimal digits; None: the service has no key."""

@@ -2,6 +2,7 @@
 
 import getpass
 import json
+import os
 import sys
 from argparse import Namespace
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from service.cli.arguments import (
     settings_of,
     settings_of_existing,
 )
+from service.errors import BadConfiguration
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -145,8 +147,10 @@ def backup(parsed: Namespace) -> int:
 
     with progress_bar("pages", "copying") as bar:
         database = settings_of(parsed).database
-        back_up(database, parsed.output, lambda left, total: bar(total - left, total))
+        head = back_up(database, parsed.output, lambda left, total: bar(total - left, total))
     print(f"{parsed.output}: {parsed.output.stat().st_size} bytes")
+    if head is not None:
+        print(f"record head {head.text}")
     return 0
 
 
@@ -187,10 +191,7 @@ def verify(parsed: Namespace) -> int:
 
     database = settings_of(parsed).database
     public_key = None if parsed.public_key is None else PublicKey(parsed.public_key)
-    anchors = []
-    if parsed.head is not None:
-        file = Path(parsed.head)
-        anchors = anchors_in(file.read_text(encoding="utf-8") if file.is_file() else parsed.head)
+    anchors = [] if parsed.head is None else anchors_in(_text_of(parsed.head))
     with progress_bar("batches", "reading") as bar:
         problems = verify_records(database, bar, public_key=public_key, anchors=anchors)
     if parsed.json:
@@ -208,6 +209,16 @@ def verify(parsed: Namespace) -> int:
     if without:
         print(f"{without} results have no digest yet: the service makes them while it runs")
     return 0
+
+
+def _text_of(given: str) -> str:
+    """The text of a file, or what was given where it names none."""
+    if not os.path.isfile(given):
+        return given
+    try:
+        return Path(given).read_text(encoding="utf-8", errors="replace")
+    except OSError as error:
+        raise BadConfiguration(f"--head: {given}: {error.strerror}") from None
 
 
 def _print_problems(problems: Sequence[str]) -> None:

@@ -52,16 +52,11 @@ def head(parsed: Namespace) -> int:
 
     acquire record head
     """
-    from service.errors import NotFound
-    from service.storage.projections.heads import last_head
-    from service.storage.recording.chain import sha256_of
+    from service.storage.projections.heads import require_head
     from service.storage.sql.migrations import reading
 
     with reading(settings_of_existing(parsed).database) as connection:
-        last = last_head(connection)
-    if not last.number:
-        raise NotFound("the record has no head yet: the service makes one each minute")
-    print(f"{last.number} {sha256_of(last)} {last.made}")
+        print(require_head(connection).text)
     return 0
 
 

@@ -71,6 +71,8 @@ class Part(Struct, frozen=True, kw_only=True):
     """The digest of what a reprocessed partition was made from."""
     tracked: bool = False
     """True if its run was reprocessed with tracking; see `runs`."""
+    record_head: str | None = None
+    """Number, SHA-256 and time of the last head of the record when it was written."""
 
 
 class Manifest(Struct, frozen=True, kw_only=True):

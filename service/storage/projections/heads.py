@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import msgspec
+from msgspec import structs
 from sqlalchemy import (
     ColumnElement,
     Connection,
@@ -26,7 +27,9 @@ from sqlalchemy import (
     update,
 )
 
-from service.storage.recording import chain
+from service.contract.events import RecordHead
+from service.errors import NotFound
+from service.storage.recording import chain, events
 from service.storage.recording.chain import Statement
 from service.storage.recording.identity import encoded_rows
 from service.storage.sql.chain_tables import record_facts, record_heads, record_leaves
@@ -43,6 +46,8 @@ MOST_LEAVES = 2_000
 """The leaves of one head, about: more are bound by the next one, in another transaction."""
 ADOPTED_AT_ONCE = 500
 """The results of earlier versions that get a leaf in one transaction."""
+_HOUR = len("2026-03-01T12")
+"""The first head of an hour is an event, so that receivers elsewhere get one each hour."""
 LATE_S = 3_600.0
 """How long a transaction may take that adds a row to a bound table."""
 
@@ -99,23 +104,31 @@ class HeadMaker:
             counts=counts,
             root=chain.root_of(leaves_of(rows, facts)).hex(),
         )
-        self._store(connection, made, facts)
+        self._store(connection, before, made, facts)
         if len(rows) >= MOST_LEAVES or len(facts) >= MOST_LEAVES:
             self._due_s = 0.0
         self._bound = made.last
         return made
 
-    def _store(self, connection: Connection, made: Statement, facts: Sequence[Row]) -> None:
+    def _store(
+        self, connection: Connection, before: Statement, made: Statement, facts: Sequence[Row]
+    ) -> None:
         statement = made.encoded()
-        row: Row = {"number": made.number, "made": made.made, "statement": statement.decode()}
-        row |= {"sha256": chain.sha256_of(made)}
-        row["signature"] = None if self.sign is None else self.sign(statement)
-        connection.execute(insert(record_heads), row)
+        head = RecordHead(
+            number=made.number,
+            made=made.made,
+            statement=statement.decode(),
+            sha256=chain.sha256_of(made),
+            signature=None if self.sign is None else self.sign(statement),
+        )
+        connection.execute(insert(record_heads), structs.asdict(head))
         if facts:
             bound = update(record_facts).where(record_facts.c.id == bindparam("of"))
             own = [{"of": each["id"]} for each in facts]
             connection.execute(bound.values(head=made.number), own)
-        log.info("record head %d %s", made.number, row["sha256"])
+        log.info("record head %s", head.text)
+        if before.number and before.made[:_HOUR] != made.made[:_HOUR]:
+            events.add_event(connection, "head", head)
 
     def _find_facts(self, connection: Connection) -> None:
         """Add a fact for each row of the bound tables that is new, or closed since."""
@@ -153,9 +166,21 @@ NOTHING = Statement(number=0, previous="", made="", first=0, last=0, counts={}, 
 
 def last_head(connection: Connection) -> Statement:
     """The statement of the last head; `NOTHING` without one."""
-    newest = select(record_heads.c.statement).order_by(record_heads.c.number.desc()).limit(1)
-    statement = connection.scalar(newest)
-    return NOTHING if statement is None else msgspec.json.decode(statement, type=Statement)
+    newest = newest_head(connection)
+    return NOTHING if newest is None else msgspec.json.decode(newest.statement, type=Statement)
+
+
+def newest_head(connection: Connection) -> RecordHead | None:
+    """The last head as it is given away; None where none was made yet."""
+    query = select(record_heads).order_by(record_heads.c.number.desc()).limit(1)
+    return next((RecordHead(**row) for row in rows_of(connection, query)), None)
+
+
+def require_head(connection: Connection) -> RecordHead:
+    """The last head; raises `NotFound` where none was made yet."""
+    if (newest := newest_head(connection)) is None:
+        raise NotFound("the record has no head yet: the service makes one each minute")
+    return newest
 
 
 def new_leaves(

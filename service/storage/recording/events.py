@@ -41,6 +41,7 @@ EventKind = Literal[
     "gyro",
     "tracking",
     "calibration",
+    "head",
 ]
 EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 KEPT = 20_000

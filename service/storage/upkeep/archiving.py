@@ -56,6 +56,7 @@ from service.storage.archive.rows import (
     to_partition,
 )
 from service.storage.projections import rollups, seals
+from service.storage.projections.heads import newest_head
 from service.storage.projections.rollups import keep_share
 from service.storage.recording.identity import digest_of_row, made_later
 from service.storage.recording.result_metrics import is_waiting
@@ -202,10 +203,13 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
             tracked = connection.scalar(
                 select(tables.runs.c.tracked).where(tables.runs.c.name == day.run)
             )
+            head = newest_head(connection)
         file = _new_file(day_folder(folder, day.spacecraft, day.text))
         content = write_partition(file, to_partition(rows))
         part = described(file.name, day.run, rows, content)
-        part = msgspec.structs.replace(part, tracked=bool(tracked))
+        part = msgspec.structs.replace(
+            part, tracked=bool(tracked), record_head=None if head is None else head.text
+        )
         manifest = manifest_of(folder, day.spacecraft, day.text).with_part(part)
         write_manifest(folder, manifest)
         path = path_of(folder, manifest, part)

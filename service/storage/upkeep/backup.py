@@ -18,10 +18,13 @@ from pathlib import Path
 
 from sqlalchemy import URL, inspect
 
+from service.contract.events import RecordHead
 from service.errors import BadConfiguration
+from service.storage.projections.heads import newest_head
 from service.storage.sql import engines
+from service.storage.sql.chain_tables import record_heads
 from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile, sync_folder
-from service.storage.sql.migrations import connected, revision_of
+from service.storage.sql.migrations import connected, reading, revision_of
 
 PAGES_AT_ONCE = 2_000
 """About eight megabytes: often enough to show how far it is."""
@@ -34,24 +37,31 @@ Step = Callable[[int, int], object]
 """Called with the pages that are left and those there are."""
 
 
-def back_up(database: str, target: Path, step: Step = lambda left, total: None) -> None:
+def back_up(
+    database: str, target: Path, step: Step = lambda left, total: None
+) -> RecordHead | None:
     """Write a copy of a database to a file that is not there yet, whole or not at all.
 
     Of SQLite the copy is a database of its own; of PostgreSQL it is what
-    `pg_restore` reads.  Raises `BadConfiguration` where the database cannot be
-    read, and for a target that is there already.
+    `pg_restore` reads.  Returns the last head of the record from before the copy.  Raises
+    `BadConfiguration` where the database cannot be read, and for a target that is there already.
     """
     url = engines.database_url(database)
     if target.exists():
         raise BadConfiguration(f"{target}: exists already; choose another file")
     if not target.absolute().parent.is_dir():
         raise BadConfiguration(f"{target}: there is no such folder")
+    with reading(database) as connection:
+        # Earlier versions had none.
+        has_heads = inspect(connection).has_table(record_heads.name)
+        head = newest_head(connection) if has_heads else None
     with _part_of(target) as part:
         if url.drivername == "sqlite":
             _copy_sqlite(Path(url.database or ""), part, step)
         else:
             _dump_postgresql(url, part)
         _move(part, target, Path.replace)
+    return head
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from starlette.responses import Response
 from service.app.spacecraft import batch_table, history_table
 from service.contract import spacecraft as models
 from service.contract.answers import Result
+from service.contract.events import RecordHead
 from service.contract.spacecraft import About, Overview
 from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
@@ -157,3 +158,14 @@ def get_overview(query: FromQuery[params.RunQuery], app: AppDep, caller: CallerD
 def get_about(app: AppDep, caller: CallerDep) -> Response:
     """Version, catalog, missions, database and credits."""
     return json_response(app.service.about(caller.spacecraft))
+
+
+@overview_router.serves(
+    "GET /record/head",
+    Policy("read", "nothing"),
+    Returns("The last head.", RecordHead),
+    problems=(404,),
+)
+def get_record_head(app: AppDep) -> Response:
+    """The last head of the record, to be kept where nobody can write who can change the record."""
+    return json_response(app.service.record_head())

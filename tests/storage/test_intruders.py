@@ -1,0 +1,209 @@
+"""What a person with access to the database changes is found and named, also after a repair."""
+
+import pytest
+from sqlalchemy import text
+
+from service.storage.recording.signing import PublicKey
+from service.storage.sql.engines import database_url, reading_engine
+from service.storage.upkeep.verify_chain import faults_of_the_chain
+from tests.storage.sealed import (
+    chain_anew,
+    changing,
+    digest_anew,
+    heads_of,
+    leaves_anew,
+    put_back,
+    rows_in,
+)
+
+pytestmark = pytest.mark.both_databases
+
+_FIRST = "(SELECT min(id) FROM results WHERE status = 'good')"
+_WHAT_IF = "(SELECT max(id) FROM results WHERE parent_id IS NOT NULL)"
+_OF_IMAGER = "(SELECT id FROM results WHERE spacecraft = 'IMAGER')"
+_HAS_CURRENT = "batch_id IN (SELECT batch_id FROM results WHERE current)"
+_REMOVE = [f"DELETE FROM {name} WHERE result_id = {{0}}" for name in ("star_results", "solutions")]
+
+CHANGES = {
+    # ---- results and batches
+    "a digest that is missing": "UPDATE results SET digest = NULL WHERE status = 'good'",
+    "a place that is missing": "UPDATE results SET seq = 0, digest = NULL WHERE status = 'suspect'",
+    "an answer": "UPDATE results SET reason = 'x' WHERE status IS NULL",
+    "the options": "UPDATE results SET options = '{}'",
+    "the identifier": "UPDATE results SET identifier = 'x'",
+    "a mean residual": "UPDATE results SET residual_rms_arcsec = residual_rms_arcsec + 1e-9",
+    "the settings of a result": "UPDATE results SET mission_digest = 'sha256:0'",
+    "the catalog of a result": "UPDATE results SET catalog_digest = 'sha256:0'",
+    "the time of computing": "UPDATE results SET created = '2001-01-01T00:00:00.000Z'",
+    "the origin of a what-if": "UPDATE results SET parent_id = NULL WHERE parent_id IS NOT NULL",
+    "the current result": (
+        "UPDATE results SET current = NOT current WHERE current AND parent_id IS NOT NULL",
+        f"UPDATE results SET current = NOT current WHERE id = batch_id AND NOT {_HAS_CURRENT}",
+    ),
+    "an attitude": "UPDATE solutions SET q1 = q1 + 1e-9",
+    "a covariance": "UPDATE solutions SET p11 = p11 * 1.000000000001",
+    "the frame of an attitude": "UPDATE solutions SET frame = 'x'",
+    "the noise of an attitude": "UPDATE solutions SET predicted_rms_arcsec = 1",
+    "the method of an attitude": "UPDATE solutions SET method = 'x'",
+    "a star": "UPDATE star_results SET votes = votes + 1",
+    "the name of a star": "UPDATE star_results SET star_id = 'HIP 1' WHERE star_id IS NOT NULL",
+    "a probability": "UPDATE star_results SET probability = 1 WHERE probability < 1",
+    "a residual": "UPDATE star_results SET residual_arcsec = 0 WHERE residual_arcsec > 0",
+    "an outcome": "UPDATE star_results SET outcome = 'unmatched' WHERE outcome = 'unique'",
+    "the tracker of a star": "UPDATE star_results SET tracker = 'x'",
+    "a star that is removed": "DELETE FROM star_results WHERE position = 0",
+    "the time of receipt": "UPDATE batches SET received = '2001-01-01T00:00:00Z'",
+    "the time of a batch": "UPDATE batches SET time = '2001-01-01T00:00:00.000Z'",
+    "the name of a batch": "UPDATE batches SET batch = batch || 'x'",
+    "an input": "UPDATE batches SET input = '{}'",
+    "a fingerprint": "UPDATE batches SET fingerprint = 'x'",
+    "the stars of a frame": "UPDATE frames SET detections = detections || ' '",
+    "the summary of a frame": "UPDATE frames SET summary = summary || ' '",
+    "the picture of a frame": "UPDATE frames SET preview = :bytes",
+    "a frame that is removed": "DELETE FROM frames",
+    "an attitude that is removed": f"DELETE FROM solutions WHERE result_id = {_FIRST}",
+    "a what-if that is removed": (
+        *(each.format(_WHAT_IF) for each in _REMOVE),
+        f"DELETE FROM results WHERE id = {_WHAT_IF}",
+    ),
+    "a spacecraft that is removed": (
+        *(each.format(_OF_IMAGER) for each in _REMOVE),
+        f"DELETE FROM frames WHERE batch_id = {_OF_IMAGER}",
+        "DELETE FROM results WHERE spacecraft = 'IMAGER'",
+        *(
+            f"DELETE FROM {table} WHERE spacecraft = 'IMAGER'"
+            for table in ("batches", "rollups_hourly", "rollups_daily", "seals", "events")
+        ),
+    ),
+    # ---- missions and catalogs
+    "a mission": "UPDATE missions SET settings = settings || ' '",
+    "a mission and its digest": "UPDATE missions SET spacecraft = 'X', row_digest = NULL",
+    "a mission that is removed": "DELETE FROM missions",
+    "a use of a mission": "UPDATE mission_uses SET since = '1990-01-01', row_digest = NULL",
+    "the digest of a use": "UPDATE mission_uses SET row_digest = NULL",
+    "a use that is removed": "DELETE FROM mission_uses",
+    "a catalog": "UPDATE catalogs SET name = 'x', row_digest = NULL",
+    "the first use of a catalog": "UPDATE catalogs SET first_used = '1990-01-01'",
+    "a catalog that is removed": "DELETE FROM catalogs",
+    # ---- what people do
+    "the audit list": "UPDATE audit SET who = 'B'",
+    "the time of an entry": "UPDATE audit SET moment = '1990-01-01'",
+    "an entry that is removed": "DELETE FROM audit",
+    "a token's scopes": "UPDATE access_tokens SET scopes = 'read operate'",
+    "a token's end": "UPDATE access_tokens SET expires = '2100-01-01T00:00:00Z'",
+    "a token's spacecraft": "UPDATE access_tokens SET spacecraft = 'XTE'",
+    "a token that is valid again": "UPDATE access_tokens SET revoked = NULL",
+    "a token that is removed": "DELETE FROM access_tokens",
+    "a limit": "UPDATE limits SET settings = '{}'",
+    "who set a limit": "UPDATE limits SET who = 'B'",
+    "the end of a limit": "UPDATE limits SET until = '1990-01-01' WHERE until IS NOT NULL",
+    "a limit that is removed": "DELETE FROM limits",
+    "an action on an alarm": "UPDATE alarm_actions SET who = 'B'",
+    "an action that is removed": "DELETE FROM alarm_actions",
+    "a note": "UPDATE annotations SET text = 'another'",
+    "a note that is removed": "DELETE FROM annotations",
+    "an address": "UPDATE webhooks SET url = 'https://y.example/'",
+    "the events that are sent": "UPDATE webhooks SET kinds = 'gyro'",
+    "a webhook that is removed": "DELETE FROM webhooks",
+    "a calibration": "UPDATE calibrations SET result = '{{}}'",
+    "the end of a calibration": "UPDATE calibrations SET ended = '1990-01-01'",
+    "a calibration that is removed": "DELETE FROM calibrations",
+    "an adoption": "UPDATE calibration_adoptions SET who = 'B'",
+    "what was adopted": "UPDATE calibration_adoptions SET trackers = '[]'",
+    "an adoption that is removed": "DELETE FROM calibration_adoptions",
+    # ---- gyro blocks and graded days
+    "the rates of a gyro block": "UPDATE gyro_blocks SET rates_rad_per_s = :bytes",
+    "the receipt of a gyro block": "UPDATE gyro_blocks SET received = '1990-01-01'",
+    "a gyro block that is removed": "DELETE FROM gyro_blocks",
+    "the summary of a day": "UPDATE graded_days SET summary = '{}'",
+    "the inputs of a day": "UPDATE graded_days SET inputs = 'sha256:0'",
+    "the samples of a day": "UPDATE graded_blocks SET packed = :bytes",
+    "the model of samples": "UPDATE graded_blocks SET model = 'x'",
+    "a day that is removed": ("DELETE FROM graded_blocks", "DELETE FROM graded_days"),
+    # ---- the chain itself
+    "a fact": "UPDATE record_facts SET sha256 = 'x' WHERE kind = 'audit'",
+    "a fact that is removed": "DELETE FROM record_facts WHERE kind = 'audit'",
+    "a leaf": "UPDATE record_leaves SET leaf = (SELECT leaf FROM record_leaves LIMIT 1)",
+    "a leaf that is removed": (
+        "DELETE FROM record_leaves WHERE seq = (SELECT min(seq) FROM results)"
+    ),
+    "a head": "UPDATE record_heads SET statement = replace(statement, 'results', 'audit')",
+    "a head that is removed": "DELETE FROM record_heads WHERE number = 1",
+    "a signature": "UPDATE record_heads SET signature = NULL",
+}
+"""What a person does to the tables; each is one statement, or several."""
+
+
+def make(connection, change):
+    for each in (change,) if isinstance(change, str) else change:
+        parameters = {"bytes": b"x"} if ":bytes" in each else {}
+        assert connection.execute(text(each), parameters).rowcount, each
+
+
+@pytest.fixture
+def unfound(signed, database, key):
+    """Names the changes that `find` finds no fault in; `repair` is done after each."""
+
+    def tried(find, *repairs):
+        with changing(database) as connection:
+            rows = rows_in(connection)
+        missed = []
+        for name, change in CHANGES.items():
+            with changing(database) as connection:
+                make(connection, change)
+                for repair in repairs:
+                    repair(connection)
+            if not find():
+                missed.append(name)
+            with changing(database) as connection:
+                put_back(connection, rows)
+        return missed
+
+    return tried
+
+
+@pytest.fixture
+def chain_faults(database, key):
+    """Faults of the chain alone."""
+
+    def found(anchors=(), *, public=True):
+        engine = reading_engine(database_url(database))
+        try:
+            return list(faults_of_the_chain(engine, PublicKey(key[1]) if public else None, anchors))
+        finally:
+            engine.dispose()
+
+    return found
+
+
+def test_each_change_of_the_tables_is_found(unfound, faults):
+    assert len(CHANGES) >= 60
+    assert unfound(faults) == []
+    assert faults() == []
+
+
+def test_without_the_key_all_are_found_but_a_signature_that_is_removed(unfound, faults):
+    assert unfound(lambda: faults(public=False)) == ["a signature"]
+
+
+def test_who_computes_digests_and_seals_anew_is_found_by_the_chain(unfound, chain_faults):
+    assert unfound(chain_faults, digest_anew) == []
+
+
+def test_who_computes_leaves_and_facts_too_is_found_by_the_heads(unfound, chain_faults):
+    assert unfound(chain_faults, digest_anew, leaves_anew) == []
+
+
+def test_who_makes_all_heads_anew_is_found_by_the_key_and_by_a_head_that_was_kept(
+    unfound, chain_faults, database
+):
+    kept = heads_of(database)
+
+    def found():
+        assert chain_faults(public=False) == []
+        is_unsigned = "it is not signed" in "".join(chain_faults())
+        return is_unsigned and "is another than the one" in "".join(
+            chain_faults(kept, public=False)
+        )
+
+    assert unfound(found, digest_anew, chain_anew) == []
