@@ -4,7 +4,7 @@ import ipaddress
 import socket
 import ssl
 import subprocess
-from ipaddress import ip_address
+from ipaddress import IPv6Address, ip_address, ip_network
 
 import pytest
 
@@ -140,6 +140,47 @@ def test_the_addresses_beside_a_special_network_are_public(rng):
         *("2001:200::", "2001:db7:ffff::", "2001:db9::", "3ffe:ffff::", "3fff:1000::", "2000::"),
     ):
         require_reachable(ip_address(beside), ())
+
+
+REGISTRIES = networks(
+    "0.0.0.0/8, 0.0.0.0/32, 10.0.0.0/8, 100.64.0.0/10, 127.0.0.0/8, 169.254.0.0/16, 172.16.0.0/12,"
+    "192.0.0.0/24, 192.0.0.0/29, 192.0.0.8/32, 192.0.0.9/32, 192.0.0.10/32, 192.0.0.170/32,"
+    "192.0.0.171/32, 192.0.2.0/24, 192.88.99.0/24, 192.88.99.2/32, 192.168.0.0/16, 198.18.0.0/15,"
+    "198.51.100.0/24, 203.0.113.0/24, 240.0.0.0/4, 255.255.255.255/32,"
+    "::1/128, ::/128, ::ffff:0:0/96, 64:ff9b:1::/48, 100::/64, 100:0:0:1::/64, 2001::/23,"
+    "2001::/32, 2001:1::1/128, 2001:1::2/128, 2001:1::3/128, 2001:2::/48, 2001:3::/32,"
+    "2001:4:112::/48, 2001:10::/28, 2001:20::/28, 2001:30::/28, 2001:db8::/32, 3fff::/20,"
+    "5f00::/16, fc00::/7, fe80::/10"
+)
+"""Every block of IANA's two registries of special-purpose addresses but those below."""
+REACHABLE = networks("192.31.196.0/24, 192.52.193.0/24, 192.175.48.0/24, 2620:4f:8000::/48")
+"""Blocks that the registries call globally reachable, outside of a block that is not."""
+OF_IPV4 = {"64:ff9b::/96": 0, "2002::/16": 80}
+"""Blocks whose addresses are as public as the IPv4 address that they carry, so many bits up."""
+
+
+def test_each_block_of_the_registries_is_refused_or_reachable_as_they_say(rng):
+    def some(network):
+        size = network.num_addresses
+        places = {0, size - 1, *(int(rng.random() * size) for _ in range(20))}
+        return [network[place] for place in places]
+
+    for each in REGISTRIES:
+        for address in some(each):
+            with pytest.raises(Refused):
+                require_reachable(address, ())
+    for each in REACHABLE:
+        for address in some(each):
+            require_reachable(address, ())
+    for block, bits in OF_IPV4.items():
+        base = int(ip_network(block).network_address)
+        for each in (each for each in REGISTRIES if each.version == 4):
+            for inner in some(each):
+                with pytest.raises(Refused):
+                    require_reachable(IPv6Address(base | int(inner) << bits), ())
+        require_reachable(IPv6Address(base | int(ip_address("8.8.8.8")) << bits), ())
+    of_others = {"224.0.0.0/4", "ff00::/8", "::/96", "::ffff:0:0:0/96", "fec0::/10"}
+    assert {str(each) for each in set(NOT_PUBLIC) - set(REGISTRIES)} == of_others
 
 
 @pytest.mark.parametrize(("url", "said"), FORMS, ids=[url[:40] for url, _ in FORMS])
