@@ -117,6 +117,8 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 PREFIX = "acq_"
 SESSION_H = 12
 """How long a browser stays signed in, in hours."""
+CLOCKS_APART_S = 300.0
+"""How much the clocks of services on one database may differ."""
 MAX_DAYS = 3660
 DEFAULT_DAYS = 365
 KNOWN_FOR_S = 1.0
@@ -253,13 +255,19 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
     connection.execute(delete(access_sessions).where(access_sessions.c.token_id == row.id))
 
 
-def _caller(connection: Connection, kind: str, digest: str, moment: str) -> Caller | None:
-    """The caller of a token or of a browser's session that is valid at `moment`; else None."""
-    condition = access_tokens.c.digest == digest
+def _caller(connection: Connection, kind: str, digest: str, now: Utc) -> Caller | None:
+    """The caller of a token or of a browser's session that is valid now; else None."""
+    condition, moment = access_tokens.c.digest == digest, now.text
     if kind == "session":
+        # One that was begun by a clock far ahead, which was set right since, would last too long.
+        latest = shifted(now, SESSION_H * 3600 + CLOCKS_APART_S).text
         held = (
             select(access_sessions.c.token_id)
-            .where(access_sessions.c.digest == digest, access_sessions.c.expires > moment)
+            .where(
+                access_sessions.c.digest == digest,
+                access_sessions.c.expires > moment,
+                access_sessions.c.expires <= latest,
+            )
             .scalar_subquery()
         )
         condition = access_tokens.c.id == held
@@ -469,7 +477,7 @@ class Access:
         if known is not None and clock_s < known[1]:
             return known[0]
         with self._reading() as connection:
-            caller = _caller(connection, kind, digest, self._now().text)
+            caller = _caller(connection, kind, digest, self._now())
         with self._lock:
             self._known.pop(key, None)
             if caller is None:

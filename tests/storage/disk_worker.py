@@ -58,7 +58,7 @@ def main(database, file, faults, seed):
         before = disk.faulty_failed()
         # A single call or a disk that stays so for a while: in a commit, at its end, or where a
         # checkpoint takes the log over into the file.
-        error = draw.choice((errno.ENOSPC, errno.EIO))
+        error = draw.choice((errno.ENOSPC, errno.EIO, errno.EROFS))
         # The first is one that the sender notices: in the log.
         kind, within = draw.choice(tuple(enumerate(WITHIN))) if kinds else (0, WITHIN[0])
         disk.faulty_fail(kind, draw.randrange(within), draw.choice((1, 1, 3, 25)), error)

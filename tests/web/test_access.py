@@ -15,6 +15,7 @@ from sqlalchemy import text
 from service import access
 from service import access as sessions
 from service.app.factory import open_app
+from service.errors import Unauthenticated
 from service.storage.recording.ids import Ulids
 from service.times import shifted, utc_now
 from service.web import event_stream as live
@@ -414,6 +415,60 @@ def test_a_session_without_a_host_changes_nothing_and_reads(guarded, host):
     assert status(b"DELETE /api/v1/zones", b"Origin: http://127.0.0.1\r\n") == b"403"
     assert status(b"DELETE /api/v1/zones", b"Sec-Fetch-Site: same-origin\r\n") == b"200"
     assert status(b"GET /api/v1/session") == status(b"GET /") == b"200"
+
+
+def test_a_cookie_is_secure_where_a_trusted_proxy_has_tls(guarded):
+    def begin(client, **headers):
+        asked = {"token": guarded.all}
+        begun = client.post("/api/v1/session", json=asked, headers=headers)
+        begun.raise_for_status()
+        return "secure" in begun.headers["Set-Cookie"].lower().split("; ")
+
+    own = f"https://{guarded.url.partition('://')[2]}"
+    # From another address than the trusted proxies, which are on this one.
+    transport = httpx.HTTPTransport(local_address="127.0.0.2")
+    with (
+        httpx.Client(base_url=guarded.url, timeout=60) as proxy,
+        httpx.Client(base_url=guarded.url, timeout=60, transport=transport) as stranger,
+    ):
+        told = {"X-Forwarded-Proto": "https", "X-Forwarded-For": "192.0.2.1"}
+        assert begin(proxy, **told)
+        cookie = {"Cookie": f"{COOKIE}={proxy.cookies.get(COOKIE)}"}
+        changed = proxy.delete("/api/v1/zones", headers=told | cookie | {"Origin": own})
+        assert changed.status_code == 200
+        assert not begin(proxy)
+        assert not begin(stranger, **told)
+
+
+def test_sessions_and_tokens_end_by_clocks_that_jump_and_none_lives_on(guarded, monkeypatch):
+    held, ahead_s = guarded.app.access, 0.0
+    monkeypatch.setattr(held, "_now", lambda: shifted(utc_now(), ahead_s))
+    token = guarded.token("of clocks", "read", days=1)
+
+    def is_known(*, by_token=None, session=None):
+        held.forget()
+        try:
+            held.caller(by_token, session)
+        except Unauthenticated:
+            return False
+        return True
+
+    session, _ = held.sign_in(token)
+    for ahead_s, token_lives, session_lives in (
+        (0.0, True, True),
+        (11.9 * 3_600, True, True),
+        (12.1 * 3_600, True, False),
+        (86_401.0, False, False),
+        # Back again: what had not ended by the right clock has not ended.
+        (0.0, True, True),
+        (-240.0, True, True),
+        # What a clock a year ahead began does not last for a year.
+        (-86_400.0 * 365, True, False),
+    ):
+        assert is_known(by_token=token) == token_lives, ahead_s
+        assert is_known(session=session) == session_lives, ahead_s
+    ahead_s = 0.0
+    assert is_known(session=session)
 
 
 @pytest.mark.parametrize("by", ["token", "session"])

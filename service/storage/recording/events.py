@@ -284,7 +284,13 @@ class HeardEvents:
     def _run(self) -> None:
         import psycopg
 
-        engine = create_engine(self._url, poolclass=NullPool, isolation_level="AUTOCOMMIT")
+        engine = create_engine(
+            self._url,
+            poolclass=NullPool,
+            isolation_level="AUTOCOMMIT",
+            # One that was cut cannot be reset.
+            pool_reset_on_return=None,
+        )
         while not self._closed.is_set():
             try:
                 with engine.connect() as connection:

@@ -13,7 +13,7 @@ import sqlite3
 import subprocess
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 
 from sqlalchemy import URL, inspect
@@ -51,10 +51,12 @@ def back_up(
         raise BadConfiguration(f"{target}: exists already; choose another file")
     if not target.absolute().parent.is_dir():
         raise BadConfiguration(f"{target}: there is no such folder")
-    with reading(database) as connection:
+    head = None
+    # What cannot be read cannot be copied either, which is said below.
+    with suppress(BadConfiguration), reading(database) as connection:
         # Earlier versions had none.
-        has_heads = inspect(connection).has_table(record_heads.name)
-        head = newest_head(connection) if has_heads else None
+        if inspect(connection).has_table(record_heads.name):
+            head = newest_head(connection)
     with _part_of(target) as part:
         if url.drivername == "sqlite":
             _copy_sqlite(Path(url.database or ""), part, step)

@@ -77,18 +77,28 @@ def verify(
     if not dialect_of(engine).is_shared:
         sa.event.listen(engine, "connect", _read_any_text)
     with disposed(engine), reported(url):
-        found = list(_of_the_file(engine))
-        # The content of a damaged file is not evidence of what was written.
-        if not found:
-            found += _of_the_references(engine)
-            found += _of_the_batches(engine, step)
-            found += _of_the_missions(engine)
-            found += _of_the_seals(engine)
-            found += faults_of_the_chain(engine, public_key, anchors)
-            found += _of_the_trends(engine)
-            found += _of_the_gyro_blocks(engine)
-            found += _of_the_archived(engine)
-            found += _of_the_grades(engine)
+        return faults_in(engine, step, public_key, anchors)
+
+
+def faults_in(
+    engine: sa.Engine,
+    step: Step = lambda done, total: None,
+    public_key: PublicKey | None = None,
+    anchors: Sequence[Anchor] = (),
+) -> list[str]:
+    """The faults of a database with the schema of this version, a sentence each."""
+    found = list(_of_the_file(engine))
+    # The content of a damaged file is not evidence of what was written.
+    if not found:
+        found += _of_the_references(engine)
+        found += _of_the_batches(engine, step)
+        found += _of_the_missions(engine)
+        found += _of_the_seals(engine)
+        found += faults_of_the_chain(engine, public_key, anchors)
+        found += _of_the_trends(engine)
+        found += _of_the_gyro_blocks(engine)
+        found += _of_the_archived(engine)
+        found += _of_the_grades(engine)
     return found
 
 
