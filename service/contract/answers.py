@@ -204,7 +204,7 @@ class Rival(Record, frozen=True, kw_only=True):
     probability: Annotated[float, doc("Its probability, relative to the first attitude.")]
     angle_deg: Annotated[float, doc("The rotation between the two attitudes.")]
     stars: list[list[str | None]]
-    """For each tracker, its stars in the order observed; null for a star that is not in the
+    """The stars of each tracker in the order observed; null for a star that is not in the
     group."""
 
 
@@ -311,7 +311,7 @@ class Answer(Record, frozen=True, kw_only=True):
     parent: Id | UnsetType | None = UNSET
     """Only for a what-if: the result that it started from."""
     recorded: Annotated[
-        bool | UnsetType, Absent(True), doc("For a what-if: whether it was recorded.")
+        bool | UnsetType, Absent(True), doc("True if this what-if was recorded.")
     ] = UNSET
     frame: FrameSummary | UnsetType | None = UNSET
     """Only for a batch that was made from a frame."""
@@ -364,7 +364,7 @@ class Summary(Record, frozen=True, kw_only=True):
     status: Annotated[Status | None, doc("Status of the attitude; null without an attitude.")]
     reason: Reason | None
     measures: Measures
-    parent: Annotated[Id | None, doc("For a what-if: the result that it started from.")]
+    parent: Annotated[Id | None, doc("The result that a what-if started from.")]
     current: Annotated[bool, doc("True if this is the current result of its batch.")]
     archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
 

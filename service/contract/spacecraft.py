@@ -132,8 +132,8 @@ class History(Record, frozen=True, kw_only=True):
     run: str
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
     not_split: Annotated[bool | UnsetType, Absent(False)] = UNSET
-    """With `tracker`: true while older batches of the run are not split by tracker yet, and so are
-    missing here."""
+    """True while older batches of the run are not split by tracker yet, and so are missing here;
+    only with `tracker`."""
     start: Moment | None
     end: Moment | None
     strategy: Literal["minmax", "latest"]
@@ -165,7 +165,7 @@ class Ranking(Record, frozen=True, kw_only=True):
     by: QuantityName
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
     not_split: Annotated[bool | UnsetType, Absent(False)] = UNSET
-    """With `tracker`: true while older batches are not split by tracker."""
+    """True while older batches are not split by tracker; only with `tracker`."""
     items: list[RankedBatch]
 
 

@@ -157,8 +157,7 @@ class Rival(Model, frozen=True, kw_only=True):
     angle_deg: float
     """The rotation between the two attitudes."""
     stars: Sequence[Sequence[str | None]]
-    """For each tracker, its stars in the order observed; None for a star that is not in the
-    group."""
+    """The stars of each tracker in the order observed; None for a star that is not in the group."""
 
 
 class Attitude(Model, frozen=True, kw_only=True):
@@ -263,7 +262,7 @@ class WhatIf(Model, frozen=True, kw_only=True):
     parent: str | None = None
     """Only for a what-if: the result that it started from."""
     recorded: bool = True
-    """For a what-if: whether it was recorded."""
+    """True if this what-if was recorded."""
     frame: FrameSummary | None = None
     """Only for a batch that was made from a frame."""
     tracking: Tracking | None = None
@@ -297,7 +296,7 @@ class Summary(Model, frozen=True, kw_only=True):
     reason: str | None
     measures: dict[str, float | None]
     parent: str | None
-    """For a what-if: the result that it started from."""
+    """The result that a what-if started from."""
     current: bool
     """True if this is the current result of its batch."""
     archived: bool

@@ -106,8 +106,8 @@ class History(Tabulated, frozen=True, kw_only=True):
     tracker: str | None = None
     """If the request names one."""
     not_split: bool = False
-    """With `tracker`: true while older batches of the run are not split by tracker yet, and so are
-    missing here."""
+    """True while older batches of the run are not split by tracker yet, and so are missing here;
+    only with `tracker`."""
     start: str | None
     end: str | None
     strategy: str
@@ -141,7 +141,7 @@ class Ranking(Model, frozen=True, kw_only=True):
     tracker: str | None = None
     """If the request names one."""
     not_split: bool = False
-    """With `tracker`: true while older batches are not split by tracker."""
+    """True while older batches are not split by tracker; only with `tracker`."""
     items: Sequence[RankedBatch]
 
 
