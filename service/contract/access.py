@@ -54,7 +54,9 @@ class AuditEntry(Record, frozen=True, kw_only=True):
     about: Annotated[str, doc("Path and query of the request.")]
     body: Annotated[str | None, doc("The body of the request; of a long one, the beginning.")]
     status: Annotated[int | None, doc("Status of the answer; null for an action of a command.")]
-    person: Annotated[str, doc("The name that signed the request; without a signature the token's name.")]
+    person: Annotated[
+        str, doc("The name that signed the request; without a signature the token's name.")
+    ]
     reason: Annotated[str | None, doc("The comment or the note that was sent with it.")]
 
 

@@ -291,6 +291,17 @@ def test_a_projection_whose_statement_is_wrong_holds_up_no_other(app, make, monk
     assert rates.batches == 3
 
 
+def test_projections_go_on_after_a_turn_that_could_not_read_the_record(
+    app, make, monkeypatch, caplog
+):
+    with monkeypatch.context() as patch:
+        patch.setattr(projecting, "recorded_after", lambda *_: 1 / 0)
+        app.submissions.submit(make("first"))
+        wait_until(lambda: "the record could not be projected" in caplog.text, 30.0)
+    app.submissions.submit(make("second", after_s=60.0))
+    wait_until(lambda: [each.batches for each in app.spacecraft.rates("XTE")] == [2], 30.0)
+
+
 def test_what_is_left_when_the_service_ends_is_projected_by_the_next(database, make, monkeypatch):
     settings = Settings(database=database, replay_processes=0)
     with monkeypatch.context() as patch:

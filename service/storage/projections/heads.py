@@ -1,7 +1,7 @@
-"""Heads of the record: the last projection of a turn binds what is new into the chain.
+"""Heads of the record: after a turn, the projector binds what is new into the chain.
 
-A head is made once a minute, or as soon as there are many new leaves, in the projector's
-transaction.  Results that have no leaf yet, of a database of an earlier version, get theirs here,
+A head is made once a minute, or as soon as there are many new leaves, in a transaction of its
+own.  Results that have no leaf yet, of a database of an earlier version, get theirs here,
 some at a time.
 """
 

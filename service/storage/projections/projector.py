@@ -110,6 +110,8 @@ EVERY_S = 0.2
 """The time between the beginnings of two turns, unless a reader waits."""
 GAP_S = 0.01
 """The pause before a gap in the record is looked at again."""
+RETRY_S = 1.0
+"""The pause after a turn that failed."""
 HOURS_AT_ONCE = 24
 """The hours of trends that are counted anew in one transaction."""
 CLOSE_S = 5.0
@@ -174,7 +176,13 @@ class Projector:
     def _run(self) -> None:
         while not self._closing.is_set():
             begun_s = time.monotonic()
-            step = self._turn()
+            try:
+                step = self._turn()
+            except Exception:
+                # Without this thread, nothing would be projected until the service ends.
+                log.exception("the record could not be projected")
+                self._closing.wait(RETRY_S)
+                continue
             if self._is_head_due():
                 self._try_to_make_heads(1)
             if step is None or step.is_all:
