@@ -20,7 +20,7 @@ from service.features.advice import trackers
 from service.features.advice.evidence import evidence_of, merged
 from service.features.advice.tolerances import ToleranceFinding, tolerance_findings
 from service.identify.identification import Identification
-from service.missions.mission import Identifier, Mission
+from service.missions.mission import Band, Identifier, Mission
 from service.observations.batch import ObservationBatch
 
 PRESENT = "present settings"
@@ -149,10 +149,14 @@ def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> In
     return Interval(100.0 * change, 100.0 * (change - half), 100.0 * (change + half))
 
 
-EVIDENCE_SHARE = 0.4
-"""The share of the time in which evidence is collected; the rest is for trials."""
+EVIDENCE_SHARE, TRIALS_SHARE = 0.4, 0.7
+"""The shares of the time until evidence is collected, and other mission settings are tried."""
+LARGEST_ZONE_DEG = 80.0
 
 RunAgain = Callable[[ObservationBatch], Acquisition]
+RunWith = Callable[[Mission, ObservationBatch], Acquisition]
+MOST_WITH_MISSION = 60
+"""Batches that are run again with another mission file."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +204,7 @@ def advise(
     run_freely: RunAgain,
     own: Mapping[str, float] | None = None,
     pace: WorkLimit | None = None,
+    run_with: RunWith | None = None,
 ) -> Findings:
     """The advice that batches of a mission give; `run` acquires one batch within its zones.
 
@@ -207,7 +212,8 @@ def advise(
     outside its zones fits there by chance alone, and as well in a mirror.
 
     Batches should come in random order: when time runs out, the rest are
-    left out.  `own` are additional tolerances to try.
+    left out.  `own` are additional tolerances to try.  `run_with` acquires a batch with other
+    settings of the mission: verified identification, which uses no tolerances, is tried with them.
     """
     pace = pace or WorkLimit()
     sample = _SampledBatches()
@@ -230,6 +236,12 @@ def advise(
                 sample.mirrored += any(each.identification.mirrored for each in freely)
         pace.step()
     evidence = merged(parts)
+    uses_voting = any(
+        (batch.options.identifier or mission.identifier) == "starid" for batch, *_ in sample.cases
+    )
+    of_mission: list[VariantOutcome] = []
+    if mission.identifier == "verified" and run_with is not None:
+        of_mission = list(_mission_trials(mission, sample, run_with, pace))
     tolerances = tuple(tolerance_findings(mission, evidence))
     return Findings(
         mission=mission,
@@ -239,13 +251,13 @@ def advise(
         noise=tuple(trackers.noise_findings(mission, evidence)),
         magnitudes=tuple(trackers.magnitude_findings(mission, evidence)),
         alignment=tuple(trackers.alignment_findings(mission, evidence)),
-        trials=tuple(_trials(tolerances, sample, run, own or {}, pace)),
+        trials=(
+            *_trials(tolerances if uses_voting else (), sample, run, own or {}, pace),
+            *of_mission,
+        ),
         refused=sample.refused,
         refusal=sample.refusal,
-        uses_voting=any(
-            (batch.options.identifier or mission.identifier) == "starid"
-            for batch, *_ in sample.cases
-        ),
+        uses_voting=uses_voting,
         with_rival=sample.with_rival,
         mirrored=sample.mirrored,
     )
@@ -294,3 +306,45 @@ def _trials(
         variant_outcome(by_probability, [found for *_, found in sample.cases], None),
         *(variant_outcome(each, counts[each], counts[present]) for each in others),
     ]
+
+
+def mission_variants(mission: Mission) -> Iterator[tuple[str, Mission]]:
+    """Other values of the settings that act under verified identification, with their names."""
+    settings = mission.model_dump()
+    for factor in (0.5, 2.0, 5.0):
+        trackers = [
+            each | {"sigma_arcsec": factor * each["sigma_arcsec"]} for each in settings["trackers"]
+        ]
+        yield (
+            f"sigma_arcsec times {factor:g}",
+            Mission.model_validate(settings | {"trackers": trackers}),
+        )
+    name = "half_width_deg" if isinstance(mission.zone, Band) else "radius_deg"
+    for factor in (0.75, 1.5):
+        value = min(factor * settings["zone"][name], LARGEST_ZONE_DEG)
+        zone = settings["zone"] | {name: value}
+        yield f"zone.{name} = {value:.3g}", Mission.model_validate(settings | {"zone": zone})
+
+
+def _mission_trials(
+    mission: Mission, sample: "_SampledBatches", run_with: RunWith, pace: WorkLimit
+) -> Iterator[VariantOutcome]:
+    """The outcomes of the batches with other settings of the mission, one setting at a time."""
+    cases = [
+        case
+        for case in sample.cases[:MOST_WITH_MISSION]
+        if (case[0].options.identifier or mission.identifier) == "verified"
+    ]
+    for name, other in mission_variants(mission):
+        variant = Variant(name, "verified")
+        counts, present = [], []
+        for batch, sure, found in cases:
+            if not pace.in_time(TRIALS_SHARE):
+                break
+            try:
+                counts.append(trial_counts(run_with(other, variant.of(batch)), sure))
+            except BadInput:
+                continue
+            present.append(found)
+        if counts:
+            yield variant_outcome(variant, counts, present)

@@ -1,17 +1,22 @@
 """The page of advice."""
 
+import re
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlencode
 
+from markupsafe import Markup, escape
 from pydantic import model_validator
 from starlette.responses import Response
 
-from service.features.advice.part import AdviceService, no_changes_text
+from service.features.advice.part import AdviceService, best_setting, no_changes_text
 from service.features.advice.routes import ADVICE_LIMIT_S, MAX_SAMPLE, AdviceQuery
 from service.missions.mission import Tolerances
 from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.requests.access import Policy
+
+FIRST_SAMPLE, FIRST_LIMIT_S = 60, 1.5
+"""Batches and seconds of the first answer; the page offers a larger sample."""
 
 
 class AdviceForm(AdviceQuery):
@@ -26,17 +31,44 @@ class AdviceForm(AdviceQuery):
         return filled
 
 
+def with_settings(text: str) -> Markup:
+    """A sentence that names settings, with the paper's symbols as their tooltips."""
+    named = re.compile(r"\b([A-Z0-9]+) \(([a-z_.]+)\)")
+    marked = named.sub(r'<abbr title="\1 in Fink &amp; Shoup (1994)">\2</abbr>', str(escape(text)))
+    return Markup(marked.replace(" (NTOT)", ""))
+
+
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
 def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
     """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
+    is_first = "sample" not in query.model_fields_set and not query.tolerance
+    asked = query.asked() | ({"sample": FIRST_SAMPLE} if is_first else {})
     advice = context.app.part(AdviceService).of_spacecraft(
-        name, **query.asked(), limit_s=ADVICE_LIMIT_S
+        name, **asked, limit_s=FIRST_LIMIT_S if is_first else ADVICE_LIMIT_S
     )
+    found = (
+        advice.groups
+        + advice.zone
+        + advice.tolerances
+        + advice.noise
+        + advice.magnitudes
+        + advice.alignment
+        + advice.innovations
+    )
+    used = [each for each in found if getattr(each, "verdict", "") != "not_used"]
     return context.rendered(
         "advice.html.jinja",
         query.run,
         advice=advice,
         query=query,
+        is_first=is_first,
+        with_settings=with_settings,
+        best=best_setting(advice),
+        to_do=[each for each in used if each.action not in ("keep", "wait")],
+        to_keep=[each for each in used if each.action in ("keep", "wait")],
+        tried=[
+            each for each in advice.tried if query.tolerance or each.identifier == advice.identifier
+        ],
         asked=urlencode(
             {name: getattr(query, name) for name in sorted(query.model_fields_set)}, doseq=True
         ),

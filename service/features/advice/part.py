@@ -4,8 +4,10 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
+from service.acquire import Acquisition
 from service.acquire.choices import idle_reason
 from service.advice.intervals import Interval
 from service.app.context import Context
@@ -14,6 +16,7 @@ from service.app.zones import Zones
 from service.errors import BadInput, Busy, Fault
 from service.features.advice import records
 from service.features.advice.advice import Findings, VariantOutcome, WorkLimit, advise
+from service.features.advice.causes import Part, StarTable, causes, common_rivals, parts, star_table
 from service.features.advice.innovations import (
     InnovationFinding,
     innovation_findings,
@@ -36,17 +39,41 @@ from service.features.advice.trackers import (
     NoisePeriod,
 )
 from service.ingest.submit import SubmissionService
+from service.missions.mission import Mission
+from service.observations.batch import ObservationBatch
 from service.observations.schema import TolerancesIn
 from service.storage.grades.period import latest_innovations
 from service.storage.queries.pages import ResultFilter
+from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches
+from service.storage.queries.time_buckets import BucketFilter
 from service.storage.recording.unsaved_result import LIVE
-from service.times import Utc
+from service.times import DAY_S, Utc, recorded_utc, shifted
 
 ADVICE_SAMPLE = 200
 """Gives a sigma to about five percent; these batches are processed again in seconds."""
 ADVICE_RETRY_S = 10
 NO_TOLERANCES = TolerancesIn()
+CAUSES_SAMPLE = 300
+"""Batches of each period whose recorded answers are read for causes: less than half a second."""
+
+
+@dataclass(frozen=True)
+class Ambiguity:
+    """Ambiguous stars of a period by parts beside an earlier period, their causes and rivals."""
+
+    parts: list[Part]
+    causes: list[records.Cause]
+    rivals: list[tuple[str, int]]
+    batches: int
+    total: int
+    unmatched: float
+    unmatched_before: float | None
+
+    @property
+    def ambiguous(self) -> int:
+        """How many stars of the period are ambiguous."""
+        return round(self.parts[0].stars * self.parts[0].share.value)
 
 
 class AdviceService:
@@ -60,6 +87,31 @@ class AdviceService:
 
     def close(self) -> None:
         """Nothing is open."""
+
+    def ambiguity(
+        self, name: str, run: str, start: Utc, end: Utc, earlier_s: float = DAY_S
+    ) -> Ambiguity:
+        """Why stars of a period are ambiguous, beside the period some seconds before it."""
+        now = self._stars(name, run, start, end)
+        before = self._stars(name, run, shifted(start, -earlier_s), shifted(end, -earlier_s))
+        earlier = before if before.batches else None
+        return Ambiguity(
+            parts=parts(now, earlier),
+            causes=causes(now, earlier),
+            rivals=common_rivals(now),
+            batches=now.batches,
+            total=now.total,
+            unmatched=now.share_of("m"),
+            unmatched_before=None if earlier is None else earlier.share_of("m"),
+        )
+
+    def _run_with(self, mission: Mission, batch: ObservationBatch) -> Acquisition:
+        return self._submissions.run_again(batch, mission.within_zones)
+
+    def _stars(self, name: str, run: str, start: Utc, end: Utc) -> StarTable:
+        with self._context.reading() as connection:
+            sample = sample_period(connection, BucketFilter(name, run, start, end), CAUSES_SAMPLE)
+        return star_table(sample, self._context.sky)
 
     def of_spacecraft(
         self,
@@ -98,12 +150,21 @@ class AdviceService:
             # Without the search of the whole sky, which would hide faults of the settings.
             run_again = partial(self._submissions.run_again, mission=mission.within_zones)
             run_freely = partial(self._submissions.run_again, mission=mission)
-            findings = advise(mission, drawn.batches, run_again, run_freely, own, pace)
+            findings = advise(
+                mission, drawn.batches, run_again, run_freely, own, pace, self._run_with
+            )
             zone = zone_statements(mission, *self._zones.advised_size(name, run))
         finally:
             self._lock.release()
         noise = innovation_findings(innovation_noise(met), mission, findings.noise)
-        return advice_record(name, run or LIVE, drawn, findings, zone, noise)
+        found: list[records.Cause] = []
+        if drawn.first and drawn.last:
+            last = shifted(recorded_utc(drawn.last), 1.0)
+            first = max(
+                start or recorded_utc(drawn.first), shifted(last, -DAY_S), key=lambda t: t.tai_ns
+            )
+            found = self.ambiguity(name, run or LIVE, first, end or last).causes
+        return advice_record(name, run or LIVE, drawn, findings, zone, noise, found)
 
 
 def advice_record(
@@ -113,6 +174,7 @@ def advice_record(
     findings: Findings,
     zone: Sequence[Statement],
     innovations: Sequence[InnovationFinding] = (),
+    causes: Sequence[records.Cause] = (),
 ) -> records.Advice:
     """The findings with their figures and sentences, the trials, and the lines to change."""
     tolerances = [(each, tolerance_statement(each, findings)) for each in findings.tolerances]
@@ -136,6 +198,7 @@ def advice_record(
         refusal=findings.refusal,
         mission=findings.mission.digest,
         identifier=findings.mission.identifier,
+        causes=list(causes),
         groups=[
             records.GroupAdvice(action=each.action, text=each.text)
             for each in group_statements(findings)
@@ -288,6 +351,30 @@ def no_changes_text(advice: records.Advice) -> str:
     if "wait" in actions:
         return "The batches so far give no reason to change the mission file."
     return "The mission file needs no change."
+
+
+def best_setting(advice: records.Advice) -> tuple[records.Trial, records.Trial] | None:
+    """The present settings, and the one setting that leaves the fewest stars ambiguous instead.
+
+    Of those of the identifier in use; None where none certainly leaves fewer, or it leaves more
+    stars unmatched instead.
+    """
+    own = [each for each in advice.tried if each.identifier == advice.identifier and each.observed]
+    present = next((each for each in own if each.change_points is None), None)
+    if present is None:
+        return None
+    better = [
+        each
+        for each in own
+        if each.change_points is not None
+        and each.change_points.high is not None
+        and each.change_points.high < 0.0
+        and len(each.tolerances) <= 1
+        and each.ambiguous * present.observed < present.ambiguous * each.observed
+    ]
+    if not better:
+        return None
+    return present, min(better, key=lambda each: (each.ambiguous + each.unmatched) / each.observed)
 
 
 def open_part(app: App) -> AdviceService:

@@ -152,6 +152,19 @@ class Change(Record, frozen=True, kw_only=True):
     line: str
 
 
+class Cause(Record, frozen=True, kw_only=True):
+    """A cause of ambiguous or unmatched stars, by recorded answers."""
+
+    batches: Annotated[Count, doc("Batches of the sample with such stars that it explains.")]
+    text: Text
+    evidence: Annotated[str, doc("The figures, beside those of the day before.")]
+    remedy: Annotated[str, doc("What to do.")]
+    effect: Annotated[str, doc("The share of the stars that it concerns.")]
+    over_since: Annotated[
+        Moment | None, doc("Time of the last such batch of a cause that is over.")
+    ]
+
+
 class Advice(Record, frozen=True, kw_only=True):
     """Recommended settings of a mission, from recorded batches."""
 
@@ -166,6 +179,7 @@ class Advice(Record, frozen=True, kw_only=True):
     refusal: str | None
     mission: Digest
     identifier: Identifier
+    causes: Annotated[list[Cause], doc("Those that explain the most batches first.")]
     groups: list[GroupAdvice]
     """Findings on batches in which two groups of stars give two attitudes, and on mirrored
     batches."""

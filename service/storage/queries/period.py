@@ -37,11 +37,12 @@ from service.vectors import Matrix, Vector
 MOST_READ = 600
 """Batches that are read in full: their stars take less than a second."""
 
-_SHOWN: Select[tuple[str, str, int, str, str]] = select(
+_SHOWN: Select[tuple[str, str, int, str, float | None, str]] = select(
     results.c.answer,
     results.c.mission_digest,
     results.c.time_ns,
     results.c.batch_id,
+    results.c.a_priori_angle_deg,
     batches.c.input,
 ).join_from(results, batches, results.c.batch_id == batches.c.id)
 _FROM_NS = bindparam("from_ns", type_=BigInteger)

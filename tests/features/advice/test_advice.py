@@ -415,7 +415,7 @@ def test_where_time_runs_out_fewer_batches_are_looked_at_and_the_answer_says_so(
 ):
     steps = []
     pace = WorkLimit(lambda share: len(steps) < 20 * share, lambda: steps.append(1))
-    mission = missions["XTE"]
+    mission = missions["XTE"].model_copy(update={"identifier": "starid"})
     advice = advice_from(mission, sky, flown(mission, sky, 40, seed).batches, pace=pace)
     assert advice.sampled == 8
     assert {t.batches for t in advice.trials if t.variant.identifier == "starid"} == {8}

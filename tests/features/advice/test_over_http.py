@@ -67,7 +67,7 @@ def test_the_page_says_it_in_words_and_is_whole(address, full_run):
     tags = [tag for tag, _ in Markup(answer.text).elements]
     assert tags.count("section") == 1
     assert "20 of 20 batches processed again" in answer.text
-    assert "SEPTOL (separation_deg)" in answer.text
+    assert ">zone.radius_deg</abbr>" in answer.text
     assert "default-src 'none'" in answer.headers["content-security-policy"]
 
 

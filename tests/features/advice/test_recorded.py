@@ -120,6 +120,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
         lambda b: acquire(b, mission.within_zones, sky),
         lambda b: acquire(b, mission, sky),
         {"separation_deg": 0.01},
+        run_with=lambda other, b: acquire(b, other.within_zones, sky),
     )
     about = ("spacecraft", "run", "first", "last", "batches_in_range")
     assert [getattr(found, name) for name in about] == [
@@ -137,7 +138,7 @@ def test_the_advice_is_that_of_the_batches_themselves_and_changes_nothing(
     assert [(each["subject"], each["action"]) for each in given["innovations"]] == [
         ("gyro", "wait")
     ]
-    assert _rounded(given | {"innovations": []}) == _rounded(expected)
+    assert _rounded(given | {"innovations": [], "causes": []}) == _rounded(expected)
 
 
 def _rounded(thing):

@@ -46,6 +46,8 @@ Range = Annotated[
     str, Field(pattern=rf"^({'|'.join(RANGES_S)}|[1-9][0-9]{{0,3}}({'|'.join(UNITS_S)}))$")
 ]
 """The length of a period that ends with the latest batch: by its name, or such as `6h`."""
+BEFORE_S = {"day": DAY_S, "week": 7 * DAY_S}
+"""How much earlier a period is that another is compared with."""
 WORST, LATEST = 10, 10
 MOST_BESIDE = 4
 Vertical = Literal["robust", "all", "log", "hold"]
@@ -163,6 +165,7 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
     drawn_limits: list[DrawnLimits] = context.panels(
         "spacecraft_page", name, query.run, query.tracker, stretch
     )
+    before = _before(name, query, stretch)
     return context.rendered(
         "spacecraft.html.jinja",
         query.run,
@@ -184,7 +187,8 @@ def spacecraft_page(name: str, query: FromQuery[SpacecraftQuery], context: Conte
         worst=ranking.items,
         limits=[limit for drawn in drawn_limits for limit in drawn.limits],
         query=query,
-        before=_before(name, query, stretch),
+        before=before,
+        why=context.panels("ambiguity", name, query.run, stretch, before) if before else [],
         vertical=VERTICAL,
         others=_others(context, query, stretch),
         spacecraft=[each for each in context.spacecraft if each != name],
@@ -293,7 +297,7 @@ class PeriodBefore:
 def _before(name: str, query: SpacecraftQuery, shown: ShownPeriod | None) -> PeriodBefore | None:
     if shown is None or not query.before:
         return None
-    shift_s = RANGES_S[query.before]
+    shift_s = BEFORE_S[query.before]
     start, end = (shifted(each, -float(shift_s)) for each in (shown.start, shown.end))
     return PeriodBefore(history_address(name, query.run, query.tracker, start, end), shift_s)
 
@@ -313,13 +317,14 @@ def _changes(
     query: SpacecraftQuery,
     stretch: ShownPeriod | None,
 ) -> list[Change]:
-    """The changes of settings within a period of live batches, whose times follow the clock."""
+    """The changes of settings within a period of live batches, and within that before it."""
     if stretch is None or query.run != LIVE:
         return []
+    earliest_ns = stretch.start.tai_ns - BEFORE_S.get(query.before, 0) * 10**9
     adopted = {each.adopted[:19]: each for each in context.app.adoptions.in_force(name).history}
     found = []
     for each in history[1:]:
-        if not stretch.start.tai_ns <= recorded_utc(each.since).tai_ns < stretch.end.tai_ns:
+        if not earliest_ns <= recorded_utc(each.since).tai_ns < stretch.end.tai_ns:
             continue
         adoption = adopted.get(each.since[:19])
         what = "Settings changed with the mission file"

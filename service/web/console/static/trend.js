@@ -241,7 +241,7 @@ export class Trend {
     this.holder.replaceChildren();
     // A chart without a value is not drawn, but for the first one of the page.
     const section = this.holder.closest("section");
-    section.hidden = !known.length && section.previousElementSibling !== null;
+    section.hidden = !known.length && section.closest("details") !== null;
     if (!known.length) {
       const note = document.createElement("p");
       note.className = "chart-note";

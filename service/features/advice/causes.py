@@ -1,0 +1,513 @@
+"""Causes of ambiguous and unmatched stars, from the recorded answers of a period.
+
+A period is compared with an earlier one, where that has batches.  Nothing is identified again:
+the stars of solved batches are compared with the catalog at the recorded attitude.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from service.acquire.choices import aberration_velocity
+from service.advice.intervals import Interval, share_of
+from service.contract.answers import Answer
+from service.features.advice.records import Cause
+from service.missions.mission import Band, Mission
+from service.observations.batch import ObservationBatch
+from service.observations.calibrate import CorrectedObservations, correct
+from service.observations.schema import submission_from_json
+from service.sky.catalog.run_catalog import RunCatalog
+from service.sky.ephemeris import apparent
+from service.sky.model import SkyModel
+from service.storage.queries.period import PeriodSample
+from service.storage.queries.results import answer_from_json
+from service.storage.queries.star_field import presumed_attitude
+from service.times import unix_seconds, utc_of_unix
+from service.vectors import (
+    ARCSEC_PER_RADIAN,
+    Matrix,
+    Vector,
+    angle_between_deg,
+    matrix_from_quaternion,
+)
+
+NEAR_DEG = 0.1
+"""A catalog star farther from an observed one is another star."""
+SURROUNDINGS_DEG = 10.0
+"""Radius in which catalog stars are counted for the density of a field."""
+RADIAL_MEDIAN = 1.1774
+"""Median radial error over the standard deviation per axis."""
+NOISY, DENSER, FEWER, FAR = 1.5, 1.4, 0.75, 1.5
+"""Ratios to the earlier period from which noise, density, numbers of stars and angles differ."""
+BRIGHTER_MAG, OFFSET_MAG = 0.4, 0.25
+FITTING_SHARE = 0.6
+"""Stars near one of the catalog, of a batch whose attitude is right."""
+LEAST_STARS, LEAST_BATCHES = 20, 5
+FALSE_SHARE = 0.02
+OVER_SHARE, OVER_BATCHES = 0.1, 6
+"""A cause is over if so much of the period, and so many batches, follow without it."""
+COMMON = 5
+
+Flags = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class StarTable:
+    """Observed stars (n) of a sample of batches (b) with trackers (t).
+
+    `outcome` (n,) is u, a or m: unique, ambiguous, unmatched.  `offset_sigmas` is the distance
+    to the nearest catalog star, NaN without an attitude and inf beyond `NEAR_DEG`;
+    `offset_mag` is observed minus catalog.  `density` (b, t) counts the catalog stars near
+    each boresight.  `room_deg` (b,) is the a priori error that the zone leaves room for.
+    """
+
+    total: int
+    trackers: tuple[str, ...]
+    time_ns: npt.NDArray[np.int64]
+    solved: Flags
+    a_priori_deg: Vector
+    room_deg: Vector
+    density: Vector
+    batch: npt.NDArray[np.int64]
+    tracker: npt.NDArray[np.int64]
+    outcome: npt.NDArray[np.str_]
+    magnitude: Vector
+    off_axis: Vector
+    """Angle from the boresight over the radius of the field of view."""
+    offset_sigmas: Vector
+    offset_mag: Vector
+    rivals: tuple[tuple[str, ...], ...]
+
+    @property
+    def batches(self) -> int:
+        """The number of batches in the sample."""
+        return len(self.time_ns)
+
+    @property
+    def ambiguous(self) -> Flags:
+        """The ambiguous stars."""
+        return np.asarray(self.outcome == "a")
+
+    def share(self, of: Flags | None = None) -> float:
+        """The share of ambiguous stars, of all or of some; NaN without any."""
+        chosen = self.ambiguous if of is None else self.ambiguous[of]
+        return float(chosen.mean()) if len(chosen) else float("nan")
+
+    def share_of(self, outcome: str) -> float:
+        """The share of the stars with an outcome."""
+        return float(np.mean(self.outcome == outcome)) if len(self.outcome) else 0.0
+
+    def reported(self, tracker: int) -> Vector:
+        """How many stars (b,) a tracker reported in each batch."""
+        own = self.batch[self.tracker == tracker]
+        return np.bincount(own, minlength=self.batches).astype(float)
+
+    def noise(self, tracker: int) -> float:
+        """The noise of a tracker over its sigma, robustly; NaN with too few stars."""
+        own = (self.tracker == tracker) & np.isfinite(self.offset_sigmas)
+        if np.count_nonzero(own) < LEAST_STARS:
+            return float("nan")
+        return float(np.median(self.offset_sigmas[own])) / RADIAL_MEDIAN
+
+
+def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
+    """The stars of a sample of batches."""
+    names = tuple(dict.fromkeys(t.name for m in sample.missions.values() for t in m.trackers))
+    count = len(sample.rows)
+    density = np.full((count, len(names)), np.nan)
+    room_deg = np.full(count, np.nan)
+    columns: list[list[Any]] = [[] for _ in range(7)]
+    rivals, solved = [], []
+    for place, row in enumerate(sample.rows):
+        mission = sample.missions[row["mission_digest"]]
+        batch = submission_from_json(row["input"]).batch
+        answer = answer_from_json(row["answer"])
+        solved.append(answer.attitude is not None and answer.attitude.status == "good")
+        room_deg[place] = _room_deg(mission)
+        catalog = sky.run_catalog(mission, batch.time)
+        seen_by = correct(batch, mission) if answer.observations else ()
+        presumed = presumed_attitude(batch, answer, mission)
+        attitude = None if presumed is None else presumed.attitude
+        if answer.attitude is not None:
+            attitude = matrix_from_quaternion(answer.attitude.quaternion)
+        offsets_of = _offsets_of(answer, seen_by, catalog, batch)
+        for seen, found, offsets in zip(seen_by, answer.observations, offsets_of, strict=True):
+            number = names.index(seen.tracker.name)
+            if attitude is not None:
+                boresight = seen.tracker.boresight_body @ attitude
+                near = catalog.direction @ boresight > np.cos(np.radians(SURROUNDINGS_DEG))
+                density[place, number] = np.count_nonzero(near)
+            angle_deg = angle_between_deg(seen.direction_body, seen.tracker.boresight_body)
+            parts = (
+                np.full(len(found.stars), place),
+                np.full(len(found.stars), number),
+                [{"unmatched": "m"}.get(each.outcome, each.outcome[0]) for each in found.stars],
+                seen.magnitude_mag,
+                angle_deg / seen.tracker.field_of_view_radius_deg,
+                *offsets,
+            )
+            for column, part in zip(columns, parts, strict=True):
+                column.append(part)
+            rivals += [
+                tuple(sorted(each.rivals))
+                for each in found.stars
+                if each.outcome == "ambiguous" and each.rivals
+            ]
+    angles = [row["a_priori_angle_deg"] for row in sample.rows]
+    kinds = (np.int64, np.int64, "U1", *[np.float64] * 4)
+    batch_of, tracker_of, outcome, magnitude, off_axis, offset_sigmas, offset_mag = (
+        np.concatenate([np.empty(0, kind), *parts])  # type: ignore[call-overload]
+        for kind, parts in zip(kinds, columns, strict=True)
+    )
+    return StarTable(
+        total=sample.total,
+        trackers=names,
+        time_ns=np.array([row["time_ns"] for row in sample.rows], np.int64),
+        solved=np.array(solved, bool),
+        a_priori_deg=np.array([np.nan if each is None else each for each in angles], float),
+        room_deg=room_deg,
+        density=density,
+        batch=batch_of,
+        tracker=tracker_of,
+        outcome=outcome,
+        magnitude=magnitude,
+        off_axis=off_axis,
+        offset_sigmas=offset_sigmas,
+        offset_mag=offset_mag,
+        rivals=tuple(rivals),
+    )
+
+
+def _room_deg(mission: Mission) -> float:
+    zone = mission.zone
+    size_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
+    return size_deg - max(each.field_of_view_radius_deg for each in mission.trackers)
+
+
+def _offsets_of(
+    answer: Answer,
+    seen_by: Sequence[CorrectedObservations],
+    catalog: RunCatalog,
+    batch: ObservationBatch,
+) -> list[Vector]:
+    """Of each tracker, distance over its sigma and magnitude difference (2, n) to the nearest star.
+
+    NaN without an attitude, and where it is wrong: few stars then have a neighbour.
+    """
+    unknown = [np.full((2, len(each.magnitude_mag)), np.nan) for each in seen_by]
+    if answer.attitude is None:
+        return unknown
+    attitude = matrix_from_quaternion(answer.attitude.quaternion)
+    covariance = np.array(answer.attitude.covariance_arcsec2)
+    found = [_offsets(each, attitude, covariance, catalog, batch) for each in seen_by]
+    distances = np.concatenate([each[0] for each in found])
+    return found if np.isfinite(distances).mean() >= FITTING_SHARE else unknown
+
+
+def _offsets(
+    seen: CorrectedObservations,
+    attitude: Matrix,
+    covariance_arcsec2: Matrix,
+    catalog: RunCatalog,
+    batch: ObservationBatch,
+) -> Vector:
+    direction = seen.direction_body
+    inertial = direction @ attitude
+    row = np.argmax(inertial @ catalog.direction.T, axis=1)
+    natural = catalog.direction_at(batch.time)[row]
+    away_deg = angle_between_deg(
+        inertial, apparent(natural, aberration_velocity(batch), batch.time)
+    )
+    # The error of the attitude about the star's own direction does not move it.
+    along = np.einsum("ni,ij,nj->n", direction, covariance_arcsec2, direction)
+    sigma = np.sqrt(seen.sigma_arcsec**2 + (np.trace(covariance_arcsec2) - along) / 2.0)
+    is_near = away_deg < NEAR_DEG
+    sigmas = np.where(is_near, np.radians(away_deg) * ARCSEC_PER_RADIAN / sigma, np.inf)
+    fainter = np.where(is_near, seen.magnitude_mag - catalog.magnitude_mag[row], np.nan)
+    return np.stack([sigmas, fainter])
+
+
+@dataclass(frozen=True, eq=False)
+class Factor:
+    """A cause that was found: the batches (b,) and the stars (n,) of the period that it is in."""
+
+    batches: Flags
+    stars: Flags
+    text: str
+    evidence: str
+    remedy: str
+
+
+def causes(now: StarTable, before: StarTable | None) -> list[Cause]:
+    """The causes, those that explain the most batches first."""
+    if not len(now.outcome):
+        return []
+    lost = now.outcome != "u"
+    found = []
+    for make in FACTORS:
+        for factor in make(now, before):
+            hit = factor.stars & lost
+            explained = factor.batches & ~now.solved
+            explained[now.batch[hit]] = True
+            if hit.any() and np.count_nonzero(explained) >= LEAST_BATCHES:
+                found.append(_cause(factor, now, hit, explained))
+    return sorted(found, key=lambda each: -each.batches)
+
+
+def _cause(factor: Factor, now: StarTable, hit: Flags, explained: Flags) -> Cause:
+    rest = ~factor.stars
+    count, lost = int(np.count_nonzero(hit)), int(np.count_nonzero(now.outcome != "u"))
+    effect = f"{count} of {lost} ambiguous or unmatched stars"
+    if np.count_nonzero(rest) >= LEAST_STARS:
+        effect += (
+            f"; of the other stars {100 * now.share(rest):.1f} % are ambiguous, of all "
+            f"{100 * now.share():.1f} %"
+        )
+    last = int(np.flatnonzero(explained)[-1])
+    after = now.batches - 1 - last
+    is_over = after >= max(OVER_BATCHES, OVER_SHARE * now.batches)
+    return Cause(
+        batches=int(np.count_nonzero(explained)),
+        text=factor.text,
+        evidence=factor.evidence,
+        remedy=factor.remedy,
+        effect=f"{effect}.",
+        over_since=utc_of_unix(float(unix_seconds(now.time_ns[last]))).text if is_over else None,
+    )
+
+
+def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """A priori errors for which the zone leaves no room: the error grew, or the zone is small."""
+    beyond = now.a_priori_deg > now.room_deg
+    angle, room = (
+        float(np.nanmedian(each)) if np.isfinite(each).any() else np.nan
+        for each in (now.a_priori_deg, now.room_deg)
+    )
+    evidence = (
+        f"The zone leaves room for {room:.2f}°; the angle from the a priori attitude has a median "
+        f"of {angle:.2f}°"
+    )
+    text = "The zone is too small for the errors of the a priori attitude."
+    remedy = "Widen the zone, or correct the a priori attitude."
+    if before is not None and np.isfinite(before.a_priori_deg).any():
+        earlier = float(np.nanmedian(before.a_priori_deg))
+        room_before = float(np.nanmedian(before.room_deg))
+        evidence += f", before {earlier:.2f}°"
+        if room < room_before - 0.01:
+            text = "The zone was made smaller than the errors of the a priori attitude."
+            evidence += f"; before, the zone left room for {room_before:.2f}°"
+            remedy = "Put the former zone back."
+        elif angle > FAR * earlier:
+            text = "The a priori attitude is worse than before."
+            remedy = "Correct its source; until then send the batches as lost in space."
+    stars = beyond[now.batch]
+    yield Factor(beyond, stars, text, f"{evidence}.", remedy)
+
+
+def _noise(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Trackers that are noisier than the mission's sigma, and than before."""
+    ratios = [now.noise(number) for number in range(len(now.trackers))]
+    worst = max((each for each in ratios if np.isfinite(each)), default=0.0)
+    for number, (name, ratio) in enumerate(zip(now.trackers, ratios, strict=True)):
+        earlier = _earlier(before, name, StarTable.noise)
+        # The attitude follows the noisiest tracker, and with it the residuals of the others.
+        if not ratio > NOISY * max(1.0, np.nan_to_num(earlier), worst / 4.0):
+            continue
+        own = now.tracker == number
+        was = "" if np.isnan(earlier) else f", before {earlier:.1f} times"
+        yield Factor(
+            np.bincount(now.batch[own], minlength=now.batches) > 0,
+            own,
+            f"{name} is noisy.",
+            f"Its stars lie {ratio:.1f} times the mission's sigma from the catalog{was}.",
+            f"Look at {name} first; leave it out of the batches, or raise its sigma_arcsec, until "
+            "it is mended.",
+        )
+
+
+def _sensitivity(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Trackers that report fewer or brighter stars than before."""
+    for number, name in enumerate(now.trackers):
+        mean, mean_before = _both(now, before, number, lambda t, k: float(t.reported(k).mean()))
+        faint, faint_before = _both(
+            now, before, number, lambda t, k: _percentile(t.magnitude[t.tracker == k], 90.0)
+        )
+        if not (mean < FEWER * mean_before or faint < faint_before - BRIGHTER_MAG):
+            continue
+        usual = _earlier(before, name, lambda t, k: float(np.median(t.reported(k))))
+        few = now.reported(number) < max(usual, 1.0)
+        yield Factor(
+            few,
+            few[now.batch],
+            f"{name} has lost sensitivity: it reports fewer stars.",
+            f"{mean:.1f} stars a batch, before {mean_before:.1f}; nine of ten are brighter than "
+            f"{faint:.1f} mag, before {faint_before:.1f} mag.",
+            "Look for stray light, temperature or a changed threshold of the tracker.",
+        )
+
+
+def _density(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Fields with more catalog stars than nearly all earlier ones."""
+    for number, name in enumerate(now.trackers):
+        middle, middle_before = _both(
+            now, before, number, lambda t, k: _percentile(t.density[:, k], 50.0)
+        )
+        usual = _earlier(before, name, lambda t, k: _percentile(t.density[:, k], 90.0))
+        dense = now.density[:, number] > max(DENSER * middle_before, usual)
+        if not middle > DENSER * middle_before:
+            continue
+        yield Factor(
+            dense,
+            dense[now.batch] & (now.tracker == number),
+            f"{name} looks at dense fields.",
+            f"{middle:.0f} catalog stars within {SURROUNDINGS_DEG:.0f}° of its boresight, before "
+            f"{middle_before:.0f}.",
+            "It passes when the pointing leaves them; a better a priori attitude or a smaller "
+            "sigma leaves fewer rivals.",
+        )
+
+
+def _false_stars(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Observed points at which the catalog has no star."""
+    for number, name in enumerate(now.trackers):
+        share, earlier = _both(now, before, number, _false_share)
+        if not share > FALSE_SHARE + NOISY * np.nan_to_num(earlier):
+            continue
+        false = (now.tracker == number) & np.isinf(now.offset_sigmas)
+        was = "" if np.isnan(earlier) else f", before {100 * earlier:.1f} %"
+        yield Factor(
+            np.isin(np.arange(now.batches), now.batch[false]),
+            false,
+            f"{name} reports points that are no stars of the catalog.",
+            f"{100 * share:.1f} % of its stars lie more than {NEAR_DEG:g}° from every catalog "
+            f"star{was}.",
+            "Look for particles, planets, radiation or reflections; see the objects that move.",
+        )
+
+
+def _false_share(table: StarTable, tracker: int) -> float:
+    known = table.offset_sigmas[(table.tracker == tracker) & ~np.isnan(table.offset_sigmas)]
+    return float(np.isinf(known).mean()) if len(known) else 0.0
+
+
+def _magnitudes(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
+    """Trackers whose magnitudes moved against the catalog's."""
+    for number, name in enumerate(now.trackers):
+        offset, earlier = _both(
+            now, before, number, lambda t, k: _percentile(t.offset_mag[t.tracker == k], 50.0)
+        )
+        if not abs(offset - np.nan_to_num(earlier)) > OFFSET_MAG:
+            continue
+        was = "" if np.isnan(earlier) else f", before {earlier:+.2f} mag"
+        own = now.tracker == number
+        yield Factor(
+            np.isin(np.arange(now.batches), now.batch[own]),
+            own,
+            f"The magnitudes of {name} have shifted.",
+            f"Observed minus catalog is {offset:+.2f} mag{was}.",
+            "Calibrate its magnitudes; until then widen the magnitude tolerance.",
+        )
+
+
+def _both(
+    now: StarTable,
+    before: StarTable | None,
+    number: int,
+    value: Callable[[StarTable, int], float],
+) -> tuple[float, float]:
+    return value(now, number), _earlier(before, now.trackers[number], value)
+
+
+FACTORS: tuple[Callable[[StarTable, StarTable | None], Iterator[Factor]], ...] = (
+    _a_priori,
+    _noise,
+    _sensitivity,
+    _density,
+    _false_stars,
+    _magnitudes,
+)
+
+
+def _earlier(
+    before: StarTable | None, tracker: str, value: Callable[[StarTable, int], float]
+) -> float:
+    """A value of a tracker in the earlier period; NaN where it is not known."""
+    if before is None or tracker not in before.trackers:
+        return float("nan")
+    return value(before, before.trackers.index(tracker))
+
+
+def _percentile(values: Vector, percent: float) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.percentile(known, percent)) if len(known) else float("nan")
+
+
+@dataclass(frozen=True)
+class Part:
+    """The ambiguous stars of a part of a period, and of the same part of the earlier one."""
+
+    name: str
+    stars: int
+    share: Interval
+    before: Interval | None
+
+    @property
+    def points(self) -> float | None:
+        """The change in percent points; None without an earlier share."""
+        return None if self.before is None else 100.0 * (self.share.value - self.before.value)
+
+    @property
+    def is_certain(self) -> bool:
+        """True if the change is more than chance: neither interval holds the other's share."""
+        return self.before is not None and (
+            self.share.low > self.before.high or self.share.high < self.before.low
+        )
+
+
+def parts(now: StarTable, before: StarTable | None) -> list[Part]:
+    """All stars, those of each tracker, the bright and faint, the inner and outer ones."""
+    found = [_part("all stars", now, before, lambda t: np.ones(len(t.batch), bool))]
+    if len(now.trackers) > 1:
+        found += [_part(name, now, before, _of_tracker(name)) for name in now.trackers]
+    middle = _percentile((before or now).magnitude, 50.0)
+    if np.isfinite(middle):
+        bright = f"{middle:.1f} mag or brighter"
+        found.append(_part(bright, now, before, lambda t: t.magnitude <= middle))
+        found.append(_part("fainter", now, before, lambda t: t.magnitude > middle))
+    half = np.sqrt(0.5)
+    found.append(_part("inner half of the field", now, before, lambda t: t.off_axis < half))
+    found.append(_part("outer half", now, before, lambda t: t.off_axis >= half))
+    return [each for each in found if each is not None]
+
+
+def _of_tracker(name: str) -> Callable[[StarTable], Flags]:
+    return lambda table: (
+        table.tracker == (table.trackers.index(name) if name in table.trackers else -1)
+    )
+
+
+def _part(
+    name: str, now: StarTable, before: StarTable | None, chosen: Callable[[StarTable], Flags]
+) -> Part | None:
+    shares = []
+    for table in (now, before):
+        of = chosen(table) if table is not None else np.empty(0, bool)
+        shares.append(
+            share_of(table.ambiguous[of], table.batch[of])
+            if table is not None and of.any()
+            else None
+        )
+    return (
+        None
+        if shares[0] is None
+        else Part(name, int(np.count_nonzero(chosen(now))), shares[0], shares[1])
+    )
+
+
+def common_rivals(now: StarTable) -> list[tuple[str, int]]:
+    """The groups of rivals of the most ambiguous stars, with their numbers of stars."""
+    return [(", ".join(names), n) for names, n in Counter(now.rivals).most_common(COMMON)]

@@ -1,0 +1,21 @@
+"""Why stars are ambiguous, on the page of a spacecraft."""
+
+from collections.abc import Iterator
+
+from service.features.advice.part import AdviceService
+from service.web.console.page import PageContext, Panel
+from service.web.console.pages.spacecraft import PeriodBefore, ShownPeriod
+
+
+def ambiguity_of_period(
+    context: PageContext, name: str, run: str, shown: ShownPeriod, before: PeriodBefore
+) -> Iterator[Panel]:
+    """Ambiguous stars of a period beside an earlier one, and their causes."""
+    found = context.app.part(AdviceService).ambiguity(
+        name, run, shown.start, shown.end, before.shift_s
+    )
+    if found.parts:
+        yield Panel("_ambiguity.html.jinja", found)
+
+
+PANELS = {"ambiguity": ambiguity_of_period}

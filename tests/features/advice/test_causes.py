@@ -1,0 +1,115 @@
+"""Causes of ambiguous and unmatched stars, told from a day and the day before."""
+
+import json
+
+import pytest
+
+from service.features.advice.part import AdviceService
+from service.observations.schema import submission_from_json
+from service.simulate.stretches import NO_TROUBLES, Pass
+from service.simulate.telemetry import draw_pass
+from service.times import DAY_S, parse_utc, shifted
+
+BATCHES = 24
+BEGIN = "1999-03-02T00:00:00.000Z"
+
+
+def only_bright(body):
+    """A batch of a tracker that reports its brightest two stars."""
+    for each in body["observations"]:
+        each["stars"] = sorted(each["stars"], key=lambda star: star["magnitude"])[:2]
+
+
+def fainter(body):
+    """A batch whose magnitudes are half a magnitude too faint."""
+    for each in body["observations"]:
+        for star in each["stars"]:
+            star["magnitude"] += 0.5
+
+
+def fly(app, mission, start, seed, change=None, identifier="verified", **wanted):
+    asked = Pass(BATCHES, seed, start=start, cadence_s=600.0, troubles=NO_TROUBLES, **wanted)
+    bodies = [each.batch for each in draw_pass(mission, app.sky, asked)]
+    for body in bodies:
+        body |= {"batch": body["time"], "options": {"identifier": identifier}}
+        if change is not None:
+            change(body)
+    answers = app.submissions.submit_many([submission_from_json(json.dumps(b)) for b in bodies])
+    assert all(not isinstance(each, Exception) for each in answers)
+
+
+@pytest.fixture
+def compare(app, missions, seed):
+    """Fly a good day and the next one as asked; the ambiguity of the second."""
+    begin = parse_utc(BEGIN)
+
+    def compared(**changed):
+        fly(app, missions["XTE"], shifted(begin, -DAY_S).text, seed)
+        fly(app, missions["XTE"], BEGIN, seed + 1, **changed)
+        return app.part(AdviceService).ambiguity("XTE", "live", begin, shifted(begin, DAY_S))
+
+    return compared
+
+
+@pytest.mark.parametrize(
+    ("changed", "cause"),
+    [
+        ({"noise_arcsec": 60.0}, "STARTRACKER_1 is noisy."),
+        (
+            {"a_priori_error_deg": 9.0, "identifier": "starid"},
+            "The a priori attitude is worse than before.",
+        ),
+        ({"false_stars": 2}, "STARTRACKER_1 reports points that are no stars of the catalog."),
+        (
+            {"change": only_bright, "noise_arcsec": 30.0, "identifier": "starid"},
+            "STARTRACKER_1 has lost sensitivity: it reports fewer stars.",
+        ),
+        (
+            {"change": fainter, "identifier": "starid"},
+            "The magnitudes of STARTRACKER_1 have shifted.",
+        ),
+    ],
+)
+def test_the_cause_of_a_bad_day_is_named_with_what_it_explains(compare, changed, cause):
+    found = compare(**changed)
+    assert found.batches == found.total == BATCHES
+    assert found.unmatched_before is not None
+    told = {each.text: each for each in found.causes}
+    assert cause in told
+    assert 0 < told[cause].batches <= BATCHES
+    assert told[cause].remedy
+    explained = [each.batches for each in found.causes]
+    assert explained == sorted(explained, reverse=True)
+
+
+def test_a_day_like_the_one_before_has_no_cause_and_no_certain_change(compare):
+    found = compare()
+    assert found.causes == []
+    assert not any(each.is_certain for each in found.parts)
+    assert found.parts[0].before is not None
+
+
+def test_without_an_earlier_day_nothing_is_compared(app, missions, seed):
+    fly(app, missions["XTE"], BEGIN, seed, false_stars=2)
+    begin = parse_utc(BEGIN)
+    found = app.part(AdviceService).ambiguity("XTE", "live", begin, shifted(begin, DAY_S))
+    assert found.unmatched_before is None
+    assert all(each.before is None for each in found.parts)
+    assert ["no stars of the catalog" in each.text for each in found.causes] == [True]
+
+
+def test_a_cause_that_ended_says_since_when(app, missions, seed):
+    begin = parse_utc(BEGIN)
+    fly(app, missions["XTE"], BEGIN, seed, false_stars=2)
+    fly(app, missions["XTE"], shifted(begin, BATCHES * 600.0).text, seed)
+    found = app.part(AdviceService).ambiguity("XTE", "live", begin, shifted(begin, DAY_S))
+    (cause,) = found.causes
+    assert cause.over_since is not None
+    last = shifted(begin, BATCHES * 600.0).text
+    assert BEGIN < cause.over_since < last
+
+
+def test_a_period_without_batches_has_no_parts(app):
+    begin = parse_utc(BEGIN)
+    found = app.part(AdviceService).ambiguity("XTE", "live", begin, shifted(begin, DAY_S))
+    assert (found.parts, found.causes, found.batches) == ([], [], 0)
