@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from numba.core import event
 from numba.core.caching import IndexDataCacheFile
-from numba.core.compiler import Flags
 from numba.core.errors import NumbaError
 
 from service.attitude.covariance import information
@@ -52,27 +51,6 @@ def test_what_its_caller_made_is_there_as_long_as_it_runs():
         return found
 
     assert of_new_arrays(1_000) == sum(4.0 * k for k in range(1_000))
-
-
-def test_sets_of_compiler_options_are_equal_where_all_their_values_are(rng):
-    """Comparing sets of options was made faster: it has to find what a look at each value finds."""
-    switches = [name for name, option in Flags.options.items() if option.type is bool]
-    assert len(switches) > 10
-    made = [Flags() for _ in range(60)]
-    for flags in made:
-        for name in rng.choice(switches[:4], rng.integers(0, 4), replace=False):
-            setattr(flags, name, bool(rng.integers(2)))
-    equal = 0
-    for one in made:
-        for other in made:
-            assert (one == other) == (one.values() == other.values())
-            if one == other:
-                equal += 1
-                assert hash(one) == hash(other)
-    assert len(made) < equal < len(made) ** 2
-    # Some are equal although they were not set alike.
-    assert any(a == b and a._values != b._values for a in made for b in made)
-    assert Flags() != "options"
 
 
 def test_what_borrows_cannot_make_an_array():

@@ -29,7 +29,6 @@ from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.registry import CPUDispatcher
-from numba.core.targetconfig import TargetConfig
 
 from service.compiled.checked_file import CheckedFile
 
@@ -52,33 +51,6 @@ def _leave_scipy_out() -> None:
 
 
 _leave_scipy_out()
-
-
-def _compare_options_that_were_set() -> None:
-    """Have numba compare compiler options first by those that were set, then as it does itself.
-
-    It looks up the functions of its own that a kernel calls by types and options, and for each
-    comparison makes two tables of all options with their defaults: an eighth of the time of
-    compiling.  Where the same are set to the same values, the defaults are the same as well.
-    """
-    if "_values" not in TargetConfig.__slots__:
-        return  # another numba, which may compare in another way
-    as_numba_does: Callable[..., Any] = TargetConfig.__eq__
-
-    def is_equal(one: Any, other: Any) -> Any:
-        if type(one) is type(other) and one._values == other._values:
-            return True
-        return as_numba_does(one, other)
-
-    def hash_of(options: Any) -> int:
-        return hash(type(options))
-
-    # numba's own hash is that of the names of all options: one for all sets of a type as well.
-    TargetConfig.__eq__ = is_equal  # type: ignore[method-assign]
-    TargetConfig.__hash__ = hash_of  # type: ignore[method-assign]
-
-
-_compare_options_that_were_set()
 
 
 def njit(*function: Callable[..., Any], **options: Any) -> Any:
