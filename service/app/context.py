@@ -14,7 +14,7 @@ from service.access import Entry
 from service.contract.alarms import Alarm
 from service.contract.base import Page
 from service.errors import BadBatch, Fault, NotFound, shown_value
-from service.feature import feature_modules
+from service.feature import SETTING, feature_modules, features_on
 from service.missions.faults import plain_message
 from service.missions.mission import Mission, mission_named
 from service.observations.schema import RunName
@@ -67,6 +67,16 @@ class Context:
     def trackers(self, name: str) -> tuple[str, ...]:
         """The trackers of a spacecraft that have values of their own, then its retired ones."""
         return (*limited_trackers(self.mission(name)), *self.retired.trackers.get(name, ()))
+
+    def has_feature(self, name: str) -> bool:
+        """True unless the settings leave this feature out."""
+        return any(each.name == name for each in features_on(self.settings.features_off))
+
+    def require_alarms(self, wanted: bool) -> None:
+        """Raise `BadBatch` if alarms are wanted from a service that leaves them out."""
+        if wanted and not self.has_feature("alarms"):
+            message = f"are off in this service ({SETTING}): nothing would evaluate the limits"
+            raise BadBatch(Fault("alarms", message, "true"))
 
     def reading(self) -> AbstractContextManager[Connection]:
         """A connection that sees one moment of the record and its projections; see `Store`."""

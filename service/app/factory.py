@@ -1,5 +1,6 @@
 """The app: every part of the service, put together in one place."""
 
+import logging
 from typing import Protocol, TypeVar
 
 from service.access import Access, Tokens
@@ -17,7 +18,7 @@ from service.app.service import Events, Service
 from service.app.single_projector import SingleProjector
 from service.app.spacecraft import Gyro, Spacecraft
 from service.app.zones import Zones
-from service.feature import feature_modules
+from service.feature import SETTING, feature_modules
 from service.ingest.missions_in_force import MissionsInForce
 from service.ingest.spool import Spool
 from service.ingest.submit import SubmissionService
@@ -36,6 +37,8 @@ from service.storage.store import Store
 from service.storage.upkeep.expiries import ExpiryDates
 from service.storage.upkeep.split_trackers import BackgroundUpgrade, TrackerSplitter
 from service.times import utc_now
+
+log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 
@@ -180,6 +183,14 @@ def open_app(
 
     try:
         app.in_force.load(leave)
+        adopted = app.in_force.adopted_names()
+        if adopted and not context.has_feature("calibration"):
+            log.warning(
+                "%s leaves calibration out, and adopted calibrations stay in force for %s: "
+                "they can be taken back while the feature is on",
+                SETTING,
+                ", ".join(adopted),
+            )
         if not reads_only:
             _register(app.context)
             if store.lock is None:

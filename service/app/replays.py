@@ -116,6 +116,7 @@ class Replays:
 
         Every batch goes to `run`.  Lines that can be closed are closed at the end.
         """
+        self._context.require_alarms(options.get("alarms", False))
         replay = self._new(run, options)
         replay.start(lines, _stored_with(run, options))
         return replay.id
@@ -143,6 +144,7 @@ class Replays:
         options |= {"check": caller.require, "owner": caller.token_id}
         with ExitStack() as on_failure:
             on_failure.callback(discard_upload, file)
+            self._context.require_alarms(options.get("alarms", False))
             archive = self._archive_lines(file, form)
             if archive is None and form.coding == "identity":
                 file.flush()

@@ -50,6 +50,7 @@ class Runs:
         name = checked_run_name(run)
         if name == LIVE and not alarms:
             raise BadBatch(Fault("alarms", "alarms are always on for live batches", "False"))
+        self._context.require_alarms(alarms)
         self._context.change_audited(
             lambda connection: set_run_alarms(connection, name, alarms, utc_now().text), entry
         )

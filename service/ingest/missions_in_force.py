@@ -59,6 +59,10 @@ class MissionsInForce:
         if newest_adoption(connection) != self._loaded:
             self.load(self._leave)
 
+    def adopted_names(self) -> list[str]:
+        """The spacecraft whose settings are an adopted calibration over their file."""
+        return [name for name, file in self.files.items() if self.missions[name] is not file]
+
     def load(self, leave: str | None = None) -> None:
         """Put what was adopted over the mission files, but for the spacecraft `leave`."""
         self._leave = leave

@@ -5,6 +5,7 @@ another pointing; those of a Sun-pointed mission are spread over the days of a y
 """
 
 import json
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -49,17 +50,21 @@ class Expected:
 def expected_outcomes(
     mission: Mission, sky: SkyModel, moment: Utc, seconds: float, seed: int = 1
 ) -> list[Expected]:
-    """Outcomes in clear and in dense sky of up to `VIEWS` views, or as many as the time allows."""
+    """Outcomes in clear and in dense sky of up to `VIEWS` views, or as many as the time allows.
+
+    `seconds` are of this process's processor time, after the first views: these may compile.
+    """
     found = {"clear": Expected("clear"), "dense": Expected("dense")}
-    until = time.monotonic() + seconds
+    until = math.inf
     views = _views(mission, sky, moment, seed)
     while chunk := [each for _, each in zip(range(AT_ONCE), views, strict=False)]:
         batches = [submission_from_json(json.dumps(each.batch).encode()).batch for each in chunk]
         for drawn, result in zip(chunk, acquired(batches, mission, sky), strict=True):
             if (kind := _kind(mission, drawn)) is not None and not isinstance(result, Exception):
                 _count(found[kind], drawn, result)
-        if time.monotonic() > until:
+        if time.process_time() > until:
             break
+        until = min(until, time.process_time() + seconds)
     return [each for each in found.values() if each.views]
 
 

@@ -4,15 +4,19 @@ import json
 import os
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from service.app.factory import open_app
 from service.cli import build_parser
-from service.errors import BadConfiguration
+from service.errors import BadBatch, BadConfiguration
 from service.feature import SETTING, SHIPPED, Feature, features_on, known_features
+from service.settings import Settings
+from service.storage.sql import migrations
 
 FEATURES = Path(__file__).parents[2] / "service" / "features"
 
@@ -57,6 +61,19 @@ def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypa
     assert "(got 'folow')" in complaint
     with pytest.raises(BadConfiguration, match="ACQUIRE_FEATURES_OFF"):
         features_on("folow")
+
+
+def test_alarms_of_a_run_are_refused_where_the_alarms_are_off(acquire, monkeypatch, tmp_path):
+    monkeypatch.setenv("ACQUIRE_FEATURES_OFF", "alarms")
+    file = tmp_path / "one.ndjson"
+    batch = json.loads((ROOT / "docs" / "example-batch.json").read_text(encoding="utf-8"))
+    file.write_text(json.dumps(batch), encoding="utf-8")
+    database = ("--database", f"sqlite:///{tmp_path / 'a.db'}")
+    code, _, complaint = acquire("replay", "--in-process", "--alarms", *database, str(file))
+    assert (code, "alarms: are off in this service" in complaint) == (2, True)
+    settings = Settings(database=database[1], replay_processes=0, features_off="alarms")
+    with closing(open_app(settings)) as app, pytest.raises(BadBatch, match="are off"):
+        app.replays.start([b""], "night", alarms=True)
 
 
 def test_a_feature_can_only_bring_what_the_service_asks_for():
@@ -344,7 +361,7 @@ def sent(file, first, last, *command, path=()):
     return [json.loads(each) for each in answers], json.loads(differs), lines[last - first + 1 :]
 
 
-def test_a_brought_feature_has_its_tables_and_follows_the_record(tmp_path, site):
+def test_a_brought_feature_has_its_tables_and_follows_the_record(tmp_path, site, acquire):
     """The database was there before the package, and is given its tables as it is opened."""
     file = tmp_path / "acquire.db"
     sent(file, 0, 4)
@@ -355,5 +372,12 @@ def test_a_brought_feature_has_its_tables_and_follows_the_record(tmp_path, site)
     assert printed == [" ".join(map(str, bands))]
     # Without the package the service goes on, and the numbers stay for its return.
     sent(file, 0, 0)
+    database = f"sqlite:///{file}"
+    assert migrations.check(database) == []
+    assert migrations.unknown_tables(database) == ["dwell_bands"]
+    for command in ("check --database", "copy"):
+        target = [f"sqlite:///{tmp_path / 'copy.db'}"] * (command == "copy")
+        code, out, _ = acquire("database", *command.split(), database, *target)
+        assert (code, "dwell_bands" in out) == (0, True)
     *_, printed = sent(file, 0, 0, "dwell", "XTE", path=(site,))
     assert printed == [" ".join(map(str, bands))]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 
 MAX_PROBLEMS = 100
+UNKNOWN_TABLES = "tables that no installed code knows, as those of a feature that was removed"
 
 
 def add(commands: Any) -> None:
@@ -123,12 +124,16 @@ def check(parsed: Namespace) -> int:
     acquire database check --fresh
     """
     from service.storage.sql.migrations import check as check_schema
-    from service.storage.sql.migrations import check_fresh
+    from service.storage.sql.migrations import check_fresh, unknown_tables
 
-    differences = check_fresh() if parsed.fresh else check_schema(settings_of(parsed).database)
+    database = settings_of(parsed).database
+    differences = check_fresh() if parsed.fresh else check_schema(database)
+    unknown = [] if parsed.fresh else unknown_tables(database)
     if parsed.json:
-        arguments.print_json({"differences": differences})
+        arguments.print_json({"differences": differences, "unknown_tables": unknown})
         return 1 if differences else 0
+    if unknown:
+        print(f"note: {UNKNOWN_TABLES}: {', '.join(unknown)}")
     for difference in differences:
         print(difference if len(difference) <= 120 else difference[:119] + "…")
     if not differences:
@@ -239,6 +244,7 @@ def copy(parsed: Namespace) -> int:
     """
     from tqdm import tqdm
 
+    from service.storage.sql.migrations import unknown_tables
     from service.storage.upkeep.copy import copy_record
 
     with tqdm(total=None, disable=None, leave=False) as bar:
@@ -249,6 +255,8 @@ def copy(parsed: Namespace) -> int:
             bar.update(done - bar.n)
 
         rows, problems = copy_record(parsed.source, parsed.target, step)
+    if unknown := unknown_tables(parsed.source):
+        print(f"not copied: {UNKNOWN_TABLES}: {', '.join(unknown)}")
     _print_problems(problems)
     if problems:
         print(f"the copy equals its source in {rows} rows; both have these faults")

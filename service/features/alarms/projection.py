@@ -17,6 +17,7 @@ from service.features.alarms.tables import alarms, watches
 from service.features.alarms.windows import BatchRef, Point, SampleWindow
 from service.missions.mission import Mission
 from service.storage.projections.rollups import RecordedResult
+from service.storage.queries.pages import ResultFilter, newest
 from service.storage.queries.results import recorded_mission
 from service.storage.recording.ids import Ulids
 from service.storage.recording.results import runs_with_alarms
@@ -24,7 +25,7 @@ from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
 from service.storage.sql.statements import insert_missing, prepared
 from service.storage.sql.tables import batches, results
-from service.times import Utc, recorded_utc
+from service.times import Utc, recorded_utc, utc_now
 from service.trends.limits import LimitSettings, Sample, Severity
 from service.trends.quantities import SILENCE, Subject, quantity_and_tracker, sampler, subject_of
 
@@ -87,6 +88,14 @@ class LimitEvaluator:
         row, newest = self._row, None
         latest_ns, received = row["time_ns"], row["received"]
         received_ns = recorded_utc(received).tai_ns
+        first = self._new[0]
+        if self._run == LIVE and silence_severity(
+            self._limits, (first.received_ns - received_ns) * 1e-9
+        ):
+            received = _last_received(
+                self._connection, row, batches.c.received < first.result["received"]
+            )
+            received_ns = recorded_utc(received).tai_ns
         for each in self._new:
             batch = each.result
             gap_ns = batch["time_ns"] - latest_ns
@@ -249,7 +258,7 @@ def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], n
         if row is None:
             continue
         active = ActiveAlarms(connection, spacecraft, LIVE)
-        gap_s = _seconds(row["received"], now)
+        gap_s = _seconds(_last_received(connection, row), now)
         limits = limits_of(connection, missions[spacecraft])
         severity = silence_severity(limits, gap_s)
         if severity is not None:
@@ -273,11 +282,13 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
     """The live spacecraft whose silence is worse than their alarm says so far."""
     found = set()
     query = select(watches.c.spacecraft, watches.c.received).where(watches.c.run == LIVE)
-    for spacecraft, received in connection.execute(query):
+    for row in connection.execute(query).mappings():
+        spacecraft = row["spacecraft"]
         mission = missions.get(spacecraft)
         if mission is None:
             continue
-        severity = silence_severity(limits_of(connection, mission), _seconds(received, now))
+        limits = limits_of(connection, mission)
+        severity = silence_severity(limits, _seconds(row["received"], now))
         if severity is None:
             continue
         noted = select(alarms.c.current_severity).where(
@@ -286,9 +297,27 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
             alarms.c.quantity == SILENCE,
             alarms.c.cleared_at.is_(None),
         )
-        if connection.execute(noted).scalar() != severity.word:
+        if connection.execute(noted).scalar() == severity.word:
+            continue
+        if silence_severity(limits, _seconds(_last_received(connection, row), now)) is not None:
             found.add(spacecraft)
     return found
+
+
+def _last_received(connection: Connection, watch: Mapping[Any, Any], *before: Any) -> str:
+    """When the last live batch of a spacecraft came, by the record where that knows of a later one.
+
+    Batches that came while the alarms were off are recorded, and were not evaluated.
+    """
+    query = select(batches.c.received).join_from(
+        results, batches, results.c.batch_id == batches.c.id
+    )
+    selected = ResultFilter(LIVE, watch["spacecraft"])
+    row = newest(connection, query.where(*before), selected, utc_now())
+    evaluated = str(watch["received"])
+    if row is None or recorded_utc(row["received"]).tai_ns < recorded_utc(evaluated).tai_ns:
+        return evaluated
+    return str(row["received"])
 
 
 def _locked(connection: Connection, spacecraft: str, run: str) -> Row | None:

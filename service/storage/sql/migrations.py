@@ -7,7 +7,7 @@ service that starts would wait for it.
 import json
 import logging
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -100,7 +100,32 @@ def check(database: str) -> list[str]:
 
         all_tables()
         context = MigrationContext.configure(connection, opts={"compare_type": True})
-        return [_in_words(difference) for difference in compare_metadata(context, metadata)]
+        unknown = _unknown_tables(connection)
+        return [
+            _in_words(difference)
+            for difference in compare_metadata(context, metadata)
+            if not _is_about(difference, unknown)
+        ]
+
+
+def unknown_tables(database: str) -> list[str]:
+    """The tables of a database that no installed code knows, such as those of a feature removed."""
+    with reading(database) as connection:
+        return _unknown_tables(connection)
+
+
+def _unknown_tables(connection: Connection) -> list[str]:
+    known = {"alembic_version", *(table.name for table in all_tables())}
+    return sorted(set(inspect(connection).get_table_names()) - known)
+
+
+def _is_about(difference: Any, tables: Collection[str]) -> bool:
+    """True if alembic would remove one of these tables, or an index of one."""
+    if isinstance(difference, list):
+        return False
+    verb, thing = difference[:2]
+    table = thing if verb == "remove_table" else getattr(thing, "table", None)
+    return verb in ("remove_table", "remove_index") and getattr(table, "name", "") in tables
 
 
 def all_tables() -> list[Table]:
@@ -127,7 +152,7 @@ def check_fresh() -> list[str]:
     with tempfile.TemporaryDirectory() as folder:
         database = f"sqlite:///{Path(folder, 'fresh.db')}"
         upgrade(database)
-        return check(database)
+        return [*check(database), *unknown_tables(database)]
 
 
 def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None) -> None:

@@ -28,7 +28,11 @@ from service.web.requests.problems import NotJson
 
 JSON = "application/json"
 BINARY = "application/octet-stream"
-FRAMES = ("application/fits", "image/fits", "image/tiff", "image/png", "application/x-npy", BINARY)
+FRAMES = (
+    BINARY,
+    *("application/fits", "image/fits", "image/tiff", "image/png", "image/jpeg"),
+    "application/x-npy",
+)
 """Media types of frames; the first bytes tell the format."""
 
 MAX_JSON_BYTES = 2 << 20

@@ -264,6 +264,17 @@ def test_live_silence_is_an_alarm_that_the_next_batch_ends(app, make, monkeypatc
     assert actions(app, silent) == ["raised", "escalated", "returned"]
 
 
+def test_batches_that_came_while_the_alarms_were_off_are_no_silence(app, make):
+    """These are recorded without being evaluated, so that the last one evaluated is older."""
+    send(app, make, ["good"])
+    long_ago = shifted(utc_now(), -36_000.0).text
+    with app.context.store.writer.projection() as connection:
+        connection.execute(update(watches).values(received=long_ago))
+    assert not app.part(Alarms).evaluate_by_clock()
+    send(app, make, ["good"], start=1)
+    assert app.part(Alarms).page(state="all").items == []
+
+
 def test_a_low_bound_of_silence_is_held_as_well(app, make):
     """Batches that come too close after each other."""
     settings = {"watch": {"low": 5.0}, "minimum_count": 1, "duration_s": 0.0}

@@ -91,6 +91,14 @@ def test_each_change_is_in_force_at_once_after_a_restart_and_an_event(app, opene
     assert {each["spacecraft"] for each in events} == {"TWO"}
 
 
+def test_a_start_without_the_feature_names_what_stays_in_force(app, opened, folder, caplog):
+    adopted = app.part(Calibrations).adopt(recorded(app).id, WHO)
+    app.close()
+    app = opened(missions=folder, features_off="calibration")
+    assert app.missions["TWO"].digest == adopted.mission
+    assert "adopted calibrations stay in force for TWO" in caplog.text
+
+
 def test_reprocessing_uses_what_was_adopted_and_the_record_stays_as_it_was(app):
     found = recorded(app)
     before = app.spacecraft.history("TWO", quantities=["suspect_share"], strategy="latest").series
