@@ -48,7 +48,7 @@ from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("advice", "alarms", "calibration", "follow", "packets", "tracks", "webhooks")
+SHIPPED = ("advice", "alarms", "calibration", "follow", "packets", "products", "tracks", "webhooks")
 """The features that come with the service, in the order of their routes and commands."""
 
 KINDS = (

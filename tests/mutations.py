@@ -29,6 +29,9 @@ import numpy as np
 import zstandard
 from PIL import Image
 
+from service.ephemerides.aem import read_aem
+from service.ephemerides.oem import read_oem
+from service.ephemerides.tle import read_tle
 from service.errors import BadConfiguration, BadInput
 from service.features.packets.definition import PacketDefinition
 from service.features.packets.reader import PacketLines, PacketReader, archive_of
@@ -40,23 +43,20 @@ from service.observations.csv_rows import write_batches_csv
 from service.observations.decompress import MAX_LINE_BYTES, unpacked_lines
 from service.observations.schema import BatchIn, submission_from_json
 from service.observations.telemetry import read_lines
-from service.products.reading.aem import read_aem
-from service.products.reading.oem import read_oem
-from service.products.reading.tle import read_tle
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.sky.cache import LruCache
 from service.sky.catalog.star_catalog import import_csv, import_sky2000, load, load_embedded, save
 from service.sky.model import SkyModel
 from service.times import parse_utc
+from tests.ephemerides.orbits import ISS, oem_text, with_checksum
 from tests.features.packets.packing import mission_of_pass, packed, xtce
+from tests.features.products.series import GOLDEN, rows, slew
+from tests.features.products.series import written as aem_file
 from tests.imaging.colour_files import colours, dng, png_of_16_bits, tiff_of_16_bits
-from tests.products.orbits import ISS, oem_text, with_checksum
-from tests.products.series import GOLDEN, rows, slew
-from tests.products.series import written as aem_file
 from tests.sky.sky2000_records import SIRIUS, written
 
-AEM_EXAMPLES = Path(__file__).parent / "products" / "adm-examples"
+AEM_EXAMPLES = Path(__file__).parent / "ephemerides" / "adm-examples"
 MORE_MEMORY = 1 << 30
 """What a reader may take beyond what the process holds already."""
 FRAME_LIMITS = FrameLimits(max_pixels=1_000_000)

@@ -173,8 +173,7 @@ def test_help_loads_nothing_that_takes_time():
     assert {each for each in loaded if each.startswith("service.") and each.count(".") == 1} == {
         *("service.cli", "service.compiled", "service.csv_cells", "service.errors"),
         *("service.extras", "service.feature", "service.features", "service.logs"),
-        *("service.missions", "service.products"),
-        "service.settings",
+        *("service.missions", "service.settings", "service.table_files"),
     }
 
 
@@ -210,7 +209,8 @@ def test_a_service_is_ready_without_what_is_used_later(tmp_path):
     for late in (
         *("service.demo", "service.replay", "service.simulate", "studies"),
         *("service.identify.blind", "service.identify.triangles", "service.imaging.detection"),
-        *("service.imaging.frames.fits", "service.imaging.sky_overlay", "service.products.ck"),
+        *("service.imaging.frames.fits", "service.imaging.sky_overlay"),
+        *("service.features.products.ck", "service.features.products.scoring"),
         *("service.sky.whole_sky.quads", "service.storage.upkeep.archiving", "acquire_client"),
     ):
         assert late not in loaded

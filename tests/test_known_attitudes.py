@@ -8,14 +8,14 @@ import pytest
 
 from service.app.factory import open_app
 from service.cli import main
-from service.products.attitudes import AttitudeRows
+from service.ephemerides.rows import AttitudeRows
 from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass, read_objects
 from service.times import parse_utc
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 from service.web.app import create_app
-from tests.products.series import rows, written
+from tests.features.products.series import rows, written
 from tests.web.serving import Server
 
 N = 12

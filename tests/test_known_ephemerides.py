@@ -11,7 +11,7 @@ from service.settings import Settings
 from service.simulate.stretches import Pass
 from service.simulate.telemetry import draw_pass
 from service.times import parse_utc
-from tests.products.orbits import ISS, oem_text, with_checksum
+from tests.ephemerides.orbits import ISS, oem_text, with_checksum
 
 N = 6
 

@@ -26,11 +26,13 @@ from scipy.spatial.transform import Rotation
 from benchmarks.bounds import Bound, at_least, at_most, equal
 from benchmarks.report import Report
 from benchmarks.speed.fill_database import fill
-from service.products.attitudes import AttitudeRows, SeriesInfo, series_of
-from service.products.formats import write_attitudes, write_table
-from service.products.tables import Table
-from service.storage.queries.result_tables import BATCH_COLUMNS
-from service.storage.queries.result_tables import BATCHES as BATCHES_READ
+from service.ephemerides.rows import AttitudeRows
+from service.features.products.attitude_formats import write_attitudes
+from service.features.products.attitudes import SeriesInfo, series_of
+from service.features.products.result_tables import BATCH_COLUMNS
+from service.features.products.result_tables import BATCHES as BATCHES_READ
+from service.table_files.formats import write_table
+from service.table_files.table import Table
 from service.times import parse_utc, shifted
 
 DAY, QUICK_DAY = 86_400, 3_600

@@ -10,7 +10,6 @@ from service.app.annotations import Annotations
 from service.app.context import Context
 from service.app.frames import Frames
 from service.app.grades import DefinitiveAttitudes, Grades, LiveFilter
-from service.app.products import Products
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
@@ -83,7 +82,6 @@ class App:
         self.frames = Frames(context, self.submissions)
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
-        self.products = Products(context.known, context.store)
         self.gyro = Gyro(context)
         self.grades = Grades(context)
         self.definitive = DefinitiveAttitudes(context, self.grades, kernels)

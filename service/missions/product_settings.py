@@ -23,7 +23,7 @@ class ProductSettings(Strict):
     largest_gap_s: float = Field(default=DEFAULT_LARGEST_GAP_S, gt=0, le=MAX_LARGEST_GAP_S)
     """Attitudes that are farther apart belong to two stretches.
 
-    Without the key, that of raw attitudes follows their cadence: see `app.products`.
+    Without the key, that of raw attitudes follows their cadence: see the feature `products`.
     """
     object_id: str | None = Field(default=None, pattern=f"^{OBJECT_ID}$")
     """OBJECT_ID of CCSDS messages; None: the name of the mission."""

@@ -280,3 +280,11 @@ def _array(values: Any) -> Vector:
 
 def _optional_array(values: Triple | None) -> Vector | None:
     return None if values is None else _array(values)
+
+
+class _Rates(msgspec.Struct):
+    body_rates_deg_per_s: tuple[float, float, float] | None = None
+
+
+RECORDED_RATES = msgspec.json.Decoder(_Rates)
+"""Reads the rates of a recorded batch; None where it came without."""

@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from service import vectors
+from service.ephemerides.known import Ephemeris, KnownAttitudes
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
 from service.gyro import GyroBlock, block_from_line, is_gyro_line
 from service.interpolation import LARGEST_ERROR_RAD, QUARTER_TURN_RAD
@@ -22,7 +23,6 @@ from service.observations.batch import ObservationBatch
 from service.observations.decompress import Line
 from service.observations.schema import RunName, Submission, submission_from_json
 from service.observations.telemetry import read_lines
-from service.products.reading.known import Ephemeris, KnownAttitudes
 from service.times import Utc
 
 Problem = dict[str, Any]

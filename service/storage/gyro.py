@@ -13,13 +13,13 @@ from service import gyro
 from service.contract.base import Page
 from service.contract.spacecraft import GyroBlockRow, GyroSamples
 from service.errors import AcquisitionError, BadBatch, Conflict, Fault, NotFound, shown_value
-from service.products.tables import Column, Table
-from service.products.tables import Page as TablePage
 from service.storage.recording import events
 from service.storage.sql.columns import Row
 from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.statements import insert_runs
 from service.storage.sql.tables import runs
+from service.table_files.table import Column, Table
+from service.table_files.table import Page as TablePage
 from service.times import Utc, recorded_utc, shifted
 from service.vectors import Vector
 

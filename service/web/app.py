@@ -22,7 +22,7 @@ from service import __version__
 from service.app.factory import App
 from service.errors import AcquisitionError
 from service.feature import feature_folders, feature_modules
-from service.products.formats import OUTPUT_FORMATS
+from service.table_files.formats import TABLE_FORMATS
 from service.web.api import (
     annotations,
     batches,
@@ -70,7 +70,7 @@ ROUTERS: tuple[APIRouter, ...] = (
 COMPRESS_LEVEL = 4
 """The level of gzip: a third of the time of its default, for 7 % more bytes of a list."""
 
-COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, OUTPUT_FORMATS["parquet"].media_type)
+COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, TABLE_FORMATS["parquet"].media_type)
 """Media types that are compressed by themselves, or are streams of events."""
 
 DIRECT = (batches.submit_batch,)

@@ -22,7 +22,7 @@ from service import __version__
 from service.contract.base import Record, component_name, described
 from service.contract.events import EVENT_DATA
 from service.observations.input_formats import INPUT_FORMATS, NDJSON, input_formats
-from service.products.formats import attitude_formats, table_formats
+from service.table_files.formats import TABLE_FORMATS, OutputFormat
 from service.web.middleware import API
 from service.web.requests.access import POLICIES, Policy
 from service.web.requests.problems import MEDIA_TYPE as PROBLEM_JSON
@@ -32,8 +32,10 @@ from service.web.requests.request_body import BINARY, FRAMES, JSON
 Handler = TypeVar("Handler", bound=Callable[..., Any])
 
 SCHEMAS = "#/components/schemas/"
-TABLES, ATTITUDES = "x-tables", "x-attitudes"
-"""Mark a response in the formats of tables, or of attitudes, until the document is made."""
+FORMATS = "x-formats"
+"""Marks a response in several formats until the document is made."""
+FORMATS_OF: dict[str, Callable[[], Mapping[str, OutputFormat]]] = {"tables": lambda: TABLE_FORMATS}
+"""The formats of an answer, by what it holds; features add theirs."""
 
 
 def _header(name: str, description: str, **schema: Any) -> dict[str, Any]:
@@ -108,10 +110,8 @@ class Returns:
     media_type: str = JSON
     also: str | None = None
     """Another media type that the client can ask for, as plain text or bytes."""
-    tables: bool = False
-    """True if the client can ask for it as a table in each of the output formats."""
-    attitudes: bool = False
-    """True if the client can ask for it in each format of attitudes."""
+    formats: str | None = None
+    """The key in `FORMATS_OF` of the formats that the client can ask for."""
     status: int = 200
 
 
@@ -223,20 +223,16 @@ def _answer(doc: Returns) -> dict[str, Any]:
     answer["content"] = {doc.media_type: {"schema": schema}}
     if doc.also is not None:
         answer["content"][doc.also] = {"schema": _plain(doc.also)}
-    if doc.tables:
-        answer[TABLES] = True
-    if doc.attitudes:
-        answer[ATTITUDES] = True
+    if doc.formats is not None:
+        answer[FORMATS] = doc.formats
     return answer
 
 
-def add_table_formats(response: dict[str, Any]) -> None:
+def add_formats(response: dict[str, Any]) -> None:
     """Add the media types of the output formats that are registered by now."""
-    formats = {
-        **(table_formats() if response.pop(TABLES, False) else {}),
-        **(attitude_formats() if response.pop(ATTITUDES, False) else {}),
-    }
-    for each in formats.values():
+    if (held := response.pop(FORMATS, None)) is None:
+        return
+    for each in FORMATS_OF[held]().values():
         if each.media_type not in response["content"]:
             response["content"][each.media_type] = {"schema": _plain(each.media_type)}
 
@@ -393,10 +389,11 @@ def _records(kind: type[Record]) -> Iterator[type[Record]]:
 def _add_conditional(operation: dict[str, Any]) -> None:
     """Describe what `ConditionalAnswers` adds to the answers that come in one piece."""
     responses = operation["responses"]
-    # Attitudes are always streamed.
-    if EVENT_STREAM in responses["200"]["content"] or ATTITUDES in responses["200"]:
+    held = responses["200"].get(FORMATS)
+    # All formats but those of tables are always streamed.
+    if EVENT_STREAM in responses["200"]["content"] or held not in (None, "tables"):
         return
-    if TABLES not in responses["200"]:  # Tables may be streamed.
+    if held is None:  # Tables may be streamed.
         responses["200"]["headers"] = {**responses["200"].get("headers", {}), **ETAG}
     responses["304"] = {"description": _NOT_MODIFIED, "headers": ETAG, "content": {}}
 
@@ -419,7 +416,7 @@ def _finish(operation: dict[str, Any]) -> None:
     request = operation.get("requestBody", {})
     _put_examples(request, known.get("request"))
     for status, response in operation["responses"].items():
-        add_table_formats(response)
+        add_formats(response)
         _put_examples(response, known.get(status))
 
 

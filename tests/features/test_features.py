@@ -84,7 +84,8 @@ def test_a_feature_can_only_bring_what_the_service_asks_for():
 ROOT = Path(__file__).parents[2]
 
 SERVED = """
-import os, sys
+import sys
+from pathlib import Path
 import httpx
 from service.app.factory import open_app
 from service.cli import build_parser
@@ -95,10 +96,16 @@ from tests.web.serving import Server
 off, *addresses = sys.argv[2:]
 print("commands", *build_parser(off).commands.choices)
 settings = Settings(database="sqlite:///" + sys.argv[1], replay_processes=0, features_off=off)
-with Server(create_app(open_app(settings, serving=True))) as url:
+app = open_app(settings, serving=True)
+app.service.ready()
+with Server(create_app(app)) as url:
+    sent = Path("docs/example-batch.json").read_bytes()
+    json_type = {"Content-Type": "application/json"}
+    answer = httpx.post(url + "/api/v1/batches", content=sent, headers=json_type, timeout=120)
+    assert answer.json()["attitude"]["status"] == "good"
     for address in addresses:
         answer = httpx.get(url + address, timeout=120)
-        print(answer.status_code, address, answer.text.replace(os.linesep, " "))
+        print(answer.status_code, address, " ".join(answer.text.split()))
 print("modules", *sys.modules)
 """
 
@@ -123,18 +130,26 @@ def served(folder, off, *addresses, path=()):
 
 def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(tmp_path):
     pages = ("/", "/about", "/missions", "/batches", "/annotations", "/spacecraft/XTE")
+    pages += ("/spacecraft/XTE/period", "/spacecraft/XTE/grades")
+    history = "/api/v1/spacecraft/XTE/history?format=csv"
     gone = ("/webhooks", "/alarms", "/api/v1/alarms", "/api/v1/spacecraft/XTE/tracks")
+    gone += ("/spacecraft/XTE/files", "/api/v1/spacecraft/XTE/attitude")
     off = ",".join(SHIPPED)
-    commands, modules, found = served(tmp_path, off, *pages, *gone, "/metrics")
-    assert not commands & set(SHIPPED)
+    commands, modules, found = served(tmp_path, off, *pages, *gone, history, "/metrics")
+    assert not commands & {*SHIPPED, "export", "score", "calibrate"}
+    assert {"serve", "replay", "history"} <= commands
     assert [found[each][0] for each in pages] == [200] * len(pages)
+    assert found[history][0] == 200
+    assert "1996-010-0110" in found[history][1]
     assert [found[each][0] for each in gone] == [404] * len(gone)
     assert "starid_batches" in found["/metrics"][1]
     assert "starid_webhook" not in found["/metrics"][1]
     assert "starid_alarms" not in found["/metrics"][1]
+    assert "sky, residuals, rates" in found["/spacecraft/XTE"][1]
     shown = found["/"][1] + found["/spacecraft/XTE"][1] + found["/missions"][1]
-    assert "/alarms" not in shown
-    assert "/calibration" not in shown
+    shown += found["/spacecraft/XTE/period"][1] + found["/spacecraft/XTE/grades"][1]
+    for gone_page in ("/alarms", "/calibration", "/files", "/attitude?"):
+        assert gone_page not in shown
     loaded = {each for each in modules if each.startswith("service.features.")}
     # The names of the features, and the tables, which stay in the database.
     assert loaded <= {f"service.features.{name}" for name in SHIPPED} | {
@@ -308,7 +323,7 @@ def test_another_package_brings_a_feature_without_a_change_of_the_service(tmp_pa
     asked = (route, "/dwell", "/static/dwell.js", "/", "/api/v1/openapi.json")
     commands, _, found = served(tmp_path, "", *asked, path=(site,))
     assert "dwell" in commands
-    assert found[route] == (200, '{"batches":[0,0,0,0,0,0]}')
+    assert found[route] == (200, '{"batches":[0,0,0,1,0,0]}')
     assert found["/dwell"][0] == 200
     assert "<p>0 batches</p>" in found["/dwell"][1]
     assert found["/static/dwell.js"] == (200, "// dwell")

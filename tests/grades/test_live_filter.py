@@ -14,6 +14,7 @@ import pytest
 
 from service.app.grades import LiveFilter
 from service.errors import Busy, NotFound
+from service.features.products.part import Products
 from service.filtering.inputs import AttitudeMeasurements
 from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import grade_day, window_of
@@ -166,7 +167,7 @@ def test_it_answers_what_smooth_records_and_another_process_answers_the_same(
         "gyro",
     )
     live.grades.smooth("XTE")
-    *_, block = live.products.attitudes("XTE", grade="filtered").blocks
+    *_, block = live.part(Products).attitudes("XTE", grade="filtered").blocks
     assert block.time[-1] == found.time
     # The record keeps quaternions to the bit, covariances to seven digits.
     along = np.abs(block.quaternion[-1] @ found.quaternion)

@@ -13,9 +13,10 @@ from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
 from service.cli import main
+from service.ephemerides.aem import read_aem
+from service.features.products.attitude_formats import attitude_formats, write_attitudes
+from service.features.products.part import Products
 from service.filtering.inputs import AttitudeMeasurements
-from service.products.formats import attitude_formats, write_attitudes
-from service.products.reading.aem import read_aem
 from service.times import parse_utc, shifted
 from service.web.app import create_app
 from tests.filtering.simulated import ARCSEC
@@ -56,7 +57,7 @@ def whole(series):
 @pytest.mark.parametrize("grade", WORDS)
 def test_a_series_has_the_samples_in_order_of_time(smoothed, half_hour, grade):
     truth, _ = half_hour
-    rows = whole(smoothed.products.attitudes("XTE", grade=grade))
+    rows = whole(smoothed.part(Products).attitudes("XTE", grade=grade))
     # Seven measurements confirm the filter's start; the smoother knows of them.
     expected = np.arange(0 if grade == "smoothed" else 48, 1801)
     assert (rows.time_ns - NOON_NS).tolist() == (expected * 10**9).tolist()
@@ -68,30 +69,31 @@ def test_a_series_has_the_samples_in_order_of_time(smoothed, half_hour, grade):
     assert set(rows.stretch.tolist()) == {0}
     error = (Rotation.from_quat(rows.quaternion).inv() * truth.attitude[expected]).as_rotvec()
     assert np.abs(error[600:]).max() < 30.0 * ARCSEC
-    newest = whole(smoothed.products.attitudes("XTE", grade=grade, order="newest"))
+    newest = whole(smoothed.part(Products).attitudes("XTE", grade=grade, order="newest"))
     np.testing.assert_array_equal(newest.time_ns, rows.time_ns[::-1])
 
 
 def test_a_period_is_cut_to_the_sample(smoothed):
     start, end = (shifted(NOON, seconds) for seconds in (100.0, 110.0))
-    rows = whole(smoothed.products.attitudes("XTE", grade="smoothed", start=start, end=end))
+    rows = whole(smoothed.part(Products).attitudes("XTE", grade="smoothed", start=start, end=end))
     assert rows.time_ns.tolist() == [start.tai_ns + k * 10**9 for k in range(10)]
-    none = smoothed.products.attitudes(
+    none = smoothed.part(Products).attitudes(
         "XTE", grade="smoothed", start=parse_utc("1999-03-02T00:00:00Z")
     )
     assert list(none.blocks) == []
-    assert list(smoothed.products.attitudes("XTE", run="other", grade="smoothed").blocks) == []
+    none = smoothed.part(Products).attitudes("XTE", run="other", grade="smoothed")
+    assert list(none.blocks) == []
 
 
 def test_suspect_samples_are_given_when_they_are_asked_for(smoothed):
-    rows = whole(smoothed.products.attitudes("XTE", grade="filtered", status="all"))
+    rows = whole(smoothed.part(Products).attitudes("XTE", grade="filtered", status="all"))
     assert len(rows) == 1801
     assert rows.status[:49].tolist() == ["suspect"] * 48 + ["good"]
 
 
 @pytest.mark.parametrize("name", attitude_formats())
 def test_every_format_names_the_grade(smoothed, name):
-    series = smoothed.products.attitudes("XTE", grade="smoothed")
+    series = smoothed.part(Products).attitudes("XTE", grade="smoothed")
     data = b"".join(write_attitudes(name, series))
     if name == "csv":
         assert b"filter_smoother" in data
@@ -108,15 +110,16 @@ def test_every_format_names_the_grade(smoothed, name):
 
 def test_an_acm_names_the_method_in_the_standard_s_words(smoothed):
     for grade, word in WORDS.items():
-        text = b"".join(write_attitudes("acm", smoothed.products.attitudes("XTE", grade=grade)))
+        series = smoothed.part(Products).attitudes("XTE", grade=grade)
+        text = b"".join(write_attitudes("acm", series))
         assert re.search(rf"^AD_METHOD\s*= {word.upper()}$", text.decode(), re.MULTILINE)
         # Sums of stars are those of batches.
         assert b"USER_DEFINED_STARS" not in text
 
 
 def test_an_aem_is_read_again(smoothed):
-    rows = whole(smoothed.products.attitudes("XTE", grade="smoothed"))
-    series = smoothed.products.attitudes("XTE", grade="smoothed")
+    rows = whole(smoothed.part(Products).attitudes("XTE", grade="smoothed"))
+    series = smoothed.part(Products).attitudes("XTE", grade="smoothed")
     text = b"".join(write_attitudes("aem", series))
     assert b"COMMENT Angular velocity estimated by the filter" in text
     again = read_aem("xte.aem", io.BytesIO(text)).at(rows.time_ns)
@@ -156,10 +159,10 @@ def test_between_two_samples_the_covariance_is_no_less_than_theirs(client):
 def test_a_constant_rate_has_no_bias(app, half_hour):
     put_attitudes(app, half_hour[1].attitudes)
     app.grades.smooth("XTE")
-    series = app.products.attitudes("XTE", grade="smoothed", status="all")
+    series = app.part(Products).attitudes("XTE", grade="smoothed", status="all")
     (item, *_) = json.loads(b"".join(write_attitudes("json", series)))["items"]
     assert (item["model"], item["bias_deg_per_h"]) == ("constant_rate", None)
-    assert b"".join(write_attitudes("fits", app.products.attitudes("XTE", grade="smoothed")))
+    assert b"".join(write_attitudes("fits", app.part(Products).attitudes("XTE", grade="smoothed")))
 
 
 def test_the_latest_revision_is_given(smoothed, half_hour):
@@ -171,7 +174,7 @@ def test_the_latest_revision_is_given(smoothed, half_hour):
     )
     put_attitudes(smoothed, late, name="late")
     smoothed.grades.smooth("XTE")
-    rows = whole(smoothed.products.attitudes("XTE", grade="smoothed"))
+    rows = whole(smoothed.part(Products).attitudes("XTE", grade="smoothed"))
     assert set(rows.revision.tolist()) == {2}
 
 
@@ -187,7 +190,7 @@ def test_the_command_exports_a_grade(smoothed, database, capsysbinary):
 def test_the_command_gives_a_moment_in_a_grade(smoothed, database, capsys):
     moment = shifted(NOON, 900.5)
     raw, expected = (
-        smoothed.products.attitude_at("XTE", moment, "interpolated", grade=grade)
+        smoothed.part(Products).attitude_at("XTE", moment, "interpolated", grade=grade)
         for grade in ("raw", "smoothed")
     )
     smoothed.close()

@@ -9,6 +9,7 @@ from acquire_client import Client
 from service.access import Caller
 from service.app.factory import open_app
 from service.errors import BadBatch, BadFile
+from service.features.products.part import Products
 from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
 from service.observations import gyro_rows
 from service.observations.telemetry import read_lines
@@ -223,7 +224,7 @@ def test_an_export_can_be_read_with_a_column_for_the_spacecraft(service, tmp_pat
     app, _ = service
     told = line("round", rng=rng, samples=50, run="round")
     app.gyro.record(block_from_line(json.dumps(told)))
-    table = app.products.table("XTE", "gyro", run="round")
+    table = app.part(Products).table("XTE", "gyro", run="round")
     (page,) = table.pages
     times, _, blocks, *rates = page
     rows = [

@@ -52,7 +52,7 @@ AREAS = {
     "recording": ("service/storage/recording",),
     "ingest": ("service/ingest",),
     "packets": ("service/features/packets",),
-    "products": ("service/products",),
+    "products": ("service/features/products", "service/ephemerides", "service/table_files"),
     "requests": (
         "service/web/requests",
         "service/observations/csv_rows.py",

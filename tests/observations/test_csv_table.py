@@ -17,7 +17,7 @@ from service.observations.csv_rows import write_batches_csv
 from service.observations.decompress import Line
 from service.observations.schema import BatchIn, submission_from_json
 from service.observations.telemetry import read_lines, require_telemetry
-from service.products.tables import Column, Table, write_csv
+from service.table_files.table import Column, Table, write_csv
 
 HEADER = "spacecraft,batch,time,tracker,x,y,z,magnitude"
 GYRO = "spacecraft,run,block,time,rate_1_rad_per_s,rate_2_rad_per_s,rate_3_rad_per_s"

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from service.acquire import acquire
+from service.ephemerides.files import read_attitudes, read_ephemeris
 from service.errors import BadInput
 from service.gyro import block_from_line
 from service.observations.csv_rows import COLUMNS
@@ -22,7 +23,6 @@ from service.observations.input_formats import (
 )
 from service.observations.schema import submission_from_json
 from service.observations.telemetry import read_lines
-from service.products.reading.files import read_attitudes, read_ephemeris
 from service.times import parse_utc
 
 ROOT = Path(__file__).parents[2]

@@ -7,6 +7,7 @@ from msgspec import structs
 from sqlalchemy import inspect
 
 from service.errors import Busy, NotAvailable, WrongState
+from service.features.products.part import Products
 from service.observations.schema import OptionsIn
 from service.storage.archive import folder
 from service.storage.queries import compare_runs
@@ -84,7 +85,7 @@ def attitudes_of(app, limit):
 
 
 def table_of(app, kind, **period):
-    return [page for page in app.products.table("XTE", kind, **period).pages if page]
+    return [page for page in app.part(Products).table("XTE", kind, **period).pages if page]
 
 
 def joined(pages):
@@ -158,6 +159,8 @@ def test_records_what_they_show_and_what_ifs_are_the_same(filled, place):
 def test_products_and_their_numbers_are_the_same(filled, place):
     period = {"start": shifted(START, 30_000.0), "end": shifted(START, 200_000.0)}
 
+    products = filled.part(Products)
+
     def seen():
         return repr(
             (
@@ -165,10 +168,10 @@ def test_products_and_their_numbers_are_the_same(filled, place):
                 [joined(table_of(filled, kind)) for kind in ("batches", "stars")],
                 [joined(table_of(filled, kind, **period)) for kind in ("batches", "stars")],
                 [
-                    [vars(each) for each in filled.products.attitudes("XTE", order=order).blocks]
+                    [vars(each) for each in products.attitudes("XTE", order=order).blocks]
                     for order in ("oldest", "newest")
                 ],
-                filled.products.attitude_at("XTE", shifted(START, 4 * STEP_S), "nearest"),
+                products.attitude_at("XTE", shifted(START, 4 * STEP_S), "nearest"),
             )
         )
 

@@ -9,7 +9,7 @@ from fastapi import Query as InQuery
 
 from service.app.factory import open_app
 from service.cli import main
-from service.products.formats import OUTPUT_FORMATS, OutputFormat, table_formats
+from service.table_files.formats import TABLE_FORMATS, OutputFormat
 from service.web.app import bare_app, create_app
 from service.web.console.page import PAGES, ContextDep, PageQuery, console_page
 from service.web.requests.access import POLICIES, Policy
@@ -31,7 +31,7 @@ def write_ndjson(table):
 @pytest.fixture
 def ndjson(monkeypatch):
     added = OutputFormat("NDJSON", NDJSON, write_ndjson)
-    monkeypatch.setitem(OUTPUT_FORMATS, "ndjson", added)
+    monkeypatch.setitem(TABLE_FORMATS, "ndjson", added)
 
 
 @pytest.fixture
@@ -69,8 +69,8 @@ def test_a_new_format_is_written_by_the_api(ndjson, address, client, full_run):
 def test_a_new_format_is_described(ndjson):
     operation = bare_app().openapi()["paths"]["/api/v1/spacecraft/{name}/history"]["get"]
     (parameter,) = [each for each in operation["parameters"] if each["name"] == "format"]
-    assert parameter["schema"]["enum"] == ["json", *table_formats()]
-    types = {each.media_type for each in table_formats().values()}
+    assert parameter["schema"]["enum"] == ["json", *TABLE_FORMATS]
+    types = {each.media_type for each in TABLE_FORMATS.values()}
     assert set(operation["responses"]["200"]["content"]) == {"application/json", *types}
     assert NDJSON in types
 

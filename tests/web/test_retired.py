@@ -7,9 +7,9 @@ from urllib.parse import quote
 import httpx
 import pytest
 
-from service.app.products import open_products
 from service.errors import BadBatch, BadInput
 from service.features.alarms.part import Alarms
+from service.features.products.part import open_products
 from service.missions.mission import SHIPPED_FOLDER
 from service.observations.schema import submission_from_json
 from service.trends.limits import LimitSettings

@@ -1,4 +1,4 @@
-"""Attitudes as products: series, at a moment, live; how they are made, and how far they agree."""
+"""Attitude over time: the live one, how days get a definitive one, and how far they agree."""
 # Written by `make client` from service/contract/products.py.
 
 from collections.abc import Sequence

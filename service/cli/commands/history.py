@@ -8,8 +8,8 @@ from typing import Any
 
 from service.cli import arguments
 from service.cli.arguments import period_of, settings_of_existing
-from service.products.formats import table_formats, write_table
-from service.products.tables import Table
+from service.table_files.formats import TABLE_FORMATS, write_table
+from service.table_files.table import Table
 
 
 def add(commands: Any) -> None:
@@ -18,7 +18,7 @@ def add(commands: Any) -> None:
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")
     way = parser.add_mutually_exclusive_group()
-    way.add_argument("--format", choices=tuple(table_formats()), default="csv", help="default csv")
+    way.add_argument("--format", choices=tuple(TABLE_FORMATS), default="csv", help="default csv")
     way.add_argument("--json", action="store_true", help="write one JSON object per line")
     arguments.add_output(parser)
     arguments.add_database(parser)

@@ -226,7 +226,7 @@ def _print_counts(
 
 
 def _sources(parsed: Namespace) -> list["FromFile"]:
-    from service.products.reading.files import read_attitudes, read_ephemeris
+    from service.ephemerides.files import read_attitudes, read_ephemeris
     from service.replay.items import FileEphemeris, FilePrior
 
     sources: list[FromFile] = []

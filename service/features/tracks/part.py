@@ -9,7 +9,7 @@ from service.app.context import Context, known_id
 from service.app.factory import App
 from service.errors import NotFound
 from service.features.tracks import records as tracks
-from service.products.ccsds import TrackedObject, write_tdm
+from service.features.tracks.tdm import TrackedObject, write_tdm
 from service.storage.queries.pages import ResultFilter
 from service.storage.recording.unsaved_result import LIVE
 from service.times import Utc, shifted, utc_now

@@ -28,6 +28,7 @@ from sqlalchemy import (
 
 from service.contract.base import Count, Digest, Id, Moment, Stamp, doc
 from service.contract.products import LiveAttitude
+from service.ephemerides.rows import AttitudeRows
 from service.filtering.result import Status
 from service.grades.carried import Carried
 from service.grades.day import (
@@ -43,7 +44,6 @@ from service.grades.day import (
     unpacked,
 )
 from service.gyro import texts_of
-from service.products.attitudes import AttitudeRows
 from service.storage.grades.inputs import inside
 from service.storage.queries.pages import ResultFilter, covariance_of
 from service.storage.queries.time_buckets import buckets_between

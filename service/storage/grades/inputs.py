@@ -29,13 +29,13 @@ from service.identify.identification import Outcome
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.calibrate import CorrectedObservations, correct
+from service.observations.decode import RECORDED_RATES
 from service.observations.schema import submission_from_json
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.ephemeris import sun_distance_au
 from service.sky.model import SkyModel
 from service.storage.gyro import BlockFilter, rates_of, times_of
 from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, ResultFilter, covariance_of
-from service.storage.queries.result_tables import RATES
 from service.storage.queries.results import recorded_mission
 from service.storage.queries.time_buckets import buckets_between
 from service.storage.sql.grade_tables import gyro_blocks
@@ -95,7 +95,7 @@ def _carried_rates(
         part = chosen[first : first + _READ_AT_ONCE]
         inputs = _inputs(connection, [batch_ids[row] for row in part])
         for row in part:
-            sent = RATES.decode(inputs[batch_ids[row]]).body_rates_deg_per_s
+            sent = RECORDED_RATES.decode(inputs[batch_ids[row]]).body_rates_deg_per_s
             carried[row] = np.radians(sent or np.zeros(3))
     return carried if carried.any() else None
 
@@ -193,7 +193,7 @@ def last_attitudes(
     for row in connection.execute(_LAST, asked):
         covariance = np.array(covariance_of(row[8:]))
         known = Known(row.time_ns, np.array(row[4:8]), covariance / ARCSEC_PER_RADIAN**2)
-        rates = np.array(RATES.decode(row.input).body_rates_deg_per_s or np.zeros(3))
+        rates = np.array(RECORDED_RATES.decode(row.input).body_rates_deg_per_s or np.zeros(3))
         found.append(RecordedAttitude(row.id, recorded_utc(row.time), known, rates))
     return found
 

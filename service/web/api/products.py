@@ -1,6 +1,5 @@
-"""Products: attitudes, tables and tracks as files, and attitude over time."""
+"""Attitude over time: the live one, innovations, and how days get a definitive one."""
 
-from dataclasses import asdict
 from typing import Annotated, Self
 from urllib.parse import quote
 
@@ -11,7 +10,6 @@ from starlette.responses import Response
 
 from service.contract import products
 from service.observations.schema import RunName, Wire
-from service.products import formats
 from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import (
@@ -22,90 +20,10 @@ from service.web.requests.access import (
     json_response,
     page_response,
 )
-from service.web.requests.exports import ExportsDep, attached_as
 from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
 from service.web.requests.request_body import JsonBody, read_model
 
 router = ApiRouter("products")
-
-
-@router.serves(
-    "GET /spacecraft/{name}/attitude",
-    Policy("read", "path"),
-    Returns("The attitudes, in the requested format.", products.AttitudeProduct, attitudes=True),
-    problems=(503,),
-)
-def get_attitude(
-    name: SpacecraftPath,
-    query: FromQuery[params.AttitudeQuery],
-    app: AppDep,
-    exports: ExportsDep,
-    caller: CallerDep,
-) -> Response:
-    """The attitudes of a period, oldest first: as JSON, a table, or a file of flight dynamics."""
-    asked = query.asked()
-    format = asked.pop("format")
-    written = formats.attitude_formats()[format]
-    kind = "attitude" if query.grade == "raw" else f"attitude-{query.grade}"
-    series = app.products.attitudes(name, **asked, most_batches=written.most_batches)
-    return exports.response(
-        caller,
-        lambda: formats.write_attitudes(format, series),
-        written.media_type,
-        None
-        if format == formats.JSON_FORMAT
-        else attached_as(f"{name}-{query.run}-{kind}", format),
-    )
-
-
-@router.serves(
-    "GET /spacecraft/{name}/attitude/at",
-    Policy("read", "path"),
-    Returns("The attitude.", products.AttitudeAtMoment),
-)
-def get_attitude_at(
-    name: SpacecraftPath, query: FromQuery[params.AttitudeAtQuery], app: AppDep
-) -> Response:
-    """The attitude at a moment with its error: interpolated within a stretch, or the nearest.
-
-    404 if no attitude lies within the largest gap, or if the moment to interpolate at lies
-    within no stretch.
-    """
-    asked = query.asked()
-    found = app.products.attitude_at(name, asked.pop("time"), asked.pop("method"), **asked)
-    return json_response(products.AttitudeAtMoment(**asdict(found)))
-
-
-@router.serves(
-    "GET /spacecraft/{name}/tables/{kind}",
-    Policy("read", "path"),
-    Returns(
-        "The table, in the requested format.",
-        media_type=formats.OUTPUT_FORMATS["csv"].media_type,
-        tables=True,
-    ),
-    problems=(503,),
-)
-def get_table(
-    name: SpacecraftPath,
-    kind: params.TableKindPath,
-    query: FromQuery[params.TableQuery],
-    app: AppDep,
-    exports: ExportsDep,
-    caller: CallerDep,
-) -> Response:
-    """A table of a period, oldest first.
-
-    The batches with their quantities, their stars with outcomes, or the gyro samples.
-    """
-    written = formats.OUTPUT_FORMATS[query.format]
-    table = app.products.table(name, kind, **query.run_and_times, most_batches=written.most_batches)
-    return exports.response(
-        caller,
-        lambda: formats.write_table(query.format, table),
-        written.media_type,
-        attached_as(f"{name}-{query.run}-{kind}", query.format),
-    )
 
 
 @router.serves(

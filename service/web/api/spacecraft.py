@@ -8,7 +8,7 @@ from service.contract import spacecraft as models
 from service.contract.answers import Result
 from service.contract.events import RecordHead
 from service.contract.spacecraft import About, Overview
-from service.products.formats import JSON_FORMAT, OUTPUT_FORMATS, write_table
+from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS, write_table
 from service.web.openapi import CONTENT_LOCATION, LINK, ApiRouter, Returns
 from service.web.requests import query_parameters as params
 from service.web.requests.access import AppDep, CallerDep, Policy, json_response, page_response
@@ -90,7 +90,7 @@ def list_rates(name: SpacecraftPath, query: FromQuery[params.RatesQuery], app: A
 @router.serves(
     "GET /spacecraft/{name}/history",
     Policy("read", "path"),
-    Returns("The history, in the requested format.", models.History, THINNED, tables=True),
+    Returns("The history, in the requested format.", models.History, THINNED, formats="tables"),
     problems=(503,),
 )
 def get_history(
@@ -113,7 +113,7 @@ def get_history(
         return exports.response(
             caller,
             lambda: write_table(query.format, batch_table(pages)),
-            OUTPUT_FORMATS[query.format].media_type,
+            TABLE_FORMATS[query.format].media_type,
             history_headers(file, query.format, is_thinned=False),
         )
     history = app.spacecraft.history(

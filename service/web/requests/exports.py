@@ -14,8 +14,8 @@ from starlette.types import Receive, Scope, Send
 
 from service.access import Caller
 from service.errors import Busy, RateLimited
-from service.products.formats import OUTPUT_FORMATS, file_suffix, write_table
-from service.products.tables import Table
+from service.table_files.formats import TABLE_FORMATS, write_table
+from service.table_files.table import Table
 
 MAX_OF_ONE_TOKEN = 2
 MAX_EXPORTS = 8
@@ -109,7 +109,7 @@ THINNED = {
 
 def history_file(table: Table, format: str, name: str, *, is_thinned: bool) -> Response:
     """A short table as a file of that name."""
-    media_type = OUTPUT_FORMATS[format].media_type
+    media_type = TABLE_FORMATS[format].media_type
     content = b"".join(write_table(format, table))
     headers = history_headers(name, format, is_thinned=is_thinned)
     return Response(content, 200, headers, media_type=media_type)
@@ -122,10 +122,10 @@ def thinned_header(is_thinned: bool) -> dict[str, str]:
 
 def history_headers(name: str, format: str, *, is_thinned: bool) -> dict[str, str]:
     """The headers of a history as a file of that name."""
-    return attached_as(name, format) | thinned_header(is_thinned)
+    return attached_as(name, TABLE_FORMATS[format].suffix or format) | thinned_header(is_thinned)
 
 
-def attached_as(name: str, format: str) -> dict[str, str]:
+def attached_as(name: str, suffix: str) -> dict[str, str]:
     """The header that names the file that an answer is saved as."""
-    file = f"{name}.{file_suffix(format)}".replace(":", "_")
+    file = f"{name}.{suffix}".replace(":", "_")
     return {"Content-Disposition": f'attachment; filename="{file}"'}

@@ -15,16 +15,12 @@ from pydantic import (
     model_validator,
 )
 
-from service.app.products import TableKind
 from service.errors import BadInput
-from service.missions.product_settings import MAX_LARGEST_GAP_S, MIN_NAIF_ID, OBJECT_ID
 from service.observations.schema import Key, RunName
-from service.products.attitudes import ProductGrade, StatusWanted
-from service.products.formats import JSON_FORMAT, attitude_formats, table_formats
-from service.products.moment import AtMethod
 from service.storage.queries.results import OutcomeName, StatusName
 from service.storage.queries.time_buckets import Bucket
 from service.storage.queries.trends import MAX_SIZE, Strategy
+from service.table_files.formats import JSON_FORMAT, TABLE_FORMATS
 from service.times import Utc, parse_utc
 from service.trends.quantities import OneOf, QuantityName, RankedName, trend_names
 from service.web.requests.request_body import require_no_query
@@ -206,7 +202,7 @@ class HistoryQuery(PeriodQuery):
     ] = None
     format: Annotated[
         str,
-        OneOf(lambda: (JSON_FORMAT, *table_formats())),
+        OneOf(lambda: (JSON_FORMAT, *TABLE_FORMATS)),
         Field(description="`json`: columns; any other: a table, as a file."),
     ] = JSON_FORMAT
 
@@ -291,90 +287,3 @@ NO_QUERY = Depends(require_no_query)
 
 
 SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]
-
-
-LargestGap = Annotated[
-    float | None,
-    Field(
-        gt=0,
-        le=MAX_LARGEST_GAP_S,
-        allow_inf_nan=False,
-        description="Attitudes farther apart than this, in seconds, belong to two stretches. "
-        "Default: the mission's; of raw attitudes of a mission without the key, at least 60 and "
-        "two and a half times the usual time between batches of the period.",
-    ),
-]
-Statuses = Annotated[
-    StatusWanted, Field(description="Only good attitudes, only suspect ones, or `all`.")
-]
-Grades = Annotated[
-    ProductGrade,
-    Field(
-        description="`raw`: the attitudes of batches. `filtered`, `smoothed`: those that "
-        "`acquire smooth` recorded, the latest revision of each day."
-    ),
-]
-TableKindPath = Annotated[
-    TableKind,
-    Path(
-        description="`batches`: one row per batch; `stars`: one row per star; "
-        "`gyro`: one row per gyro sample."
-    ),
-]
-
-
-class AttitudeQuery(PeriodQuery):
-    """Attitudes of a period, in a format."""
-
-    format: Annotated[
-        str,
-        OneOf(lambda: tuple(attitude_formats())),
-        Field(description="`json`: objects; any other: a file."),
-    ] = JSON_FORMAT
-    grade: Grades = "raw"
-    status: Statuses = "good"
-    order: Annotated[
-        Literal["oldest", "newest"],
-        Field(description="Which come first. `newest` is for JSON and tables alone."),
-    ] = "oldest"
-    largest_gap_s: LargestGap = None
-    object_id: Annotated[
-        str | None,
-        Field(
-            pattern=f"^{OBJECT_ID}$",
-            description="OBJECT_ID of CCSDS messages, such as 1995-074A. Default: the mission's, "
-            "or else the name.",
-        ),
-    ] = None
-    naif_id: Annotated[
-        int | None,
-        Field(
-            ge=MIN_NAIF_ID,
-            le=-1,
-            description="NAIF's id of the spacecraft, for SPICE kernels. Default: the mission's.",
-        ),
-    ] = None
-
-
-class AttitudeAtQuery(RunQuery):
-    """A moment, and how its attitude is found."""
-
-    time: Annotated[Time, Field(description="The moment.")]
-    method: Annotated[
-        AtMethod,
-        Field(
-            description="`interpolated`: between the attitudes before and after the moment, within "
-            "a stretch. `nearest`: the nearest one within the largest gap."
-        ),
-    ] = "interpolated"
-    grade: Grades = "raw"
-    status: Statuses = "good"
-    largest_gap_s: LargestGap = None
-
-
-class TableQuery(PeriodQuery):
-    """A table of a period, in a format."""
-
-    format: Annotated[
-        str, OneOf(lambda: tuple(table_formats())), Field(description="The format of the file.")
-    ] = "csv"

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 
 from starlette.responses import Response
 
-from service.products.formats import attitude_formats
 from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
 from service.storage.queries.period import TrackerStarsOfPeriod
 from service.web.console.charts.all_sky import all_sky_chart
@@ -17,9 +16,13 @@ from service.web.console.charts.histogram import (
     residual_histogram,
 )
 from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
-from service.web.console.page import ContextDep, FromQuery, console_page
-from service.web.console.pages import files
-from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
+from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
+from service.web.console.pages.spacecraft import (
+    RANGES_S,
+    ShownPeriod,
+    SpacecraftQuery,
+    shown_period,
+)
 from service.web.requests.access import Policy
 
 
@@ -119,16 +122,24 @@ def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDe
         "grades.html.jinja",
         query.run,
         name=name,
-        missing=files.without_gyro(context, name, query.run, shown) if shown else "",
-        files_of=[
-            grade
-            for grade in files.GRADES
-            if shown and files.has_attitudes(context, name, query.run, shown, grade)
-        ],
+        missing=without_gyro(context, name, query.run, shown) if shown else "",
+        panels=context.panels("grades_page", name, query.run, shown) if shown else [],
         stretch=shown,
         ranges=list(RANGES_S),
         drawn=drawn,
         most_blocks=MOST_BLOCKS,
-        attitude_formats=attitude_formats(),
         jobs=context.app.definitive.all(name)[:JOBS],
+    )
+
+
+def without_gyro(context: PageContext, name: str, run: str, shown: ShownPeriod) -> str:
+    """What a filter lacks in a period, and what that means; empty where it has gyro data."""
+    if context.app.gyro.page(name, run=run, start=shown.start, end=shown.end, limit=1).items:
+        return ""
+    mission = context.app.context.known[name]
+    told = "" if mission.gyro else ", and the mission file has no table [gyro]"
+    return (
+        f"There are no gyro data in this period{told}. Without them the filter takes the rate for "
+        "constant: where the spacecraft turns, or batches are far apart, none of its attitudes is "
+        "good. The raw attitudes, one for each batch, do not need a gyro."
     )

@@ -1,0 +1,130 @@
+"""Reads attitudes as comma-separated values, such as the service exports them.
+
+A row is a time of UTC and the quaternion q1, q2, q3, qc from inertial to body, its scalar last.
+Rates of the body in deg/s and the number of the unbroken stretch are read where there are columns
+for them, rows of another status than good are left out, and other columns are passed over.
+Without that number a step of more than ten minutes ends a stretch.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Iterator
+from typing import IO
+
+import numpy as np
+
+from service.ephemerides.known import (
+    MOST_RECORDS,
+    KnownAttitudes,
+    Segment,
+    known_attitudes,
+    told_rates,
+)
+from service.ephemerides.tokens import MAX_LINE_BYTES, Source, Token
+from service.errors import BadFile, BadInput
+from service.observations.schema import NORM_TOLERANCE
+from service.times import parse_utc
+
+_QUATERNION, _RATES = ("q1", "q2", "q3", "qc"), ("rate_x", "rate_y", "rate_z")
+_HEADER = re.compile(rb"\A[^\n]*\bq1\b[^\n]*,|\A[^\n]*,[^\n]*\bq1\b", re.IGNORECASE)
+_LONGEST_STEP_NS = 600 * 10**9
+_Row = tuple[int, str, list[float], list[float]]
+
+
+def is_attitude_csv(start: bytes) -> bool:
+    """True if a file that begins so has a column of quaternions."""
+    return _HEADER.search(start) is not None
+
+
+def read_attitude_csv(name: str, file: IO[bytes]) -> KnownAttitudes:
+    """The attitudes of a file; raises `BadFile` naming file, line and column."""
+    source = Source(name)
+    segments: list[Segment] = []
+    rows: list[_Row] = []
+    line = begun = 1
+    for line, stretch, time_ns, numbers, rates in _rows(source, file):
+        if rows and time_ns <= rows[-1][0]:
+            raise source.bad(line, "time", "must be later than that of the row before")
+        if rows and (stretch != rows[-1][1] or _is_gap(stretch, time_ns - rows[-1][0])):
+            segments.append(_segment(begun, rows))
+            rows = []
+        begun = begun if rows else line
+        rows.append((time_ns, stretch, numbers, rates))
+        if line > MOST_RECORDS:
+            raise source.bad(line, "rows", f"are more than the {MOST_RECORDS:,} that are read")
+    if rows:
+        segments.append(_segment(begun, rows))
+    return known_attitudes(name, "", segments)
+
+
+def _is_gap(stretch: str, step_ns: int) -> bool:
+    return not stretch and step_ns > _LONGEST_STEP_NS
+
+
+def _segment(line: int, rows: list[_Row]) -> Segment:
+    time_ns = np.array([each[0] for each in rows], dtype=np.int64)
+    quaternion = np.array([each[2] for each in rows])
+    quaternion /= np.linalg.norm(quaternion, axis=1)[:, None]
+    rates = np.radians([each[3] for each in rows])
+    rate = None if np.isnan(rates).all() else told_rates(quaternion, rates)
+    return Segment(f"line {line}", time_ns, int(time_ns[0]), int(time_ns[-1]), quaternion, rate)
+
+
+def _rows(
+    source: Source, file: IO[bytes]
+) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
+    """The line, stretch, time, quaternion and rates (NaN: none) of each good row."""
+    names: list[str] = []
+    for line, cells in _cells(source, file):
+        if not names:
+            names = [each.strip().lower() for each in cells]
+            for column in ("time", *_QUATERNION):
+                if names.count(column) != 1:
+                    message = "must be there once: times of UTC, and quaternions with qc the scalar"
+                    raise source.bad(line, f"column {column}", message, ",".join(names))
+            missing = [each for each in _RATES if each not in names]
+            if 0 < len(missing) < len(_RATES):
+                raise source.bad(line, f"column {missing[0]}", "must be there beside other rates")
+            continue
+        if len(cells) != len(names):
+            message = f"must have {len(names)} cells, as the header has"
+            raise source.bad(line, "row", message, ",".join(cells))
+        row = dict(zip(names, (each.strip() for each in cells), strict=True))
+        if row.get("status", "good") != "good":
+            continue
+        try:
+            time_ns = parse_utc(row["time"]).tai_ns
+        except BadInput as error:
+            raise source.bad(line, "time", error.faults[0].message, row["time"]) from None
+        numbers = [_number(source, line, row, each) for each in _QUATERNION]
+        norm = math.hypot(*numbers)
+        if not abs(norm - 1.0) <= NORM_TOLERANCE:
+            message = f"must have norm 1 within {NORM_TOLERANCE}; its norm is {norm:.6g}"
+            raise source.bad(line, "quaternion", message, numbers)
+        rates = [_number(source, line, row, each) if row.get(each) else math.nan for each in _RATES]
+        yield line, row.get("stretch", ""), time_ns, numbers, rates
+
+
+def _number(source: Source, line: int, row: dict[str, str], column: str) -> float:
+    return source.number(Token(line, "state", f"column {column}"), row[column])
+
+
+def _cells(source: Source, file: IO[bytes]) -> Iterator[tuple[int, list[str]]]:
+    """The cells of the lines that are not empty, with their numbers."""
+    number = 0
+    while data := file.readline(MAX_LINE_BYTES + 1):
+        number += 1
+        if len(data) > MAX_LINE_BYTES:
+            raise source.bad(number, "line", f"must have at most {MAX_LINE_BYTES} bytes")
+        try:
+            text = data.decode("utf-8-sig" if number == 1 else "utf-8").strip()
+            cells = next(csv.reader([text], strict=True), [])
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise _bad_line(source, number, data, error) from None
+        if cells:
+            yield number, cells
+
+
+def _bad_line(source: Source, number: int, data: bytes, error: Exception) -> BadFile:
+    return source.bad(number, "line", f"is no row of comma-separated values: {error}", data[:40])

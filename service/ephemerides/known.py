@@ -1,0 +1,255 @@
+"""Attitudes or orbital states that a file gives in spans of time, and the one at a moment."""
+
+from bisect import bisect_left
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Literal, Protocol, TypeVar
+
+import numpy as np
+
+from service.ephemerides.rows import SAME_MOMENT_NS, Integers
+from service.errors import BadFile, Fault
+from service.interpolation import QUARTER_TURN_RAD, steps_between
+from service.times import Utc
+from service.vectors import Vector, rotation_vectors
+
+MOST_RECORDS = 5_000_000
+"""Attitudes that are held in memory, 40 bytes each, or 64 with rates."""
+
+CLOCK_NS = 200
+"""A time that went through a kernel's clock and ET comes back this near."""
+DISCRETE_NS = 1_000_000
+"""A moment this near to a record is that of the record, where nothing is known between."""
+
+STILL_RAD = 1e-5
+"""Rates of zeros are none where the body turns by more from one record to the next."""
+
+
+@dataclass(frozen=True)
+class Span:
+    """Records that are valid from one time to another, `Utc.tai_ns`; some may lie beyond both.
+
+    `place` names the span in messages.  The times of the records ascend.
+    """
+
+    place: str
+    time_ns: Integers
+    first_ns: int
+    last_ns: int
+
+
+@dataclass(frozen=True)
+class Segment(Span):
+    """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated.
+
+    `rate_rad_s` (n, 3) are the rates of the body relative to inertial, in body axes; None where
+    the file gives none.  Of a `discrete` segment nothing is known between two records.
+    """
+
+    quaternion: Vector
+    rate_rad_s: Vector | None = None
+    discrete: bool = False
+
+    def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
+        """The attitudes (n, 4) at moments (n,); NaN outside the segment and where none is known.
+
+        See `interpolation` for what is known between two records.  Rates (n, 3) about
+        the body axes, of another source, count for moments between records that have none, if the
+        body makes more than a quarter turn at them.
+        """
+        # A kernel's clock may put a record some nanoseconds off its moment.
+        moment = time_ns.clip(self.first_ns, self.last_ns)
+        inside = np.abs(moment - time_ns) <= SAME_MOMENT_NS
+        last = len(self.time_ns) - 1
+        after = np.searchsorted(self.time_ns, moment).clip(min(1, last), last)
+        before = (after - 1).clip(0)
+        step_ns = np.maximum(self.time_ns[after] - self.time_ns[before], 1)
+        rates: tuple[Vector | None, Vector | None] = (None, None)
+        if self.rate_rad_s is not None:
+            rates = (self.rate_rad_s[before], self.rate_rad_s[after])
+        elif rate_rad_s is not None:
+            turn = np.linalg.norm(rate_rad_s, axis=1) * step_ns * 1e-9
+            far = np.where((turn > QUARTER_TURN_RAD)[:, None], rate_rad_s, np.nan)
+            rates = (far, far)
+        steps = steps_between(
+            self.quaternion[before], self.quaternion[after], step_ns * 1e-9, *rates
+        )
+        q = steps.at((moment - self.time_ns[before]) / step_ns)
+        q[~steps.is_known] = np.nan
+        if self.discrete:
+            q[:] = np.nan
+        # Where a record is, it is given as it stands.
+        for place in (before, after):
+            apart_ns = np.abs(self.time_ns[place] - moment)
+            is_there = apart_ns <= (DISCRETE_NS if self.discrete else CLOCK_NS)
+            q[is_there] = self.quaternion[place[is_there]]
+        q[~inside] = np.nan
+        return q
+
+
+@dataclass(frozen=True)
+class KnownAttitudes:
+    """The attitudes of one object in a file: segments in order of time that do not overlap."""
+
+    object_name: str
+    segments: Sequence[Segment]
+
+    def __len__(self) -> int:
+        return sum(len(each.time_ns) for each in self.segments)
+
+    def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
+        """The attitudes (n, 4) at moments (n,); NaN where none is known; see `Segment.at`."""
+        starts = np.array([each.first_ns for each in self.segments], dtype=np.int64)
+        place = np.searchsorted(starts, time_ns + SAME_MOMENT_NS, side="right") - 1
+        found = np.full((len(time_ns), 4), np.nan)
+        for number in np.unique(place[place >= 0]).tolist():
+            chosen = place == number
+            rates = None if rate_rad_s is None else rate_rad_s[chosen]
+            found[chosen] = self.segments[number].at(time_ns[chosen], rates)
+        return found
+
+
+def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
+    """The rates (n, 3) of attitudes (n, 4); None where all are zero although the body turns."""
+    if rate_rad_s is None or rate_rad_s.any() or len(quaternion) < 2:
+        return rate_rad_s
+    turned = np.linalg.norm(rotation_vectors(quaternion[:-1], quaternion[1:]), axis=1)
+    return None if turned.max() > STILL_RAD else rate_rad_s
+
+
+def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) -> KnownAttitudes:
+    """The attitudes of a file in order of time; see `in_order`."""
+    if not segments:
+        raise BadFile(Fault(file, "has no attitude"))
+    return KnownAttitudes(object_name, in_order(file, segments))
+
+
+S = TypeVar("S", bound=Span)
+
+
+def in_order(file: str, segments: Sequence[S]) -> list[S]:
+    """The segments of a file in order of time.
+
+    Raises `BadFile` where one has no useable time, and where two overlap.
+    """
+    for each in segments:
+        if each.first_ns > each.last_ns:
+            raise BadFile(Fault(f"{file}, {each.place}", "the segment has no useable time"))
+    ordered = sorted(segments, key=lambda each: each.first_ns)
+    for one, other in pairwise(ordered):
+        if other.first_ns < one.last_ns:
+            message = f"overlaps the segment at {one.place}: a time belongs to one segment"
+            raise BadFile(Fault(f"{file}, {other.place}", message))
+    return ordered
+
+
+def by_priority(segments: Sequence[Segment]) -> list[Segment]:
+    """Segments of which none overlap: a time belongs to the last one that has it.
+
+    Between the records of a discrete segment nothing is known, and those before it hold.
+    """
+    firsts: list[int] = []
+    lasts: list[int] = []
+    found = []
+    for segment in reversed(segments):
+        spans = [(segment.first_ns, segment.last_ns)]
+        if segment.discrete:
+            spans = [(int(t) - DISCRETE_NS, int(t) + DISCRETE_NS) for t in segment.time_ns]
+        for first_ns, last_ns in spans:
+            place = end = bisect_left(lasts, first_ns)
+            begin = first_ns
+            while end < len(firsts) and firsts[end] <= last_ns:
+                if begin < firsts[end]:
+                    found.append(replace(segment, first_ns=begin, last_ns=firsts[end] - 1))
+                # A moment just after an interval is that of its end, see `KnownAttitudes.at`.
+                begin = lasts[end] + SAME_MOMENT_NS + 1
+                end += 1
+            if begin <= last_ns:
+                found.append(replace(segment, first_ns=begin, last_ns=last_ns))
+            low = min([first_ns, *firsts[place:end]])
+            high = max([last_ns, *lasts[place:end]])
+            firsts[place:end], lasts[place:end] = [low], [high]
+    return found
+
+
+Interpolation = Literal["HERMITE", "LAGRANGE"]
+
+
+class Ephemeris(Protocol):
+    """The motion of one object, as a file describes it."""
+
+    @property
+    def object_name(self) -> str:
+        """The object."""
+
+    def at(self, moment: Utc) -> Vector | None:
+        """The geocentric state (6,) in EME2000, km and km/s; None where the file has none."""
+
+
+@dataclass(frozen=True)
+class StateSegment(Span):
+    """States (n, 6), in km and km/s, between which it may be interpolated.
+
+    The polynomial goes through `points` states: HERMITE through their positions and velocities,
+    with the velocity as its derivative, LAGRANGE through positions and velocities apart.
+    """
+
+    state: Vector
+    method: Interpolation
+    points: int
+
+    def at(self, time_ns: int) -> Vector | None:
+        """The state (6,) at a moment; None outside the segment."""
+        if not self.first_ns <= time_ns <= self.last_ns:
+            return None
+        after = int(np.searchsorted(self.time_ns, time_ns))
+        if self.time_ns[after] == time_ns:
+            return np.array(self.state[after])
+        window = self._window(after, time_ns)
+        offset_s = (self.time_ns[window] - time_ns) * 1e-9
+        # Steps of about 1: powers of seconds would lose digits.
+        unit_s = float(np.ptp(offset_s)) / max(self.points - 1, 1)
+        from scipy.interpolate import KroghInterpolator
+
+        place, state = offset_s / unit_s, self.state[window]
+        if self.method == "LAGRANGE":
+            return np.asarray(KroghInterpolator(place, state)(0.0))
+        values = np.stack([state[:, :3], state[:, 3:] * unit_s], axis=1).reshape(-1, 3)
+        position, velocity = KroghInterpolator(np.repeat(place, 2), values).derivatives(0.0, 2)
+        return np.concatenate([position, velocity / unit_s])
+
+    def _window(self, after: int, time_ns: int) -> slice:
+        """The states that the polynomial goes through: as many before the moment as after it.
+
+        Of an odd number the nearest state is in the middle; at the ends of the segment the
+        window ends there too.
+        """
+        first = after - self.points // 2
+        nearer_after = 2 * time_ns > self.time_ns[after - 1] + self.time_ns[after]
+        if self.points % 2 and not nearer_after:
+            first -= 1
+        first = min(max(first, 0), len(self.time_ns) - self.points)
+        return slice(first, first + self.points)
+
+
+@dataclass(frozen=True)
+class KnownStates:
+    """The states of one object in a file: segments in order of time that do not overlap."""
+
+    object_name: str
+    segments: Sequence[StateSegment]
+
+    def at(self, moment: Utc) -> Vector | None:
+        """The geocentric state (6,) in EME2000, km and km/s; None outside every segment."""
+        for each in reversed(self.segments):
+            if each.first_ns <= moment.tai_ns:
+                return each.at(moment.tai_ns)
+        return None
+
+
+def known_states(file: str, object_name: str, segments: Sequence[StateSegment]) -> KnownStates:
+    """The states of a file in order of time; see `in_order`."""
+    if not segments:
+        raise BadFile(Fault(file, "has no state"))
+    return KnownStates(object_name, in_order(file, segments))

@@ -1,0 +1,207 @@
+"""Reads OEM versions 1 to 3 (CCSDS 502.0-B), KVN and XML: positions and velocities of a spacecraft.
+
+States are geocentric, in km and km/s.  Accelerations and covariances are passed over.
+"""
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import IO
+
+import numpy as np
+
+from service.ephemerides import tokens as ccsds
+from service.ephemerides.known import (
+    Interpolation,
+    KnownStates,
+    StateSegment,
+    known_states,
+)
+
+_VERSIONS = ("1.0", "2.0", "3.0")
+_HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")
+_REQUIRED = (
+    "OBJECT_NAME",
+    "OBJECT_ID",
+    "CENTER_NAME",
+    "REF_FRAME",
+    "TIME_SYSTEM",
+    "START_TIME",
+    "STOP_TIME",
+)
+_METADATA = (
+    *_REQUIRED,
+    "REF_FRAME_EPOCH",
+    "USEABLE_START_TIME",
+    "USEABLE_STOP_TIME",
+    "INTERPOLATION",
+    "INTERPOLATION_DEGREE",
+)
+_METHODS: dict[str, Interpolation] = {
+    "HERMITE": "HERMITE",
+    "LAGRANGE": "LAGRANGE",
+    "LINEAR": "LAGRANGE",
+}
+MOST_DEGREE = 19
+"""Polynomials of higher degree follow the rounding of the states."""
+DEFAULT_DEGREE = 7
+"""The degree of Hermite's interpolation, where the file names none."""
+EARTH_GM_KM3_PER_S2 = 398600.4418
+LONGEST_STEP_OF_PERIOD = 1 / 12
+"""The longest step between states if no interpolation is named: a longer one costs kilometres."""
+SHORT_NS = 10**9
+"""The states must reach START_TIME and STOP_TIME this near, else the file was cut short."""
+MAX_KM, MAX_KM_PER_S = 1e9, 100.0
+_NAMES = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
+
+
+@dataclass
+class _Form:
+    """The form of a segment's states by its metadata, and the states read so far."""
+
+    line: int
+    time_system: str
+    span_ns: tuple[int, int]
+    useable_ns: tuple[int | None, int | None]
+    method: Interpolation
+    degree: int | None
+    has_ended: bool = False
+    """Covariances follow the states and end them."""
+    times: list[int] = field(default_factory=list)
+    states: list[list[float]] = field(default_factory=list)
+
+
+def read_oem(name: str, file: IO[bytes]) -> KnownStates:
+    """The states of a message; raises `BadFile` naming file, line and field."""
+    return _Reader(ccsds.Source(name)).read(file)
+
+
+class _Reader(ccsds.MessageReader):
+    def read(self, file: IO[bytes]) -> KnownStates:
+        tokens = ccsds.tokens_of(self._source, file, ccsds.OEM)
+        ccsds.read_version(self._source, next(tokens, None), ccsds.OEM, _VERSIONS)
+        segments: list[StateSegment] = []
+        form: _Form | None = None
+        last = 1
+        for token in tokens:
+            last = token.line
+            if token.name == "META_START":
+                if form is not None:
+                    segments.append(self._made(form, last))
+                form = self._form(
+                    ccsds.read_metadata(self._source, tokens, token.line, _METADATA, ccsds.OEM)
+                )
+            elif form is None:
+                if token.kind != "key" or token.name not in _HEADER:
+                    raise self._source.bad_token(token, "is out of place: META_START is expected")
+            elif token.name == "COVARIANCE_START":
+                self._pass_covariances(tokens, token.line)
+                form.has_ended = True
+            elif token.kind == "state" and not form.has_ended:
+                self._add(form, token)
+            else:
+                raise self._source.bad_token(token, "is out of place among the states")
+        if form is None:
+            raise self._source.bad(last, "META_START", "is missing: the message has no segment")
+        segments.append(self._made(form, last))
+        return known_states(self._source.name, self._object_name, segments)
+
+    def _pass_covariances(self, tokens: Iterator[ccsds.Token], line: int) -> None:
+        for token in tokens:
+            if token.name == "COVARIANCE_STOP":
+                return
+        raise self._source.bad(line, "COVARIANCE_STOP", "is missing: the file was cut short")
+
+    def _form(self, metadata: ccsds.Metadata) -> _Form:
+        metadata.require(_REQUIRED)
+        metadata.one_of("CENTER_NAME", ("EARTH",))
+        metadata.one_of("REF_FRAME", ccsds.INERTIAL)
+        time_system = metadata.time_system()
+        self._check_object(metadata)
+        method, degree = self._interpolation(metadata)
+        return _Form(
+            line=metadata.line,
+            time_system=time_system,
+            span_ns=metadata.span(time_system),
+            useable_ns=metadata.useable(time_system),
+            method=method,
+            degree=degree,
+        )
+
+    def _interpolation(self, metadata: ccsds.Metadata) -> tuple[Interpolation, int | None]:
+        """The method, and the degree where one is given."""
+        if "INTERPOLATION" not in metadata.values:
+            return "HERMITE", None
+        name = metadata.one_of("INTERPOLATION", tuple(_METHODS))
+        if name == "LINEAR":
+            return "LAGRANGE", 1
+        metadata.require(("INTERPOLATION_DEGREE",))
+        text = metadata.values["INTERPOLATION_DEGREE"]
+        if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MOST_DEGREE):
+            message = f"must be a whole number from 1 to {MOST_DEGREE}"
+            raise metadata.fault("INTERPOLATION_DEGREE", message)
+        return _METHODS[name], int(text)
+
+    def _add(self, form: _Form, token: ccsds.Token) -> None:
+        words = token.words if token.names is None else self._source.named(token, _NAMES)
+        if len(words) not in (7, 10):
+            message = "must have an epoch, a position and a velocity"
+            raise self._source.bad(token.line, "state", message, " ".join(words))
+        time_ns = self._source.epoch_ns(token, words[0], form.time_system)
+        self._count_state(token, words[0], time_ns, form.times)
+        state = [self._source.number(token, word) for word in words[1:]][:6]
+        for name, most, unit in (("position", MAX_KM, "km"), ("velocity", MAX_KM_PER_S, "km/s")):
+            part = state[:3] if name == "position" else state[3:]
+            if max(map(abs, part)) > most:
+                raise self._source.bad(token.line, name, f"must be within {most:g} {unit}", part)
+        form.times.append(time_ns)
+        form.states.append(state)
+
+    def _made(self, form: _Form, line: int) -> StateSegment:
+        """The segment, whose last token is in a line or before it."""
+        if not form.times:
+            raise self._source.bad(form.line, "META_STOP", "begins a segment of no state")
+        if form.times[0] > form.span_ns[0] + SHORT_NS:
+            raise self._source.bad(form.line, "states", "the first state is later than START_TIME")
+        if form.times[-1] < form.span_ns[1] - SHORT_NS:
+            message = "the last state is earlier than STOP_TIME: the file was cut short"
+            raise self._source.bad(line, "states", message)
+        count = len(form.times)
+        points = self._points(form, count)
+        if form.degree is None:
+            self._check_steps(form)
+        return StateSegment(
+            f"line {form.line}",
+            np.array(form.times, dtype=np.int64),
+            *ccsds.useable_span(form.times, form.useable_ns),
+            np.array(form.states),
+            form.method,
+            points,
+        )
+
+    def _check_steps(self, form: _Form) -> None:
+        """Refuse states too far apart, measured by the period of a circular orbit at the lower."""
+        step_s = np.diff(np.array(form.times)) * 1e-9
+        radius_km = np.linalg.norm(np.array(form.states)[:, :3], axis=1)
+        lower_km = np.minimum(radius_km[:-1], radius_km[1:])
+        longest_s = LONGEST_STEP_OF_PERIOD * math.tau * np.sqrt(lower_km**3 / EARTH_GM_KM3_PER_S2)
+        for k in np.flatnonzero(step_s > longest_s)[:1]:
+            raise self._source.bad(
+                form.line,
+                "INTERPOLATION",
+                f"is missing, and {step_s[k]:.0f} s lie between two of its states, where at most "
+                f"{longest_s[k]:.0f} s give positions to about a kilometre",
+            )
+
+    def _points(self, form: _Form, count: int) -> int:
+        """Through how many states the polynomial goes."""
+        degree = DEFAULT_DEGREE if form.degree is None else form.degree
+        # A state gives Hermite's polynomial two conditions, its position and its velocity; through
+        # one alone would be a line that ends at the next.
+        points = degree + 1 if form.method == "LAGRANGE" else max(degree // 2 + 1, 2)
+        if form.degree is None:
+            return min(points, count)
+        if points > count:
+            message = f"degree {degree} needs {points} states; the segment has {count}"
+            raise self._source.bad(form.line, "INTERPOLATION_DEGREE", message)
+        return points

@@ -1,0 +1,82 @@
+"""Attitudes as products: a series, and the one at a moment."""
+
+from typing import Annotated, Literal
+
+from msgspec import UNSET, UnsetType
+
+from service.contract.base import (
+    Components,
+    Count,
+    Covariance,
+    DescribedAs,
+    Id,
+    Moment,
+    Record,
+    Status,
+    doc,
+)
+
+ContinuousQuaternion = Annotated[
+    list[float],
+    doc(
+        "Transforms inertial into body components; scalar last. Signs are continuous within a "
+        "stretch, so qc may be negative."
+    ),
+]
+
+
+class ProductAttitude(Record, frozen=True, kw_only=True):
+    """An attitude of a series."""
+
+    time: Moment
+    quaternion: ContinuousQuaternion
+    covariance_arcsec2: Covariance
+    rate_deg_per_s: Components | None
+    """Rate of the body relative to inertial space, in body axes; null: unknown."""
+    rate_origin: Literal["own", "derived", "estimated", "none"]
+    """`own`: of the batch. `derived`: from the attitudes before and after. `estimated`: by the
+    filter."""
+    status: Status
+    method: Annotated[
+        str, DescribedAs(Literal["quest", "triad", "measured", "ekf", "filter_smoother"])
+    ]
+    """`ekf` of the grade `filtered`, `filter_smoother` of `smoothed`."""
+    residual_rms_arcsec: float | None
+    """null unless the grade is `raw` and the attitude is of stars."""
+    predicted_rms_arcsec: Annotated[float | None, doc("null unless the grade is `raw`.")]
+    stretch: Annotated[Count, doc("Number of the unbroken stretch, from 0.")]
+    batch: Annotated[str | None, doc("null unless the grade is `raw`.")]
+    id: Annotated[Id, doc("The result's id; unless the grade is `raw`, the revision's.")]
+    model: Literal["gyro", "constant_rate"] | UnsetType = UNSET
+    """What the filter knows of the motion: the rates of a gyro, or that the rate is constant but
+    for a random walk. Absent if the grade is `raw`."""
+    revision: int | UnsetType = UNSET
+    """Number of the revision of the day's attitudes, from 1. Absent if the grade is `raw`."""
+    bias_deg_per_h: Components | UnsetType | None = UNSET
+    """Bias of the gyro, in body axes; null at a constant rate. Absent if the grade is `raw`."""
+    bias_sigma_deg_per_h: Components | UnsetType = UNSET
+    """One sigma of the bias or, at a constant rate, of the rate. Absent if the grade is `raw`."""
+
+
+class AttitudeProduct(Record, frozen=True, kw_only=True):
+    """Attitudes in order of time."""
+
+    about: Annotated[dict[str, str], doc("Where the attitudes come from: filters and origin.")]
+    items: list[ProductAttitude]
+
+
+class AttitudeAtMoment(Record, frozen=True, kw_only=True):
+    """The attitude at a moment, with its error."""
+
+    time: Moment
+    method: Literal["nearest", "interpolated"]
+    quaternion: ContinuousQuaternion
+    covariance_arcsec2: Covariance
+    """Covariance due to the attitudes used and the motion. Between two batches their errors are
+    independent; between filtered or smoothed samples it is the weighted mean."""
+    motion_arcsec: float | None
+    """The error that the motion adds. Nearest: the angle that the body turns until the moment.
+    Interpolated: an eighth of the step times the change of the rate, over more than a quarter turn
+    a bound from the rates. Null: no rate is known."""
+    offset_s: Annotated[float, doc("From the moment to the nearest attitude that was used.")]
+    ids: Annotated[list[Id], doc("The results that were used.")]

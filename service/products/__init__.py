@@ -1,1 +1,0 @@
-"""Products: attitudes and tables in the formats that other programs read."""

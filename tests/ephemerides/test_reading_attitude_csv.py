@@ -1,0 +1,136 @@
+"""Attitudes as CSV: those that the service exports are read again, and files of no format named."""
+
+import gzip
+
+import numpy as np
+import pytest
+
+from service.ephemerides import files
+from service.ephemerides.files import read_attitudes, read_ephemeris
+from service.errors import BadFile
+from tests.ephemerides.test_reading_aem import V2
+from tests.features.products.series import GOLDEN, random_quaternions, rows, slew, whole, written
+from tests.features.products.test_spinners import about_z, off_deg
+
+ROWS = """\
+time,q1,q2,q3,qc,rate_x,rate_y,rate_z
+1996-01-10T12:00:00.000Z,0,0,0,1,0,0,24
+1996-01-10T12:00:10.000Z,{},0,0,24
+"""
+SPUN = ROWS.format(",".join(map(repr, about_z(240.0).tolist())))
+
+
+def read(data, tmp_path):
+    (tmp_path / "a.csv").write_bytes(data if isinstance(data, bytes) else data.encode())
+    return read_attitudes(tmp_path / "a.csv", "FILE")
+
+
+def test_what_the_service_exports_is_read_again(rng, tmp_path):
+    pages = [rows(random_quaternions(rng, 400)), rows(slew(30), "2018-01-10T12:00:00Z")]
+    pages.append(rows([GOLDEN], "2019-01-10T12:00:00Z"))
+    known, wanted = read(written("csv", *pages), tmp_path), whole(*pages)
+    assert (len(known.segments), len(known)) == (3, len(wanted))
+    np.testing.assert_allclose(known.at(wanted.time_ns), wanted.quaternion, rtol=0, atol=3e-16)
+
+
+def test_rates_of_a_row_tell_how_often_the_body_turned(tmp_path):
+    """24 deg/s and ten seconds: the shorter way would be 120 degrees, the other way round."""
+    known = read(SPUN, tmp_path)
+    (segment,) = known.segments
+    middle = known.at(segment.time_ns[:1] + 5 * 10**9)[0]
+    assert off_deg(middle, about_z(120.0)) < 1e-6
+    without = read(SPUN.replace(",rate_", ",other_"), tmp_path)
+    assert np.isnan(without.at(segment.time_ns[:1] + 5 * 10**9)).all()
+
+
+@pytest.mark.parametrize("text", [SPUN, V2], ids=["csv", "aem"])
+def test_files_packed_with_gzip_are_read(text, tmp_path):
+    plain, packed = (read(each, tmp_path) for each in (text, gzip.compress(text.encode())))
+    assert plain.segments[0].quaternion.tobytes() == packed.segments[0].quaternion.tobytes()
+    with pytest.raises(BadFile, match="is damaged gzip"):
+        read(gzip.compress(text.encode())[:-12], tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("qc", "q4", "line 1: column qc: must be there once"),
+        ("rate_y", "y", "line 1: column rate_y: must be there beside other rates"),
+        ("time", "utc", "line 1: column time: must be there once"),
+        ("0,0,0,1", "0,0,0,2", "line 2: quaternion: must have norm 1"),
+        ("0,0,0,1", "0,0,x,1", "line 2: column q3: must be a number"),
+        ("0,0,0,1", "0,0,0,1,1", "line 2: row: must have 8 cells"),
+        ("12:00:10", "12:00:00", "line 3: time: must be later"),
+        ("12:00:10", "24:00:10", "line 3: time: "),
+    ],
+)
+def test_a_bad_row_is_refused_by_file_line_and_column(old, new, words, tmp_path):
+    with pytest.raises(BadFile, match=rf"a.csv, {words}"):
+        read(SPUN.replace(old, new, 1), tmp_path)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"SIMPLE  =                    T / conforms to FITS standard".ljust(2880),
+        b"PAR1" + bytes(40),
+        b'[{"time": "1996-01-10T12:00:00Z", "quaternion": [0, 0, 0, 1]}]',
+        b"Type OrientationsGalactic\nOG 1835487300.0 68.4 44.6 158.4 22.6\n",
+    ],
+)
+def test_a_file_of_no_format_that_is_read_is_told_those_that_are(data, tmp_path):
+    with pytest.raises(BadFile, match=r"a.csv, line 1.*of no format that is read here.*AEM or ACM"):
+        read(data, tmp_path)
+
+
+def test_an_orbit_in_fits_is_told_the_formats_of_orbits(tmp_path):
+    (tmp_path / "x").write_bytes(b"SIMPLE  =".ljust(2880))
+    with pytest.raises(BadFile, match=r"x, line 1.*OEM .*OMM .*and TLE"):
+        read_ephemeris(tmp_path / "x", "--ephemeris")
+
+
+def test_without_a_column_of_stretches_a_step_of_more_than_ten_minutes_is_a_gap(tmp_path):
+    times = ["00:00:00", "00:10:00", "00:20:00.001", "12:00:00"]
+    told = [f"1996-01-10T{each}Z,0,0,0,1" for each in times]
+    known = read("\n".join(["time,q1,q2,q3,qc", *told]), tmp_path)
+    assert [len(each.time_ns) for each in known.segments] == [2, 1, 1]
+    first_ns = known.segments[0].time_ns[0]
+    seconds = np.array([300.0, 900.0, 20_000.0])
+    told = np.isfinite(known.at(first_ns + (seconds * 1e9).astype(np.int64))).all(axis=1)
+    assert told.tolist() == [True, False, False]
+    whole = ["time,q1,q2,q3,qc,stretch", *(f"1996-01-10T{each}Z,0,0,0,1,1" for each in times)]
+    assert len(read("\n".join(whole), tmp_path).segments) == 1
+
+
+def test_a_header_in_capitals_is_read(tmp_path):
+    head, rest = SPUN.split("\n", 1)
+    known = read(f"{head.upper()}\n{rest}", tmp_path)
+    assert (
+        known.segments[0].rate_rad_s.tobytes()
+        == read(SPUN, tmp_path).segments[0].rate_rad_s.tobytes()
+    )
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_an_aem_with_comments_before_its_version_is_read(end, tmp_path):
+    text = f"COMMENT made by hand\nCOMMENT\n\n{V2}".replace("\n", end)
+    assert len(read(text.encode(), tmp_path)) == 2
+
+
+TRUTH = '{"spacecraft":"XTE","time":"1996-01-10T12:00:0%dZ","quaternion":[0,0,0,1]}\n'
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (b'{"a":' + b"[" * 100_000, "line 1: is no truth"),
+        (gzip.compress(b"{" + b" " * (2 << 20)), "line 1: must have at most 1048576 bytes"),
+        ("".join(TRUTH % k for k in range(4)), "line 4: is more than the 3 lines"),
+    ],
+    ids=["deep", "long", "many"],
+)
+def test_a_truth_beyond_what_is_read_is_refused_by_line(data, words, tmp_path, monkeypatch):
+    monkeypatch.setattr(files, "MOST_RECORDS", 3)
+    with pytest.raises(BadFile, match=words):
+        read(data, tmp_path)
+    assert len(read("".join(TRUTH % k for k in range(3)), tmp_path)) == 3
