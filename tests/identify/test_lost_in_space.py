@@ -12,9 +12,10 @@ import pytest
 from scipy.spatial import cKDTree
 
 from service.attitude.solution import NoAttitude
+from service.identify.lost_in_space.decision import star_probabilities
 from service.identify.lost_in_space.finder import magnitude_offset, search_sky
 from service.identify.lost_in_space.matching import nearest_stars
-from service.identify.lost_in_space.solver import FieldOfView, LostInSpace
+from service.identify.lost_in_space.solver import FieldOfView, LostInSpace, _solve
 from service.missions.mission import RunCatalogSettings
 from service.simulate.scenes import (
     Conditions,
@@ -27,7 +28,7 @@ from service.simulate.scenes import (
 from service.sky.catalog.run_catalog import build_run_catalog
 from service.sky.catalog.star_catalog import load_embedded
 from service.sky.whole_sky.index import build_sky_index
-from service.vectors import unit
+from service.vectors import locked, unit
 from tests.chance import at_least, at_most
 from tests.scale import draws, some_in_a_sitting
 
@@ -154,7 +155,7 @@ def test_a_rich_field_is_as_sure_as_can_be(index, rng):
     assert len(field) > 60
     places = unit(field[:, :3] + rng.normal(0.0, sigma_rad, (len(field), 3)))
     sigmas = np.full(len(field), sigma_rad)
-    result = LostInSpace(index, FieldOfView(6.0)).solve(places, field[:, 3], sigmas)
+    result = LostInSpace(index, FieldOfView(6.0)).solve(places, field[:, 3].copy(), sigmas)
     assert result.attitude is not None
     assert np.abs(result.attitude - np.eye(3)).max() < 1e-6
     assert 690.0 < result.log_odds < math.inf
@@ -184,6 +185,18 @@ def test_a_cluster_that_fixes_no_roll_is_no_attitude(sky, index, seed):
         direction, np.asarray(catalog.magnitude_mag[row]), np.full(len(row), 6e-4)
     )
     assert result.attitude is None
+
+
+def test_points_that_cannot_be_written_to_are_no_other_kind_to_the_kernel(sky, solver, seed):
+    """Else the kernel would be compiled again in the way of a post."""
+    scene = next(draw_scenes(sky, Conditions(fewest=6), 1, seed))
+    given = [np.array(each) for each in (scene.direction, scene.magnitude_mag, scene.sigma_rad)]
+    result = solver.solve(*given)
+    kinds = len(_solve.signatures)
+    solver.chances(solver.solve(*map(locked, given)), *given)
+    solver.chances(result, *map(locked, given))
+    assert len(_solve.signatures) == kinds
+    assert len(star_probabilities.signatures) == 1
 
 
 def test_the_order_of_the_points_does_not_matter(sky, solver, seed, rng):

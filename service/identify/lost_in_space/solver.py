@@ -151,8 +151,7 @@ class LostInSpace:
         """
         block = _BLOCKS.pop() if _BLOCKS else np.empty(words_for(USUAL_POINTS))
         code, *rest = _solve(
-            # Always read-only, or it would be compiled twice.
-            *(direction, locked(magnitude_mag), sigma_rad, velocity_c),
+            *map(locked, (direction, magnitude_mag, sigma_rad, velocity_c)),
             *(self.index.store, self._field, max_work, block),
         )
         _BLOCKS.append(block)
@@ -167,7 +166,7 @@ class LostInSpace:
         velocity_c: Vector = _AT_REST,
     ) -> StarChances:
         """How sure the star of every point is, at the attitude that was found."""
-        points = Points(direction, magnitude_mag, sigma_rad, velocity_c)
+        points = Points(*map(locked, (direction, magnitude_mag, sigma_rad, velocity_c)))
         doubt = 1.0 / (1.0 + math.exp(min(result.log_odds, 700.0)))
         gate = magnitude_gate(self.field.magnitude_sigma_mag)
         return StarChances(
@@ -180,11 +179,7 @@ class LostInSpace:
 
 @njit(nogil=True)
 def _sort_points(direction, magnitude, sigma, velocity, workspace):  # type: ignore[no-untyped-def]
-    """The points brightest first, those of unknown magnitude last, each in the order given.
-
-    What was given may be of many kinds of array, for each of which this is
-    compiled; what comes after is compiled once.
-    """
+    """The points brightest first, those of unknown magnitude last, each in the order given."""
     n = len(direction)
     order, points = order_in(workspace), points_in(workspace)
     for k in range(n):

@@ -178,12 +178,12 @@ def scene_of(
     reference_sigma = float(sigma_rad.min()) if len(sigma_rad) else 1.0
     nothing = np.empty(0)
     observed = ObservedStars(
-        direction=direction,
+        direction=locked(direction),
         magnitude=nothing,
-        sigma_rad=sigma_rad,
+        sigma_rad=locked(sigma_rad),
         weight=(reference_sigma / sigma_rad) ** 2,
         reference_sigma=reference_sigma,
-        velocity=velocity_c,
+        velocity=locked(velocity_c),
         prior_kind=0,
         prior_axis=np.zeros(3),
     )

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from service.compiled.jit import njit
 from service.sky.geometry.directions import axes_across
-from service.vectors import Vector
+from service.vectors import Vector, locked
 
 CELLS = 1632
 """Along an edge of the square: cells of 3.7 to 11 arcmin, 333 kB; a cache holds several."""
@@ -32,7 +32,7 @@ Bits = npt.NDArray[np.uint8]
 def build_sky_bitmap(direction: Vector, radius_rad: float) -> Bits:
     """The bits of unit vectors (n, 3), eight to a byte."""
     bits = np.zeros(CELLS * CELLS // 8, np.uint8)
-    _fill(direction, _disc(radius_rad), bits)
+    _fill(locked(direction), _disc(radius_rad), bits)
     return bits
 
 

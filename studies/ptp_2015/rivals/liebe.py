@@ -20,7 +20,7 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.directions import separation_rad
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.triangles import REACH_DEG, chords, nearest_slaves
-from service.vectors import Vector, read_only
+from service.vectors import Vector, locked, read_only
 from studies.ptp_2015.rivals.proposed import Proposed, Rows, proposed_by_votes
 
 NEIGHBOURS = 4
@@ -58,7 +58,7 @@ class Liebe:
         count = _match(
             image,
             feature,
-            scene.sigma_rad,
+            locked(scene.sigma_rad),
             self.feature,
             index.value,
             index.below,

@@ -19,7 +19,7 @@ from service.simulate.scenes import Scene
 from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.pairs import build_pairs
-from service.vectors import Vector, read_only
+from service.vectors import Vector, locked, read_only
 from studies.ptp_2015.rivals.proposed import Proposed
 
 SIDE_MAX_DEG = 10.0
@@ -54,8 +54,8 @@ class PlanarTriangle:
         n = len(scene.direction)
         image, star = np.empty((2, 3), np.int32)
         found = _pivot(
-            scene.direction[:BRIGHTEST],
-            scene.sigma_rad[:BRIGHTEST],
+            locked(scene.direction[:BRIGHTEST]),
+            locked(scene.sigma_rad[:BRIGHTEST]),
             self.direction,
             self.star,
             self.moment,

@@ -19,7 +19,7 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.sky.geometry.directions import separation_rad
 from service.sky.geometry.kvector import KVector, build_kvector, rows_within
 from service.sky.geometry.pairs import build_pairs
-from service.vectors import Vector
+from service.vectors import Vector, locked
 from studies.ptp_2015.rivals.proposed import Proposed, Rows
 
 SEPARATION_MAX_DEG = 14.2
@@ -86,7 +86,8 @@ class Pyramid:
             *(self.direction, self.brighter, self.dimmer),
             *(index.value, index.below, index.slope, index.intercept),
         )
-        if not _search(ObservedField(scene.direction, scene.sigma_rad), pairs, image, star):
+        field = ObservedField(locked(scene.direction), locked(scene.sigma_rad))
+        if not _search(field, pairs, image, star):
             return Proposed(match, image[:0], star[:0])
         match[image] = star
         return Proposed(match, image, star)
