@@ -48,6 +48,8 @@ FITTING_SHARE = 0.6
 """Stars near one of the catalog, of a batch whose attitude is right."""
 LEAST_STARS, LEAST_BATCHES = 20, 5
 FALSE_SHARE = 0.02
+USUAL_SHARE = 0.15
+"""Batches beyond the zone's room, by wrong attitudes or now and then, that are no cause."""
 OVER_SHARE, OVER_BATCHES = 0.1, 6
 """A cause is over if so much of the period, and so many batches, follow without it."""
 COMMON = 5
@@ -304,6 +306,9 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
         elif angle > FAR * earlier:
             text = "The a priori attitude is worse than before."
             remedy = "Correct its source; until then send the batches as lost in space."
+        elif beyond.mean() <= NOISY * np.mean(before.a_priori_deg > before.room_deg) + USUAL_SHARE:
+            # Wrong attitudes are far from the a priori ones, too.
+            return
     stars = beyond[now.batch]
     yield Factor(beyond, stars, text, f"{evidence}.", remedy)
 
