@@ -50,12 +50,11 @@ BEFORE_S = {"day": DAY_S, "week": 7 * DAY_S}
 """How much earlier a period is that another is compared with."""
 WORST, LATEST = 10, 10
 MOST_BESIDE = 4
-Vertical = Literal["robust", "all", "log", "hold"]
+Vertical = Literal["robust", "all", "log"]
 VERTICAL: dict[Vertical, str] = {
     "robust": "robust, outliers at the edge",
     "all": "all values",
     "log": "logarithmic",
-    "hold": "as it is now",
 }
 ANNOTATIONS = 100
 FIRST_LOOKED_AT: tuple[RankedName, ...] = (

@@ -39,9 +39,7 @@ async function draw() {
     if (before) Object.assign(beside.at(-1), { unix_s: beside.at(-1).unix_s.map((each) => each + Number(shift)), shift: Number(shift) });
     shown = found;
     for (const trend of trends) {
-      // Held is what the chart had when that was chosen, or has at first.
-      if (y === "hold" && trend.vertical !== "hold") trend.hold();
-      trend.vertical = y === "hold" && !trend.held ? "robust" : (y ?? "robust");
+      trend.vertical = y ?? "robust";
       trend.show(shown, posix(start), posix(end), annotationsShown(), beside);
       trend.definition.bars.show(JSON.parse(alarms), posix(start), posix(end));
     }

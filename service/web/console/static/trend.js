@@ -311,25 +311,20 @@ export class Trend {
     };
   }
 
-  // The vertical axis: `robust`, `all` values, `log`, or `hold` for the range that it had before.
+  // The vertical axis: `robust`, `all` values, or `log`.
   scale(lines) {
     const positive = this.shownValues().filter((value) => value > 0);
     if (this.vertical === "log" && positive.length && this.shownValues().every((value) => value >= 0)) {
       const [low, high] = [positive.reduce((a, b) => Math.min(a, b)), positive.reduce((a, b) => Math.max(a, b))];
       return { distr: 3, range: () => [10 ** Math.floor(Math.log10(low)), 10 ** Math.ceil(Math.log10(high) + 1e-9)] };
     }
-    return { range: (_, low, high) => (this.vertical === "hold" && this.held ? this.held : this.range(low, high, lines)) };
+    return { range: (_, low, high) => this.range(low, high, lines) };
   }
 
   // Means, least and greatest values of what is not hidden.
   shownValues() {
     const columns = this.known.flatMap(({ name }, k) => (this.hidden.has(name) ? [] : [1, 2, 3].map((part) => this.data[3 * k + part])));
     return [...columns, ...this.data.slice(3 * this.known.length + 1)].flat().filter((value) => value !== null && value !== undefined);
-  }
-
-  // Keeps the present vertical range of the chart, whatever is shown next.
-  hold() {
-    this.held = this.chart ? [this.chart.scales.y.min, this.chart.scales.y.max] : null;
   }
 
   // Zero belongs to the picture of what cannot be negative; limits near the data are shown too.
