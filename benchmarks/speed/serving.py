@@ -14,7 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-START_S = 120.0
+START_S = 600.0
+"""Beyond the time that a first start compiles until it is ready, on a busy machine."""
 _TICKS = os.sysconf("SC_CLK_TCK")
 
 
@@ -56,14 +57,20 @@ def _stat(pid: int) -> list[str]:
 
 
 @contextmanager
-def service(database: Path | str, missions: Path | None = None) -> Iterator[Served]:
+def service(
+    database: Path | str,
+    missions: Path | None = None,
+    environment: Mapping[str, str] = MappingProxyType({}),
+) -> Iterator[Served]:
     """`acquire serve` over a file of SQLite or a database of this URL, told to stop at the end.
 
     `missions` is a folder of missions in place of the one that the environment names.
     """
     url = database if isinstance(database, str) else f"sqlite:///{database}"
     arguments = ["-m", "service.cli", "serve", "--database", url]
-    own = {} if missions is None else {"ACQUIRE_MISSIONS": str(missions)}
+    own = dict(environment)
+    if missions is not None:
+        own["ACQUIRE_MISSIONS"] = str(missions)
     with _served(arguments, "/readyz", own) as served:
         yield served
 
@@ -81,9 +88,7 @@ def no_op() -> Iterator[Served]:
 def _served(
     arguments: list[str], path: str, environment: Mapping[str, str] = MappingProxyType({})
 ) -> Iterator[Served]:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     started = time.perf_counter()
     command = [sys.executable, *arguments, "--port", str(port)]
     process = subprocess.Popen(
@@ -101,6 +106,13 @@ def _served(
     finally:
         process.send_signal(signal.SIGTERM)
         process.wait(60)
+
+
+def free_port() -> int:
+    """The number of a port that nothing listens on."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
 
 
 def _answers(url: str) -> bool:
