@@ -1,10 +1,11 @@
 """A record in signed heads, and what a person with access to the database does to it."""
 
 import io
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from sqlalchemy import create_engine, insert, select, text, update
 
+from service.errors import Busy
 from service.gyro import GyroBlockIn, block_from_model
 from service.imaging.submit import read_known
 from service.observations.schema import OptionsIn
@@ -20,6 +21,7 @@ from service.storage.sql.migrations import all_tables
 from service.storage.sql.statements import owned_rows, rows_of
 from service.storage.upkeep import verify_chain
 from tests.storage.samples import START
+from tests.waiting import wait_until
 
 TIGHT = OptionsIn.model_validate({"identifier": "starid", "tolerances": {"separation_deg": 1e-5}})
 BATCHES = {
@@ -72,11 +74,12 @@ ROWS = [
 def fill(app, make, missions):
     """Record results of every kind and rows of every bound table; bind them into two heads."""
     ids = [
-        app.submissions.submit(make(f"b{k}", kind=kind, after_s=600.0 * k)).id
+        _patiently(app.submissions.submit, make(f"b{k}", kind=kind, after_s=600.0 * k)).id
         for k, kind in BATCHES.items()
     ]
     (drawn,) = draw_frames(missions["IMAGER"], app.sky, FrameSettings(frames=1, seed=5))
-    app.frames.submit("IMAGER", read_known(drawn.known), io.BytesIO(frame_bytes(drawn)))
+    content = frame_bytes(drawn)
+    _patiently(lambda: app.frames.submit("IMAGER", read_known(drawn.known), io.BytesIO(content)))
     rates = [(0.0, 0.0, 0.0)] * 3_001
     gyro = GyroBlockIn(block="g1", start=START.text, step_s=1.0, rates_rad_per_s=rates)
     app.gyro.record(block_from_model(gyro, "XTE"))
@@ -86,6 +89,16 @@ def fill(app, make, missions):
     app.results.what_if(ids[1], TIGHT, record=True)
     app.store.writer.change(_insert_rows)
     app.projector.make_heads()
+
+
+def _patiently(submit, *given):
+    """What is submitted, also where the machine is at work on other things."""
+
+    def submitted():
+        with suppress(Busy):
+            return submit(*given)
+
+    return wait_until(submitted, 120.0, why="no processor is free", every_s=0.1)
 
 
 def _insert_rows(connection):

@@ -11,6 +11,7 @@ from sqlalchemy import select, text, update
 
 from service.cli import main
 from service.errors import BadConfiguration
+from service.products.formats import write_attitudes
 from service.storage.projections import heads
 from service.storage.recording import chain
 from service.storage.recording.signing import PublicKey, Signer, make_key
@@ -140,7 +141,7 @@ def test_notes_and_webhooks_may_be_changed_by_the_service(opened, faults, key):
 # ---- heads that are given away -----------------------------------------------------------------
 
 
-def test_a_head_is_in_the_answer_a_backup_and_an_archive_and_verify_reads_each(
+def test_a_head_is_in_the_answer_a_backup_an_archive_and_products_and_verify_reads_each(
     signed, opened, faults, database, tmp_path, capsys
 ):
     (*_, last) = heads_of(database)
@@ -148,13 +149,18 @@ def test_a_head_is_in_the_answer_a_backup_and_an_archive_and_verify_reads_each(
     place.mkdir()
     with closing(opened(archive_folder=place)) as app:
         head = app.service.record_head()
-        assert (head.number, head.sha256) == (last.number, last.sha256)
         assert hashlib.sha256(head.statement.encode()).hexdigest() == head.sha256
+        products = [
+            b"".join(write_attitudes(format, app.products.attitudes("XTE"))).decode()
+            for format in ("aem", "aem-xml", "acm", "json")
+        ]
+        products.append(app.products.table("XTE", "stars").about["record_head"])
         assert archiving.archive(app.store, place, LATER).batches
     (manifest,) = place.glob("spacecraft=XTE/day=*/manifest.json")
     assert main(["database", "backup", str(tmp_path / "b"), "--database", database]) == 0
     backup = capsys.readouterr().out
-    for text_with_head in (head.text, backup.splitlines()[-1], manifest.read_text()):
+    texts = [head.text, backup.splitlines()[-1], manifest.read_text(), *products]
+    for text_with_head in texts:
         assert verify_chain.anchors_in(text_with_head)[0].number >= last.number
         assert faults(public=False, anchors=verify_chain.anchors_in(text_with_head)) == []
 

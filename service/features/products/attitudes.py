@@ -62,6 +62,8 @@ class SeriesInfo:
     naif_id: int = product_settings.DEFAULT_NAIF_ID
     sclk_kernel: Path | None = None
     trackers: tuple[SeriesTracker, ...] = ()
+    record_head: str = ""
+    """Number, SHA-256 and time of the record's last head; empty: it has none yet."""
 
     def __post_init__(self) -> None:
         """Raise `BadBatch` with the name and value of what is out of its range."""
@@ -116,6 +118,7 @@ class SeriesInfo:
             "created": self.created,
             "originator": f"attitude-acquisition {self.version}",
             "frame": "EME2000 to spacecraft body; quaternion scalar last",
+            "record_head": self.record_head,
         }
 
 

@@ -86,6 +86,8 @@ def header(about: attitudes.SeriesInfo) -> Pairs:
             f"{what} from {about.start or 'the first'} to before {about.end or 'the end'}"
         )
     comments.append(f"Largest gap within a segment {about.largest_gap_s!r} s")
+    if about.record_head:
+        comments.append(f"Record head {about.record_head}")
     return [
         *(("COMMENT", one_line(each)) for each in comments),
         ("CREATION_DATE", time_text(about.created)),

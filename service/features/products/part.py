@@ -21,6 +21,7 @@ from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.settings import Settings
 from service.storage.grades.days import count_samples_of, graded_pages
 from service.storage.gyro import BlockFilter, count_samples, sample_table
+from service.storage.projections.heads import newest_head
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter, count
 from service.storage.recording.unsaved_result import LIVE
@@ -91,6 +92,7 @@ class Products:
             naif_id=own.naif_id if naif_id is None else naif_id,
             # The mission's clock is that of its own id.
             sclk_kernel=own.sclk_kernel if naif_id in (None, own.naif_id) else None,
+            record_head=self._record_head(),
             trackers=tuple(
                 attitude_series.SeriesTracker(
                     each.name, tuple(map(tuple, each.body_from_tracker.tolist())), each.sigma_arcsec
@@ -109,6 +111,11 @@ class Products:
             about = replace(about, largest_gap_s=self._gap_of_cadence(about, selected))
         pages = self._pages(about, selected, newest_first=about.newest_first)
         return attitude_series.series_of(about, pages)
+
+    def _record_head(self) -> str:
+        with self._store.reading() as connection:
+            newest = newest_head(connection)
+        return "" if newest is None else newest.text
 
     def _gap_of_cadence(self, about: attitude_series.SeriesInfo, selected: ResultFilter) -> float:
         """The largest gap of a period: its first batches tell the usual time between them."""
@@ -178,6 +185,7 @@ class Products:
             "end": "" if end is None else end.text,
             "created": utc_now().text,
             "originator": f"attitude-acquisition {__version__}",
+            "record_head": self._record_head(),
         }
         if kind == "gyro":
             blocks = BlockFilter(name, run or LIVE, start, end)
