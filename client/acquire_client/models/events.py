@@ -71,7 +71,7 @@ class RecordHead(Model, frozen=True, kw_only=True):
 
     number: int
     sha256: str
-    """Of the statement."""
+    """SHA-256 of the statement."""
     made: str
     statement: str
     """JSON, byte for byte as it is hashed and signed."""
