@@ -86,7 +86,9 @@ class RecordHead(Record, frozen=True, kw_only=True):
     """A head of the record's chain, to be kept where nobody can write who can change the record."""
 
     number: Annotated[int, Field(ge=1)]
-    sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the statement.")]
+    sha256: Annotated[
+        str, Field(pattern=r"^[0-9a-f]{64}$", description="SHA-256 of the statement.")
+    ]
     made: Stamp
     statement: Annotated[str, doc("JSON, byte for byte as it is hashed and signed.")]
     signature: Annotated[
