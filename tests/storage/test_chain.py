@@ -7,11 +7,11 @@ import subprocess
 from contextlib import closing
 
 import pytest
+from service.products.formats import write_attitudes
 from sqlalchemy import select, text, update
 
 from service.cli import main
 from service.errors import BadConfiguration
-from service.products.formats import write_attitudes
 from service.storage.projections import heads
 from service.storage.recording import chain
 from service.storage.recording.signing import PublicKey, Signer, make_key
