@@ -26,7 +26,7 @@ from service.storage.archive.reading import holds_any
 from service.storage.grades import days as recorded_days
 from service.storage.grades import period
 from service.storage.grades.days import live_attitude
-from service.storage.grades.inputs import days_with_batches, inputs_digest, recorded_in
+from service.storage.grades.inputs import RatesRead, days_with_batches, inputs_digest, recorded_in
 from service.storage.queries.pages import ResultFilter, newest
 from service.storage.recording.events import last_event
 from service.storage.recording.ids import Ulids
@@ -329,6 +329,7 @@ class _Kept:
     """The filter of a spacecraft, and what it was up to."""
 
     filter: CarriedFilter = field(default_factory=CarriedFilter)
+    rates_read: RatesRead = field(default_factory=dict)
     version: tuple[int, str | None] | None = None
     forgotten: str | None = None
     """The last entry of the audit list about recorded batches or blocks that were removed."""
@@ -416,7 +417,7 @@ class LiveFilter:
                 forgotten = connection.scalar(_LAST_FORGOTTEN)
                 if kept.forgotten != forgotten:
                     # The filter holds what was computed from facts that are gone.
-                    kept.filter, kept.version = CarriedFilter(), None
+                    kept.filter, kept.rates_read, kept.version = CarriedFilter(), {}, None
                     kept.forgotten = forgotten
                 if kept.version == version:
                     return
@@ -424,7 +425,9 @@ class LiveFilter:
                 latest = None if row is None else recorded_utc(row["time"])
                 if latest is not None:
                     window = live_window(latest)
-                    recorded = recorded_in(connection, self._context.sky, name, LIVE, *window)
+                    recorded = recorded_in(
+                        connection, self._context.sky, name, LIVE, *window, kept.rates_read
+                    )
             attitude = None
             if latest is not None:
                 carried = kept.filter.carry_on(recorded, mission)

@@ -295,11 +295,10 @@ def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
 
     Such samples stand for none.  A gyro of coarse steps also reads zero, of a body nearly at rest.
     """
-    none = np.zeros(len(recorded.gyro_ns), bool)
-    zero = ~recorded.rates_rad_s.any(axis=1)
+    zero: Mask = np.asarray(~recorded.rates_rad_s.any(axis=1))
     attitude_ns = recorded.attitudes.tai_ns
     if not zero.any() or len(attitude_ns) < 2:
-        return none
+        return np.zeros_like(zero)
     # Samples after the first attitude of each step, up to that after the second.
     first = np.searchsorted(recorded.gyro_ns, attitude_ns[:-1], side="right")
     end = np.searchsorted(recorded.gyro_ns, attitude_ns[1:])
@@ -308,11 +307,10 @@ def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
     turned &= end > first
     turned &= zeros[end] - zeros[first] == end - first
     # Each run of zeros of which a part is none, is none.
-    edge = np.flatnonzero(np.diff(np.concatenate([[0], zero, [0]])))
-    for begin, stop in edge.reshape(-1, 2).tolist():
-        within = turned & (first >= begin) & (end <= stop)
-        none[begin:stop] = within.any()
-    return none
+    run = np.cumsum(np.diff(zero, prepend=False))
+    is_none = np.zeros(run[-1] + 1, bool)
+    is_none[run[first[turned]]] = True
+    return np.asarray(zero & is_none[run])
 
 
 def gyro_samples(
@@ -375,6 +373,18 @@ def at_carried_rates(
     step_s = np.diff(times_ns) * NS
     # Between two batches the body may nutate: half of the change is an error of the mean.
     error = 0.5 * np.abs(np.diff(rates, axis=0)).max(axis=1)
-    angle_walk = math.sqrt(float(np.mean(error**2 * step_s)))
+    angle_walk = _rounded_up(math.sqrt(float(np.mean(error**2 * step_s))))
     mean = np.vstack([rates[:1], 0.5 * (rates[1:] + rates[:-1])])
     return replace(model, angle_walk_rad_s0_5=angle_walk), GyroSamples(times_ns, mean)
+
+
+WALK_STEP = 1.1
+"""The ratio of an angle walk to the next larger one."""
+
+
+def _rounded_up(walk: float) -> float:
+    """The next power of `WALK_STEP`: one more batch changes it rarely.
+
+    With another model the live filter begins its stretch anew.
+    """
+    return WALK_STEP ** math.ceil(math.log(walk, WALK_STEP)) if walk > 0.0 else 0.0

@@ -14,10 +14,11 @@ from sqlalchemy import Connection
 
 from service.errors import BadInput
 from service.filtering import prediction
-from service.grades.stretches import believed, gyro_samples
+from service.filtering.inputs import AttitudeMeasurements
+from service.grades.stretches import BIAS_SIGMAS, believed, gyro_samples, turns_beside_bias
 from service.interpolation import QUARTER_TURN_RAD, steps_between
 from service.missions.mission import Mission
-from service.missions.motion import MotionSettings, TrackingSettings
+from service.missions.motion import GyroSettings, MotionSettings, TrackingSettings
 from service.observations.batch import ObservationBatch
 from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
 from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes
@@ -131,7 +132,7 @@ def _predicted(
     """The attitude at the batch's time: by the gyro where it is recorded, else at a rate."""
     now_ns = batch.time.tai_ns
     motion = mission.motion or MotionSettings()
-    by_gyro = _by_gyro(connection, batch, mission, last, motion, gyro_run)
+    by_gyro = _by_gyro(connection, batch, mission, last, before, gyro_run)
     if by_gyro is not None:
         return by_gyro, "gyro"
     rate, source = _rate(batch, mission, last, before, motion)
@@ -203,7 +204,7 @@ def _by_gyro(
     batch: ObservationBatch,
     mission: Mission,
     last: RecordedAttitude,
-    motion: MotionSettings,
+    before: RecordedAttitude | None,
     gyro_run: str,
 ) -> prediction.Known | None:
     if mission.gyro is None:
@@ -215,12 +216,42 @@ def _by_gyro(
     tai_ns, rates = gyro_in(connection, selected)
     if len(tai_ns) < 2 or not believed(mission.gyro, rates).all():
         return None
-    if not rates.any() and (last.body_rates_deg_per_s.any() or batch.body_rates_deg_per_s.any()):
-        # A gyro that reads zero while the batches say that the body turns, gives nothing.
+    if not rates.any() and _turns(mission, mission.gyro, batch, last, before):
         return None
     try:
         model, samples = gyro_samples(mission.gyro, tai_ns, rates)
     except BadInput:
         return None
-    walk = motion.rate_walk_rad_s1_5
+    walk = (mission.motion or MotionSettings()).rate_walk_rad_s1_5
     return prediction.predict_by_gyro(last.known, batch.time.tai_ns, model, samples, walk)
+
+
+def _turns(
+    mission: Mission,
+    gyro: GyroSettings,
+    batch: ObservationBatch,
+    last: RecordedAttitude,
+    before: RecordedAttitude | None,
+) -> bool:
+    """True if the body turns for certain, so that gyro samples of zeros stand for none.
+
+    The step between the last two attitudes tells it.  Rates of batches tell it where the turn is
+    more than a quarter since the last attitude; where that has none before it, by their errors.
+    """
+    both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
+    fastest_rad_s = math.radians(float(np.linalg.norm(both, axis=1).max()))
+    passed_s = (batch.time.tai_ns - last.known.tai_ns) * 1e-9
+    if fastest_rad_s * passed_s > QUARTER_TURN_RAD:
+        return True
+    if before is None:
+        tracking = mission.tracking or TrackingSettings()
+        error_rad_s = math.radians(tracking.body_rate_sigma_deg_per_s) + gyro.bias_sigma_rad_s
+        return fastest_rad_s > BIAS_SIGMAS * error_rad_s
+    step = (before, last)
+    attitudes = AttitudeMeasurements(
+        np.array([each.known.tai_ns for each in step]),
+        np.stack([each.known.quaternion for each in step]),
+        np.stack([each.known.covariance_rad2 for each in step]),
+    )
+    carried_rad_s = np.radians([each.body_rates_deg_per_s for each in step])
+    return bool(turns_beside_bias(gyro, attitudes, carried_rad_s)[0])

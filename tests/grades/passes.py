@@ -19,7 +19,7 @@ from service.missions.motion import (
     SmoothingSettings,
 )
 from service.times import DAY_S, parse_utc
-from tests.filtering.simulated import START_NS
+from tests.filtering.simulated import START_NS, attitudes_of, truth_of
 
 NOON = parse_utc("1999-03-01T12:00:00Z")
 NOON_NS = NOON.tai_ns
@@ -57,3 +57,26 @@ def recorded_of(gyro_ns, rates, attitudes):
 
 def graded(recorded, mission):
     return grade_day(recorded, mission, NOON.bucket(DAY_S))
+
+
+def spun(rate_deg_per_s, rng, step_s=10.0, duration_s=900.0, carried=None, wander=0.0):
+    """A body that spins at a rate (3,) and nutates by `wander` deg/s, seen every `step_s` seconds.
+
+    `carried` (3,) in deg/s are the rates that its batches carry, by default its own.
+    """
+    spin = np.radians(rate_deg_per_s)
+    across = np.cross(spin, [0.3, 0.5, 0.8])
+    across *= np.radians(wander) / (np.linalg.norm(across) or 1.0)
+    other = np.cross(spin, across) / (np.linalg.norm(spin) or 1.0)
+
+    def rate(t):
+        phase = 0.3 * np.linalg.norm(spin) * t[:, None]
+        return spin + across * np.cos(phase) + other * np.sin(phase)
+
+    truth = truth_of(rate, duration_s, 0.5)
+    rows = np.arange(0, len(truth.time_s), round(step_s / 0.5))
+    attitudes = attitudes_of(truth, rows, (6.0, 6.0, 40.0), rng)
+    own = rate(truth.time_s[rows])
+    rates = own if carried is None else np.tile(np.radians(carried), (len(rows), 1))
+    recorded = replace(recorded_of([], np.zeros((0, 3)), attitudes), carried_rad_s=rates)
+    return truth, rows, recorded, np.degrees(own)

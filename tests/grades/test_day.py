@@ -1,5 +1,6 @@
 """The grades of a day: what they promise of accuracy, of gaps, and of what is wrong."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from service.filtering.inputs import AttitudeMeasurements, no_attitudes
 from service.filtering.result import Status
 from service.grades.day import day_bounds, grade_day, packed, unpacked, window_of
-from service.grades.stretches import attitudes_where, usable_attitudes
+from service.grades.stretches import attitudes_where, usable_attitudes, zeros_while_turning
 from service.missions.motion import GyroSettings
 from service.times import DAY_S, parse_utc
 from tests.filtering.simulated import (
@@ -21,7 +22,16 @@ from tests.filtering.simulated import (
     squares,
     truth_of,
 )
-from tests.grades.passes import GYRO, MODEL, NOON_NS, graded, later, mission_with, recorded_of
+from tests.grades.passes import (
+    GYRO,
+    MODEL,
+    NOON_NS,
+    graded,
+    later,
+    mission_with,
+    recorded_of,
+    spun,
+)
 from tests.missions.without_gyro import mission_without_gyro
 
 SIGMAS = (6.0, 6.0, 40.0)
@@ -300,29 +310,6 @@ def test_settings_of_a_gyro_have_bounds():
         GyroSettings(sigma_v_rad_s0_5=1e-7, sigma_u_rad_s1_5=1e-10, largest_step_s=0.0)
 
 
-def spun(rate_deg_per_s, rng, step_s=10.0, duration_s=900.0, carried=None, wander=0.0):
-    """A body that spins at a rate (3,) and nutates by `wander` deg/s, seen every `step_s` seconds.
-
-    `carried` (3,) in deg/s are the rates that its batches carry, by default its own.
-    """
-    spin = np.radians(rate_deg_per_s)
-    across = np.cross(spin, [0.3, 0.5, 0.8])
-    across *= np.radians(wander) / (np.linalg.norm(across) or 1.0)
-    other = np.cross(spin, across) / (np.linalg.norm(spin) or 1.0)
-
-    def rate(t):
-        phase = 0.3 * np.linalg.norm(spin) * t[:, None]
-        return spin + across * np.cos(phase) + other * np.sin(phase)
-
-    truth = truth_of(rate, duration_s, 0.5)
-    rows = np.arange(0, len(truth.time_s), round(step_s / 0.5))
-    attitudes = attitudes_of(truth, rows, SIGMAS, rng)
-    own = rate(truth.time_s[rows])
-    rates = own if carried is None else np.tile(np.radians(carried), (len(rows), 1))
-    recorded = replace(recorded_of([], np.zeros((0, 3)), attitudes), carried_rad_s=rates)
-    return truth, rows, recorded, np.degrees(own)
-
-
 @pytest.mark.parametrize("spin", [(0.0, 0.0, 36.0), (0.0, -24.0, 0.0), (18.0, 18.0, 1.0)])
 def test_a_spinning_body_has_the_rates_that_its_batches_carried(rng, spin):
     """At 36 deg/s, with a batch every ten seconds, a body looks still; at 24 it looks reversed."""
@@ -436,3 +423,29 @@ def test_batches_of_one_moment_have_an_attitude_whatever_rates_they_carry(rng):
     samples = stretch.samples["smoothed"]
     assert len(samples) == 1
     assert np.isfinite(samples.covariance_arcsec2).all()
+
+
+def test_zeros_that_stand_for_none_are_whole_runs_however_many(missions, rng):
+    truth = truth_of(lambda t: np.tile([0.0, 2e-3, 0.0], (len(t), 1)), 3600.0)
+    attitudes = attitudes_of(truth, np.arange(0, 3601, 8), SIGMAS, rng)
+    gyro_ns = attitudes.tai_ns[0] + np.arange(0, 3600 * 10**9, 10**7)
+    rates = np.full((len(gyro_ns), 3), 1e-3)
+    # Every other sample, and runs of all lengths up to a minute.
+    rates[::2] = 0.0
+    begin = rng.integers(0, len(gyro_ns), 200)
+    for first, length in zip(begin, rng.integers(1, 6000, 200), strict=True):
+        rates[first : first + length] = 0.0
+    recorded = recorded_of(gyro_ns, rates, attitudes)
+    began = time.process_time()
+    none = zeros_while_turning(GyroSettings(**GYRO), recorded)
+    # A look at each step for each run took a minute.
+    assert time.process_time() - began < 2.0
+    zero = ~rates.any(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], zero, [0]]))).reshape(-1, 2)
+    steps = np.searchsorted(recorded.gyro_ns, recorded.attitudes.tai_ns, side="right")
+    whole = [run for run in edges if run[1] - run[0] > 1600]
+    for begin, end in edges:
+        holds_a_step = ((steps[:-1] >= begin) & (steps[1:] <= end)).any()
+        assert (none[begin:end] == holds_a_step).all()
+    assert len(edges) > 30_000
+    assert len(whole) > 10

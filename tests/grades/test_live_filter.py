@@ -20,13 +20,14 @@ from service.grades.carried import CarriedFilter, live_window
 from service.grades.day import grade_day, window_of
 from service.grades.stretches import attitudes_where
 from service.observations.schema import submission_from_json
+from service.storage.grades import inputs as graded_inputs
 from service.storage.grades.inputs import recorded_in
 from service.storage.upkeep.archiving import PartFilter, archive, restore
 from service.storage.upkeep.verify import verify
 from service.times import DAY_S, parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, attitude_error_arcsec, matrix_from_quaternion
 from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
-from tests.grades.passes import GYRO, MODEL, NOON, NOON_NS, mission_with, recorded_of
+from tests.grades.passes import GYRO, MODEL, NOON, NOON_NS, mission_with, recorded_of, spun
 from tests.grades.records import at, put_attitudes, put_gyro
 from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 from tests.waiting import wait_until
@@ -387,3 +388,41 @@ def test_rates_of_recorded_batches_lead_a_spinning_body_through_the_day_and_live
     assert (stretch.model, carried.model) == ("constant_rate", "constant_rate")
     for rates in (stretch.samples["smoothed"].rate_deg_per_s[5:], carried.sample.rate_deg_per_s):
         np.testing.assert_allclose(rates, np.tile(rate_deg_per_s, (len(rates), 1)), atol=0.02)
+
+
+def test_rates_that_vary_leave_the_marks_where_they_are(rng):
+    """A body that nutates, a batch more at each look: an hour is not filtered each time."""
+    mission = mission_without_gyro("XTE")
+    _, _, whole, _ = spun((0.0, 0.0, 36.0), rng, duration_s=3600.0, wander=0.5)
+    carried, given = CarriedFilter(), 0
+    for count in range(300, 361):
+        recorded = replace(
+            whole,
+            attitudes=attitudes_where(whole.attitudes, slice(0, count)),
+            carried_rad_s=whole.carried_rad_s[:count],
+        )
+        found = carried.carry_on(recorded, mission)
+        given += count
+    assert_same(found, CarriedFilter().carry_on(recorded, mission))
+    assert carried.filtered < 0.4 * given
+
+
+def test_a_look_reads_the_rates_of_new_batches_only(live, rng, monkeypatch):
+    read = []
+    inputs = graded_inputs._inputs
+
+    def counted(connection, ids):
+        read.append(len(ids))
+        return inputs(connection, ids)
+
+    monkeypatch.setattr(graded_inputs, "_inputs", counted)
+    truth = truth_of(lambda t: np.tile([0.0, 0.0, 0.1], (len(t), 1)), 300.0, 0.5)
+    measured = attitudes_of(truth, np.arange(0, 601, 20), (6.0, 6.0, 40.0), rng)
+    recorded = recorded_of([], np.zeros((0, 3)), measured).attitudes
+    sent = [body | {"body_rates_deg_per_s": [0.0, 0.0, 5.7]} for body in bodies(recorded)]
+    for first, end in ((0, 25), (25, 26), (26, 31)):
+        for body in sent[first:end]:
+            live.submissions.submit(submission_from_json(json.dumps(body)))
+        live.live_filter.refresh("XTE")
+    assert live.live_filter.latest("XTE").model == "constant_rate"
+    assert read == [25, 1, 5]

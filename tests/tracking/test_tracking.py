@@ -283,3 +283,31 @@ def test_gyro_rates_beyond_what_the_mission_names_now_predict_nothing(database, 
         finally:
             app.close()
     assert told == ["gyro", "attitudes"]
+
+
+@pytest.mark.parametrize(
+    ("bias_rad_s", "source"), [(1e-4, "gyro"), (1e-6, "body_rates")], ids=["at rest", "turning"]
+)
+def test_zeros_of_a_gyro_stand_unless_the_attitudes_turn(database, sky, bias_rad_s, source):
+    """One batch carries the noise of a body at rest as its rates.
+
+    The attitudes turn by minutes of arc; with a bias of 20 arcsec/s that may be a body at rest.
+    """
+    mission = tracked(load_missions()["XTE"])
+    gyro = GyroSettings(sigma_v_rad_s0_5=1e-6, sigma_u_rad_s1_5=1e-9, bias_sigma_rad_s=bias_rad_s)
+    app = open_app(
+        Settings(database=database, replay_processes=0), mission.model_copy(update={"gyro": gyro})
+    )
+    flown = list(fly(load_missions()["XTE"], sky, 3, 3))
+    rates = {"body_rates_deg_per_s": [0.0, 0.02, 0.0]}
+    try:
+        block = {"block": "g1", "start": flown[0].body["time"], "step_s": 1.0}
+        block["rates_rad_per_s"] = [[0.0, 0.0, 0.0]] * 61
+        app.gyro.record(block_from_json(json.dumps(block), "XTE"))
+        answers = [
+            send(app, each.body | more) for each, more in zip(flown, ({}, {}, rates), strict=True)
+        ]
+    finally:
+        app.close()
+    predictions = [each["tracking"]["prediction"] for each in answers[1:]]
+    assert [each["rate"] for each in predictions] == ["gyro", source]

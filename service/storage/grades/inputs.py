@@ -2,7 +2,7 @@
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,6 +50,10 @@ _ATTITUDES = select(
 ).join_from(results, solutions, solutions.c.result_id == results.c.id)
 
 
+RatesRead = dict[str, Sequence[float]]
+"""The rates (3) in deg/s that batches carried, by the batch; zeros where none."""
+
+
 def days_with_batches(
     connection: Connection, spacecraft: str, run: str, start: Utc | None, end: Utc | None
 ) -> list[int]:
@@ -61,9 +65,18 @@ def days_with_batches(
 
 
 def recorded_in(
-    connection: Connection, sky: SkyModel, spacecraft: str, run: str, start: Utc, end: Utc
+    connection: Connection,
+    sky: SkyModel,
+    spacecraft: str,
+    run: str,
+    start: Utc,
+    end: Utc,
+    rates_read: RatesRead | None = None,
 ) -> Recorded:
-    """The record from `start` to before `end`: good attitudes, lone stars, gyro samples."""
+    """The record from `start` to before `end`: good attitudes, lone stars, gyro samples.
+
+    `rates_read` holds rates that were read before, and keeps those of this period.
+    """
     selected = ResultFilter(run, spacecraft, start, end)
     query = _ATTITUDES.where(*selected.conditions(), results.c.status == "good").order_by(*PLACE)
     rows = np.array([tuple(row) for row in connection.execute(query)], dtype=object)
@@ -73,30 +86,42 @@ def recorded_in(
     gyro_ns, rates = gyro_in(connection, BlockFilter(spacecraft, run, start, end))
     # A gyro that is off may send zeros, which are no better than what batches carried.
     told_ns = gyro_ns[rates.any(axis=1)]
-    carried = _carried_rates(connection, rows[sound, 11].tolist(), attitudes.tai_ns, told_ns)
+    rates_read = {} if rates_read is None else rates_read
+    ids = rows[sound, 11].tolist()
+    carried = _carried_rates(connection, ids, attitudes.tai_ns, told_ns, rates_read)
     directions = lone_stars(connection, sky, selected)
     unusable = int(np.count_nonzero(~sound))
     return Recorded(gyro_ns, rates, attitudes, directions, unusable, carried)
 
 
 def _carried_rates(
-    connection: Connection, batch_ids: list[str], tai_ns: Nanoseconds, gyro_ns: Nanoseconds
+    connection: Connection,
+    batch_ids: list[str],
+    tai_ns: Nanoseconds,
+    gyro_ns: Nanoseconds,
+    rates_read: RatesRead,
 ) -> Vector | None:
     """The rates that batches carried, see `Recorded`; zeros near gyro samples, which are better.
 
-    `gyro_ns` are the times of the samples that are not zero about all axes.
+    `gyro_ns` are the times of the samples that are not zero about all axes.  Of `rates_read`
+    those stay that are of these batches.
     """
     carried = np.zeros((len(batch_ids), 3))
     padded = np.concatenate([[-FAR_NS], gyro_ns, [FAR_NS]])
     place = np.searchsorted(gyro_ns, tai_ns)
     near = np.minimum(tai_ns - padded[place], padded[place + 1] - tai_ns)
     chosen = np.flatnonzero(near > LONGEST_GAP_S * 1e9).tolist()
-    for first in range(0, len(chosen), _READ_AT_ONCE):
-        part = chosen[first : first + _READ_AT_ONCE]
-        inputs = _inputs(connection, [batch_ids[row] for row in part])
-        for row in part:
-            sent = RECORDED_RATES.decode(inputs[batch_ids[row]]).body_rates_deg_per_s
-            carried[row] = np.radians(sent or np.zeros(3))
+    wanted = [batch_ids[row] for row in chosen]
+    for id in rates_read.keys() - set(wanted):
+        del rates_read[id]
+    unread = [id for id in wanted if id not in rates_read]
+    for first in range(0, len(unread), _READ_AT_ONCE):
+        part = unread[first : first + _READ_AT_ONCE]
+        inputs = _inputs(connection, part)
+        for id in part:
+            rates_read[id] = RECORDED_RATES.decode(inputs[id]).body_rates_deg_per_s or (0.0, 0.0, 0.0)
+    if chosen:
+        carried[chosen] = np.radians([rates_read[id] for id in wanted])
     return carried if carried.any() else None
 
 
