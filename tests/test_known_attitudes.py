@@ -132,6 +132,20 @@ def test_a_replay_is_scored_against_its_truth(scored, files):
     ET.parse(files / "errors.svg")
 
 
+def test_predicted_attitudes_of_an_acm_are_no_truth(scored, files, passing):
+    page = truth_page(*passing)
+    text = written("acm", page).decode()
+    assert text.count("ATT_START\n") == 1
+    (files / "p.acm").write_text(text.replace("ATT_START\n", "ATT_START\nATT_BASIS = predicted\n"))
+    code, told = scored("p.acm")
+    assert code == 2
+    assert "must be of attitudes with ATT_BASIS DETERMINED_GND" in told.err
+    determined = text.replace("ATT_START\n", "ATT_START\nATT_BASIS = DETERMINED_OBC\n")
+    (files / "d.acm").write_text(determined)
+    assert scored("d.acm", "--json")[0] == 0
+    assert replayed(files, "--a-priori", files / "p.acm", run="predicted")[0] == 0
+
+
 def test_a_score_is_a_table_for_people(scored):
     code, told = scored("truth.aem")
     assert code == 0

@@ -15,7 +15,14 @@ import numpy as np
 
 from service.ephemerides import tokens as ccsds
 from service.ephemerides.attitude_types import AttitudeType, Frames, body_attitudes
-from service.ephemerides.known import KnownAttitudes, Segment, known_attitudes, told_rates
+from service.ephemerides.known import (
+    KnownAttitudes,
+    Segment,
+    by_priority,
+    in_order,
+    known_attitudes,
+    told_rates,
+)
 from service.observations.schema import NORM_TOLERANCE
 from service.times import FIRST_YEAR, LAST_YEAR
 
@@ -33,6 +40,8 @@ _FIRST_NS = ccsds.epoch_ns(f"{FIRST_YEAR}-01-01T00:00:00", "TAI")
 _LAST_NS = ccsds.epoch_ns(f"{LAST_YEAR}-12-31T23:59:59", "TAI")
 _NO_RATES = {"": 0, "NONE": 0, "GYRO_BIAS": 3}
 """Numbers that a state has in place of a rate."""
+TRUE_BASES = ("", "DETERMINED_GND", "DETERMINED_OBC", "SIMULATED")
+"""The values of ATT_BASIS whose attitudes are no prediction; empty where the block says nothing."""
 _BLOCKS = ("ORB", "PHYS", "COV", "MAN", "AD", "SENSOR", "USER")
 _HEADER = ("CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 _METADATA = (
@@ -90,6 +99,12 @@ class _Reader(ccsds.MessageReader):
             raise source.bad(1, "META_START", "is missing: the message has no metadata")
         if not segments:
             raise source.bad(metadata.line, "ATT_START", "is missing: the message has no attitude")
+        predicted = [each for each in segments if each.basis == "PREDICTED"]
+        others = [each for each in segments if each.basis != "PREDICTED"]
+        if predicted and others:
+            # A time of both is that of what was not predicted.
+            parts = (in_order(source.name, predicted), in_order(source.name, others))
+            segments = by_priority([*parts[0], *parts[1]])
         return known_attitudes(source.name, self._object_name, segments)
 
     def _pass_block(self, tokens: Iterator[ccsds.Token], start: ccsds.Token) -> None:
@@ -183,7 +198,8 @@ class _Reader(ccsds.MessageReader):
         quaternion, rate = body_attitudes(type, np.array(states)[:, : type.size], frames)
         time_ns = np.array(times, dtype=np.int64)
         rate = told_rates(quaternion, rate)
-        return Segment(f"line {block.line}", time_ns, times[0], times[-1], quaternion, rate)
+        span = (f"line {block.line}", time_ns, times[0], times[-1])
+        return Segment(*span, quaternion, rate, basis=block.values.get("ATT_BASIS", "").upper())
 
 
 def _is_rotation(numbers: Sequence[float]) -> bool:

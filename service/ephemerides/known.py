@@ -4,7 +4,7 @@ from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal, Protocol, TypeVar
+from typing import Literal, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -44,12 +44,14 @@ class Segment(Span):
     """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated.
 
     `rate_rad_s` (n, 3) are the rates of the body relative to inertial, in body axes; None where
-    the file gives none.  Of a `discrete` segment nothing is known between two records.
+    the file gives none.  Of a `discrete` segment nothing is known between two records.  `basis`
+    is how the file says that the attitudes came about, such as PREDICTED.
     """
 
     quaternion: Vector
     rate_rad_s: Vector | None = None
     discrete: bool = False
+    basis: str = ""
 
     def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
         """The attitudes (n, 4) at moments (n,); NaN outside the segment and where none is known.
@@ -97,6 +99,10 @@ class KnownAttitudes:
 
     def __len__(self) -> int:
         return sum(len(each.time_ns) for each in self.segments)
+
+    def of_basis(self, bases: Sequence[str]) -> Self:
+        """The segments of these bases."""
+        return replace(self, segments=[each for each in self.segments if each.basis in bases])
 
     def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
         """The attitudes (n, 4) at moments (n,); NaN where none is known; see `Segment.at`."""

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
+from service.ephemerides.acm import TRUE_BASES
 from service.ephemerides.files import read_attitudes
 from service.errors import BadFile
 from tests.features.products.series import GOLDEN, random_quaternions, rows, slew, whole, written
@@ -45,8 +47,6 @@ def block(kind, rng, frames=("EME2000", "SC_BODY_1"), states=20):
     if type == "QUATERNION":
         numbers = q
     elif type == "DCM":
-        from scipy.spatial.transform import Rotation
-
         numbers = Rotation.from_quat(q).as_matrix().transpose(0, 2, 1).reshape(-1, 9)
     else:
         numbers = rng.uniform(5.0, 85.0, (states, 3))
@@ -69,7 +69,6 @@ def apart(one, other):
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if "BIAS" not in kind])
 @pytest.mark.parametrize("frames", [("EME2000", "SC_BODY_1"), ("SC_BODY_1", "EME2000")])
 def test_orekit_and_the_service_read_the_same(kind, frames, orekit, rng, tmp_path):
-
     text = HEAD.format(system="UTC", more="") + block(kind, rng, frames)
     (segment,) = read(text, tmp_path).segments
     (theirs,) = orekit.read("acm", tmp_path / "x.acm")["stretches"]
@@ -83,8 +82,11 @@ def test_orekit_and_the_service_read_the_same(kind, frames, orekit, rng, tmp_pat
     assert segment.time_ns * 1e-9 == pytest.approx(seconds, abs=1e-6)
     if "ANGVEL" in kind or "Q_DOT" in kind or "EULER_RATE" in kind:
         rates = np.array([each["rate_rad_per_s"] for each in theirs])
-        if frames[0] == "EME2000":
-            np.testing.assert_allclose(segment.rate_rad_s, rates, rtol=0, atol=1e-12)
+        if frames[0] != "EME2000":
+            # Orekit gives the rate of the last frame in its own axes, here the inertial frame's.
+            unit = Rotation.from_quat(q / np.linalg.norm(q, axis=1)[:, None])
+            rates = -unit.inv().apply(rates)
+        np.testing.assert_allclose(segment.rate_rad_s, rates, rtol=0, atol=1e-12)
     else:
         assert segment.rate_rad_s is None
 
@@ -120,6 +122,27 @@ def test_text_and_xml_are_read_alike(rng, tmp_path):
     assert np.array_equal(one.time_ns, other.time_ns)
     assert one.quaternion.tobytes() == other.quaternion.tobytes()
     assert one.rate_rad_s.tobytes() == other.rate_rad_s.tobytes()
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_a_time_of_a_predicted_block_is_that_of_one_that_is_not(rng, tmp_path, order):
+    """Predicted for 5 s, determined up to 2 s of them."""
+    predicted = block("QUATERNION", rng, states=21)
+    determined = block("QUATERNION", rng, states=9)
+    named = [
+        each.replace("ATT_START\n", f"ATT_START\nATT_BASIS = {basis}\n")
+        for each, basis in ((predicted, "PREDICTED"), (determined, "DETERMINED_GND"))
+    ]
+    known = read(HEAD.format(system="UTC", more="") + "".join(named[::order]), tmp_path)
+    parts = [read(HEAD.format(system="UTC", more="") + each, tmp_path) for each in named]
+    times = parts[0].segments[0].time_ns
+    found, last = known.at(times), 8
+    assert np.array_equal(found[: last + 1], parts[1].at(times[: last + 1]))
+    assert np.array_equal(found[last + 1 :], parts[0].at(times[last + 1 :]))
+    assert [each.basis for each in known.of_basis(TRUE_BASES).segments] == ["DETERMINED_GND"]
+    twice = HEAD.format(system="UTC", more="") + named[1] * 2 + named[0]
+    with pytest.raises(BadFile, match="overlaps the segment"):
+        read(twice, tmp_path)
 
 
 def test_the_first_example_of_the_standard_begins_at_its_zero():

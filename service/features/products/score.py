@@ -41,13 +41,17 @@ def run(parsed: Namespace) -> int:
     acquire score truth.bc --spacecraft XTE --plot errors.svg --json
     """
     from service.app.factory import open_app
+    from service.ephemerides.acm import TRUE_BASES
     from service.ephemerides.files import read_attitudes
     from service.features.products.error_chart import errors_picture
     from service.features.products.part import Products
     from service.features.products.scoring import errors_of, statistics
 
     start, end = period_of(parsed)
-    truth = read_attitudes(parsed.truth, "FILE")
+    truth = read_attitudes(parsed.truth, "FILE").of_basis(TRUE_BASES)
+    if not truth.segments:
+        message = f"must be of attitudes with ATT_BASIS {', '.join(filter(None, TRUE_BASES))}"
+        raise BadInput(Fault("FILE", message, shown_value(str(parsed.truth))))
     with closing(open_app(settings_of_existing(parsed), reads_only=True)) as app:
         series = app.part(Products).attitudes(
             parsed.spacecraft, run=parsed.run, start=start, end=end, status=parsed.status
