@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from service.access import Caller
 from service.app.context import Context, known_id
-from service.contract.pictures import Picture, picture_of
+from service.contract.pictures import Picture, Projection, picture_of
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import FrameLimits
@@ -90,6 +90,7 @@ class Frames:
         *,
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
+        projection: Projection | None = None,
         image: str | None = None,
         draws: bool = False,
     ) -> Picture:
@@ -120,9 +121,9 @@ class Frames:
                 frame = read_frame(file, limits)
                 if field_of_view_deg is not None:
                     side_px = max(frame.width_px, frame.height_px)
-                    guess_px = focal_px_of(side_px, field_of_view_deg)
+                    guess_px = focal_px_of(side_px, field_of_view_deg, projection or "gnomonic")
                 sky, solver = blind_sky(self._context.sky.catalog)
-                result = solve_picture(frame, sky, solver, guess_px)
+                result = solve_picture(frame, sky, solver, guess_px, projection=projection)
                 drawn = overlay_of(result, "") if draws else None
             finally:
                 self._picture_turn.release()

@@ -15,7 +15,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.identify.blind.lens import Lens
+from service.contract.pictures import Projection
+from service.identify.blind.lens import Lens, distance_of
 from service.identify.blind.verify import Points, Stars, Verified, matched, refine, verify
 from service.sky.whole_sky.quads import (
     LEAST_WIDTH,
@@ -72,9 +73,9 @@ class FocalRange:
         return cls(least, most)
 
 
-def focal_px_of(side_px: int, field_deg: float) -> float:
+def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomonic") -> float:
     """The focal length with which a side spans a field of view."""
-    return 0.5 * side_px / math.tan(math.radians(0.5 * field_deg))
+    return 0.5 * side_px / distance_of(projection, math.radians(0.5 * field_deg))
 
 
 class BlindResult(NamedTuple):
