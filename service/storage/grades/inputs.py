@@ -119,7 +119,8 @@ def _carried_rates(
         part = unread[first : first + _READ_AT_ONCE]
         inputs = _inputs(connection, part)
         for id in part:
-            rates_read[id] = RECORDED_RATES.decode(inputs[id]).body_rates_deg_per_s or (0.0, 0.0, 0.0)
+            sent = RECORDED_RATES.decode(inputs[id]).body_rates_deg_per_s
+            rates_read[id] = sent or (0.0, 0.0, 0.0)
     if chosen:
         carried[chosen] = np.radians([rates_read[id] for id in wanted])
     return carried if carried.any() else None
