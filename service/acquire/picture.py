@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from service.contract.pictures import Projection
 from service.identify.blind.lens import (
     PROJECTIONS,
     Lens,
@@ -46,6 +45,7 @@ from service.times import parse_utc, utc_now
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
+    Projection,
     Vector,
     attitude_error_arcsec,
     quaternion_from_matrix,

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from service.access import Caller
 from service.app.context import Context, known_id
-from service.contract.pictures import Picture, Projection, picture_of
+from service.contract.pictures import Picture, picture_of
 from service.errors import Busy
 from service.imaging.frames.files import frame_digest, read_frame
 from service.imaging.frames.frame import FrameLimits
@@ -23,6 +23,7 @@ from service.observations.schema import FromLastIn, Submission, submission_from_
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 from service.times import utc_now
+from service.vectors import Projection
 
 FRAME_WAIT_S = 30.0
 """The longest time that a frame waits for a thread: other frames may take seconds."""

@@ -14,8 +14,8 @@ from service.settings import Settings
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
-    from service.contract.pictures import Projection
     from service.imaging.frames.frame import Frame
+    from service.vectors import Projection
 
 FEW_NAMES = 12
 WIDEST_PLAIN_DEG = 120

@@ -1,16 +1,14 @@
 """A picture of any camera, solved without a record: its attitude, its lens and its stars."""
 
 import math
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from service.contract.base import Components, Count, Quaternion, Record, doc
 from service.observations.frame_record import rounded_counts
+from service.vectors import Projection
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureAttitude, PictureResult
-
-Projection = Literal["gnomonic", "equidistant", "equisolid", "stereographic"]
-"""How a lens projects the sky: on a plane, or as a fisheye in one of three ways."""
 
 
 class PictureAttitudeFound(Record, frozen=True, kw_only=True):

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, Protocol, get_args
 
 from service.cli import arguments
-from service.contract.pictures import Projection
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
+from service.vectors import Projection
 
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for

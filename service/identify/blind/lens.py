@@ -15,8 +15,7 @@ from typing import get_args
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.contract.pictures import Projection
-from service.vectors import Matrix, Vector, rotate_about
+from service.vectors import Matrix, Projection, Vector, rotate_about
 
 BEND_PRIOR = 0.04
 """One standard deviation of the radial displacement at the corner, as a share of the radius."""

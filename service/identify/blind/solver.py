@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.contract.pictures import Projection
 from service.identify.blind.lens import Lens, distance_of
 from service.identify.blind.verify import Points, Stars, Verified, matched, refine, verify
 from service.sky.whole_sky.quads import (
@@ -25,7 +24,7 @@ from service.sky.whole_sky.quads import (
     build_quad_level,
     quad_codes,
 )
-from service.vectors import Matrix, Vector
+from service.vectors import Matrix, Projection, Vector
 
 Sets = npt.NDArray[np.int64]
 

@@ -12,10 +12,11 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.contract.answers import Answer
-from service.contract.pictures import Picture, Projection
+from service.contract.pictures import Picture
 from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
+from service.vectors import Projection
 from service.web.api.batches import answer_response
 from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests.access import AppDep, CallerDep, MetricsDep, Policy, json_response
