@@ -129,7 +129,6 @@ class ApiRouter(APIRouter):
         body: type[BaseModel] | None = None,
         body_required: bool = True,
         lines_of: type[BaseModel] | None = None,
-        uploads: bool = False,
         array_of: tuple[type[BaseModel], int] | None = None,
         frame: bool = False,
         problems: Sequence[int] = (),
@@ -142,7 +141,7 @@ class ApiRouter(APIRouter):
         `policy` is the access that it requires.
         What a path names may not be there, so 404 is described, unless the route creates it.
         Without `body_required` the body may be left out: its fields all have defaults.
-        With `uploads` every input format that has a media type can be sent in place of lines.
+        In place of `lines_of` a model, every input format that has a media type can be sent.
         `array_of` is the model of an array's elements, and how many there may be.
         """
         content: dict[str, Any] = {}
@@ -158,11 +157,10 @@ class ApiRouter(APIRouter):
             lines = {"schema": _BINARY | {"description": description}}
             types = INPUT_FORMATS[NDJSON].media_types[0], BINARY
             content, reading = dict.fromkeys(types, lines), READING_NDJSON
-            if uploads:
-                for name, each in input_formats().items():
-                    if name != NDJSON and each.media_types:
-                        schema = _BINARY | {"description": each.uploaded}
-                        content[each.media_types[0]] = {"schema": schema}
+            for name, each in input_formats().items():
+                if name != NDJSON and each.media_types:
+                    schema = _BINARY | {"description": each.uploaded}
+                    content[each.media_types[0]] = {"schema": schema}
         if frame:
             file = {"schema": _BINARY}
             content, reading = dict.fromkeys(FRAMES, file), READING_FRAME

@@ -196,7 +196,7 @@ def _offsets_of(
     catalog: RunCatalog,
     batch: ObservationBatch,
 ) -> list[Vector]:
-    """Of each tracker, distance over its sigma and magnitude difference (2, n) to the nearest star.
+    """Distance over its sigma and magnitude difference (2, n) to the nearest star, by tracker.
 
     NaN without an attitude, and where it is wrong: few stars then have a neighbour.
     """

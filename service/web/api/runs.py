@@ -164,7 +164,6 @@ def list_replays(app: AppDep, caller: CallerDep) -> Response:
     Policy("submit", "body"),
     Returns("The replay, now running.", Replay, LOCATION, status=202),
     lines_of=BatchIn,
-    uploads=True,
     problems=(503,),
 )
 def start_replay(
