@@ -8,6 +8,13 @@ from typing import Any
 
 import numpy as np
 
+from service.acquire.picture_remarks import (
+    CLEAR_RATIO,
+    LEAST_CLEAR,
+    advice_on,
+    remarks_on,
+    remarks_on_light,
+)
 from service.identify.blind.lens import (
     PROJECTIONS,
     Lens,
@@ -27,7 +34,6 @@ from service.identify.blind.solver import (
 from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified, verify
 from service.imaging.detection.points import (
     FIRST_THRESHOLD,
-    MAX_POINTS,
     SECOND_THRESHOLD,
     PointSources,
     find_points,
@@ -56,9 +62,6 @@ from service.vectors import (
 GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
-CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
-"""Signal to noise of clear points, and how many of them without an attitude speak for a lens or
-pixels of another kind."""
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
 """Parts of the sides of a wide picture that are solved alone."""
@@ -246,7 +249,7 @@ def solve_picture(
             if found.attitude is not None:
                 return replace(found, remarks=(remark, *found.remarks))
     points = tried[min(1, len(tried) - 1)]
-    return replace(result, points=points, remarks=tuple(_advice(points, frame, guess_px)))
+    return replace(result, points=points, remarks=tuple(advice_on(points, frame, guess_px)))
 
 
 def _solved_part(
@@ -282,7 +285,7 @@ def _of_projection(
         f"no_match: neither the picture nor its middle fits the sky behind a lens of {projection} "
         "projection: tell another projection, or none"
     )
-    remarks = (remark, *_light(points, has_dark(frame)))
+    remarks = (remark, *remarks_on_light(points, has_dark(frame)))
     return PictureResult(frame, points, None, nothing, remarks)
 
 
@@ -372,7 +375,7 @@ def _widened(
     remarks = (
         remark,
         *remarks_on(whole.lens, best, points, None, GUESS_SHARE),
-        *_light(points, has_dark(frame)),
+        *remarks_on_light(points, has_dark(frame)),
     )
     search = BlindResult(best, best.log_odds, 0, 0, 0, False)
     return PictureResult(frame, points, whole, search, remarks)
@@ -426,7 +429,7 @@ def _solved(
         return PictureResult(frame, points, None, search, ())
     remarks = [
         *remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE),
-        *_light(points, has_dark(frame)),
+        *remarks_on_light(points, has_dark(frame)),
     ]
     return PictureResult(frame, points, attitude, search, tuple(remarks))
 
@@ -598,95 +601,3 @@ def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> li
 
 MOST_OFF_MAG = 1.5
 """The change of a camera's zero point that clouds and another aperture explain."""
-CLIPPED_SHARE = 0.5
-BLURRED_PX = 3.5
-FEW_POINTS = 6
-NOTABLE_HOT = 20
-NOTABLE_BEND = 0.003
-NOTABLE_FOCAL = 0.005
-
-
-def remarks_on(
-    lens: Lens, found: Verified, points: PointSources, guess_px: float | None, guess_share: float
-) -> Iterator[str]:
-    """Remarks that a user should read about a picture whose attitude was found."""
-    fitted_px = lens.focal_px
-    if guess_px is not None:
-        off = fitted_px / guess_px - 1.0
-        if abs(math.log(fitted_px / guess_px)) > math.log1p(guess_share):
-            yield (
-                f"focal_length: {fitted_px:.0f} px fits, far from the {guess_px:.0f} px that were "
-                "told; the whole range was searched"
-            )
-        elif abs(off) > NOTABLE_FOCAL:
-            yield (
-                f"focal_length: residuals are radial: {fitted_px:.0f} px instead of "
-                f"{guess_px:.0f} fits"
-            )
-    if abs(lens.bend) > NOTABLE_BEND:
-        kind = "pincushion" if lens.bend < 0.0 else "barrel"
-        yield (
-            f"distortion: a {kind} of {abs(lens.bend) * lens.radius_px:.1f} px at the corners "
-            "was fitted"
-        )
-    unmatched = len(found.star) - found.matched
-    if unmatched > found.matched:
-        yield f"clutter: {unmatched} of {len(found.star)} candidates are no star of the catalog"
-
-
-def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
-    """Why there may be no attitude, and what to try next that was not given already."""
-    dark = has_dark(frame)
-    if points.count < 4:
-        yield (
-            f"too_few_points: {points.count} points of light, and four are needed: expose longer, "
-            "open the aperture, or focus on the stars"
-        )
-    elif points.count < FEW_POINTS:
-        yield f"few_points: {points.count} points of light hardly tell one field from another"
-    elif points.count >= MAX_POINTS:
-        steps = ["crop what is no sky"]
-        if not points.clipped_stars:
-            steps += [] if dark else ["take off hot pixels with a dark frame (--dark FILE)"]
-            steps.append("use a shorter exposure with less noise")
-        yield f"clutter: {MAX_POINTS} candidates and more: {', or '.join(steps)}"
-    clear = np.count_nonzero(points.signal_ratio > CLEAR_RATIO)
-    if clear >= LEAST_CLEAR:
-        least_deg, most_deg = WIDEST_FIELD_DEG
-        yield (
-            f"no_match: {clear} clear points fit no sky behind a lens of {least_deg:g} to "
-            f"{most_deg:g} degrees: they may be no stars, or the lens may be too wide, or the "
-            "pixels of unequal sides"
-        )
-    yield from _light(points, dark)
-    if guess_px is None:
-        yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
-
-
-def _light(points: PointSources, dark: bool) -> Iterator[str]:
-    if points.clipped_stars:
-        yield (
-            f"clipped_stars: {points.clipped_stars} stars are cut off at the largest count: their "
-            "places are from their flanks and less sure, their magnitudes unknown; a picture that "
-            "is not stretched shows more"
-        )
-    if points.trail_px is not None:
-        yield (
-            f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure; the "
-            "middles of their trails were taken, where they were at mid exposure"
-        )
-    if points.hot_pixels > NOTABLE_HOT:
-        more = "" if dark else "; a dark frame (--dark FILE) takes off all of them"
-        yield (
-            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars{more}"
-        )
-    if points.clipped_share > CLIPPED_SHARE:
-        yield (
-            f"clipped: {points.clipped_share:.0%} of the pixels are clipped to black: faint stars "
-            "are lost; raise the offset (black level) or expose longer"
-        )
-    if points.psf_sigma_px > BLURRED_PX:
-        yield (
-            f"blurred: images of stars are {2.35 * points.psf_sigma_px:.0f} px wide: out of focus, "
-            "or moved during the exposure"
-        )
