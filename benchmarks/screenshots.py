@@ -19,6 +19,7 @@ from PIL import Image
 from tqdm import tqdm
 
 from service.app.factory import App, open_app
+from service.features.definitive.part import Definitive
 from service.missions.mission import load_missions
 from service.settings import Settings
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
@@ -96,7 +97,7 @@ def filled(address: str, app: App) -> Mapping[str, str]:
                 sent = [each.batch | by_votes for each in drawn]
                 replay(client, sent, f"{RUN}-votes")
         # What `acquire smooth` does where no service runs.
-        app.grades.smooth("XTE", run=RUN)
+        app.part(Definitive).days.smooth("XTE", run=RUN)
         alarms = client.get("/api/v1/alarms", params={"run": RUN, "state": "all"}).json()["items"]
         signed = {"who": "J. Operator", "comment": "a priori attitude drifts; slew at 08:00"}
         xte = [each for each in alarms if each["spacecraft"] == "XTE"]

@@ -7,6 +7,8 @@ Nothing outside the folder of a feature imports it.  Its package holds a `Featur
   A table whose rows the record's chain binds says so in its `info` (`storage.sql.columns.BOUND`).
   Another package also lists its tables as `TABLES`: they are made where the database lacks them,
   while those of the service are made by its migrations.
+- `kernels`: `compile_kernels()` compiles the feature's own; a module or a package, which holds all
+  its compiled code and all of the feature that this imports (`compiled.cache.SOURCES`).
 - `projection`: `apply(connection, results)` is called with results in the order of the record,
   in the transaction that notes how far projections have come: each once, while the feature is on.
   `wants(connection, run)` tells if it needs the results of a reprocessed run, which come in order
@@ -48,11 +50,22 @@ from types import ModuleType
 
 from service.errors import BadConfiguration, shown_value
 
-SHIPPED = ("advice", "alarms", "calibration", "follow", "packets", "products", "tracks", "webhooks")
+SHIPPED = (
+    "advice",
+    "alarms",
+    "calibration",
+    "definitive",
+    "follow",
+    "packets",
+    "products",
+    "tracks",
+    "webhooks",
+)
 """The features that come with the service, in the order of their routes and commands."""
 
 KINDS = (
     "tables",
+    "kernels",
     "projection",
     "state",
     "shares",

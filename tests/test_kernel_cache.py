@@ -17,7 +17,7 @@ from numba.core import caching
 
 import service
 from service.acquire.kernel_build import KernelBuild, mark_built
-from service.compiled.cache import SOURCES
+from service.compiled.cache import SOURCES, source_files
 from service.compiled.checked_file import content_of
 from service.compiled.jit import Kernel
 from tests.scale import size
@@ -83,14 +83,9 @@ def test_all_that_compiled_code_takes_in_is_part_of_the_state_of_the_source():
         if name not in taken_in:
             taken_in.add(name)
             waiting += imported_by(modules[name], modules)
-    watched = [PACKAGE.parent / source for source in SOURCES]
-    outside = {
-        name
-        for name in taken_in
-        if not any(modules[name].is_relative_to(place) for place in watched)
-    }
-    assert not outside
-    assert all(place.exists() for place in watched)
+    watched = [set(source_files(source)) for source in SOURCES]
+    assert not {name for name in taken_in if modules[name] not in set().union(*watched)}
+    assert all(watched)
 
 
 def doubled(value):

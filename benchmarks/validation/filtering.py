@@ -17,14 +17,15 @@ from tqdm import tqdm
 from benchmarks.bounds import Bound, at_least, at_most, between
 from benchmarks.report import Report
 from benchmarks.sections import Section, Written, table
-from service.filtering.filter import filter_attitude
-from service.filtering.inputs import FilterSettings, GyroModel
-from service.filtering.result import AttitudeHistory
-from service.filtering.smoother import smooth
+from service.features.definitive.kernels.filter import filter_attitude
+from service.features.definitive.kernels.inputs import FilterSettings
+from service.features.definitive.kernels.result import AttitudeHistory
+from service.features.definitive.kernels.smoother import smooth
+from service.gyro.samples import GyroModel
 from tests import chance
-from tests.filtering import simulated
-from tests.filtering.farrenkopf import steady_sigmas
-from tests.filtering.simulated import ARCSEC
+from tests.features.definitive import simulated
+from tests.features.definitive.farrenkopf import steady_sigmas
+from tests.features.definitive.simulated import ARCSEC
 
 Array = npt.NDArray[np.float64]
 
@@ -64,11 +65,11 @@ CHECKED_S = (600, 3600, HOURS * 3600)
 """Epochs at which the sum over the runs, which are independent, is held against chi-square."""
 SIGMA_V, SIGMA_U = math.sqrt(10.0) * 1e-7, math.sqrt(10.0) * 1e-10
 SOURCES = (
-    "service/filtering",
+    "service/features/definitive/kernels",
     "service/attitude/quaternions.py",
     "service/vectors.py",
-    "tests/filtering/simulated.py",
-    "tests/filtering/farrenkopf.py",
+    "tests/features/definitive/simulated.py",
+    "tests/features/definitive/farrenkopf.py",
 )
 
 

@@ -28,6 +28,7 @@ from service.acquire.prewarm import compile_beside_batches, prewarm_kernels
 from service.child_processes import Source, own_source, require_source, safe_path
 from service.compiled.checked_file import count_whole
 from service.errors import Busy, Stopping
+from service.feature import SETTING, features_on
 from service.missions.identifiers import IDENTIFIERS, IdentifierEntry
 from service.missions.mission import Mission
 from service.sky.cache import LruCache
@@ -54,7 +55,7 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Identifiers that search the whole sky."""
     beside_batches: bool
-    """True if it compiles what no batch needs: links of points, filter, pictures."""
+    """True if it compiles what no batch needs: links of points, features, pictures."""
 
 
 class KernelBuild:
@@ -199,7 +200,10 @@ def _marker() -> Path:
     # numba compiles for one processor, and keys what it caches by that and by its version.
     config: Any = numba.config
     processor = config.CPU_NAME or llvmlite.binding.get_host_cpu_name()
-    return Path(config.CACHE_DIR) / f"complete-{numba.__version__}-{processor}"
+    # One that is switched on later has its kernels compiled then.
+    features = features_on(os.environ.get(SETTING, ""))
+    named = (each.name for each in features if "kernels" in each.brings)
+    return Path(config.CACHE_DIR) / "-".join(["complete", numba.__version__, processor, *named])
 
 
 def _processors() -> int:
@@ -275,7 +279,7 @@ STEPS = {
     "lost_in_space": "search of the whole sky",
     "triangles": "triangles",
     "tracks": "links of points",
-    "filtering": "attitude over time",
+    "kernels": "features",
 }
 """What the kernels of a folder are for; the cache has a folder for each of them."""
 EVERY_S = 10.0

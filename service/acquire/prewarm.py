@@ -2,13 +2,14 @@
 
 import json
 import math
+import os
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from service.acquire import acquire
-from service.filtering.smoother import compile_filtering
+from service.feature import SETTING, feature_modules
 from service.identify.prior_attitude import prior_attitude, search_region
 from service.imaging.frames.jpeg import compile_walk
 from service.missions.identifiers import IDENTIFIERS
@@ -134,8 +135,9 @@ def prewarm_kernels(
 
 
 def compile_beside_batches() -> None:
-    """Load the kernels, or compile them, of what is computed over many batches, and of pictures."""
-    compile_filtering()
+    """Load the kernels, or compile them, of features, of links of points, and of pictures."""
+    for module in feature_modules("kernels", os.environ.get(SETTING, "")):
+        module.compile_kernels()
     compile_linking()
     compile_walk()
 

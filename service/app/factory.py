@@ -9,7 +9,6 @@ from service.app.adoptions import CalibrationAdoptions
 from service.app.annotations import Annotations
 from service.app.context import Context
 from service.app.frames import Frames
-from service.app.grades import DefinitiveAttitudes, Grades, LiveFilter
 from service.app.replays import Replays
 from service.app.results import Comparisons, Results
 from service.app.runs import Runs
@@ -67,6 +66,7 @@ class App:
         self.missions = context.missions
         self.sky = context.sky
         self.store = context.store
+        self.kernels = kernels
         self.single_projector = SingleProjector(context.store)
         self.projector = Projector(context.store, head_maker)
         self.access = Access(
@@ -83,9 +83,6 @@ class App:
         self.results = Results(context, self.submissions)
         self.spacecraft = Spacecraft(context)
         self.gyro = Gyro(context)
-        self.grades = Grades(context)
-        self.definitive = DefinitiveAttitudes(context, self.grades, kernels)
-        self.live_filter = LiveFilter(context, kernels)
         self.annotations = Annotations(context)
         self.runs = Runs(context)
         self.replays = Replays(context, self.in_force, self.submissions, self.gyro.record_many)
@@ -123,9 +120,7 @@ class App:
         for part in self._parts.values():
             part.close()
         self.replays.stop()
-        self.live_filter.stop()
         self.upgrade.stop()
-        self.definitive.close()
         self.submissions.close()
         self.projector.close()
         self.store.close()

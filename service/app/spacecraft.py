@@ -17,7 +17,7 @@ from service.contract.alarms import Alarm
 from service.contract.base import Page
 from service.contract.spacecraft import GyroBlockRow, GyroSamples, Overview
 from service.errors import AcquisitionError, BadBatch, Fault, shown_value
-from service.gyro import GyroBlock, block_from_json, require_rates_within
+from service.gyro.blocks import GyroBlock, block_from_json, require_rates_within
 from service.ingest.solver_pool import mission_in_input
 from service.missions.mission import Mission, mission_named
 from service.missions.motion import largest_rate_deg_per_s

@@ -8,6 +8,7 @@ would go on with the old code.
 import hashlib
 import os
 import sys
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -15,7 +16,8 @@ PACKAGE = Path(__file__).parents[1]
 SOURCES = (
     "service/attitude",
     "service/compiled",
-    "service/filtering",
+    "service/features/*/kernels*",
+    "service/gyro/samples.py",
     "service/identify",
     "service/imaging/frames/frame.py",
     "service/imaging/frames/jpeg.py",
@@ -35,7 +37,7 @@ SOURCES = (
     "service/vectors.py",
     "studies/ptp_2015/rivals",
 )
-"""Folders and files that hold every module with compiled code, and all that these import."""
+"""Patterns of folders and files with every module with compiled code, and all that these import."""
 
 
 def keep_kernels_apart() -> None:
@@ -54,11 +56,15 @@ def keep_kernels_apart() -> None:
 def source_digest() -> str:
     """The digest of `SOURCES`, in hexadecimal digits."""
     state = hashlib.sha256()
-    for source in SOURCES:
-        place = PACKAGE.parent / source
-        for path in sorted(place.rglob("*.py")) if place.is_dir() else [place]:
-            state.update(path.relative_to(PACKAGE.parent).as_posix().encode() + path.read_bytes())
+    for path in sorted(path for source in SOURCES for path in source_files(source)):
+        state.update(path.relative_to(PACKAGE.parent).as_posix().encode() + path.read_bytes())
     return state.hexdigest()
+
+
+def source_files(pattern: str) -> Iterator[Path]:
+    """The Python files of a pattern of `SOURCES`."""
+    for place in PACKAGE.parent.glob(pattern):
+        yield from place.rglob("*.py") if place.is_dir() else [place]
 
 
 def _folder() -> Path:

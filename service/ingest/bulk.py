@@ -13,7 +13,7 @@ from typing import Annotated
 import msgspec
 
 from service.errors import AcquisitionError, Busy
-from service.gyro import GyroBlock, block_from_line, is_gyro_line
+from service.gyro.blocks import GyroBlock, block_from_line, is_gyro_line
 from service.ingest.local_workers import ChunkEndsWorkers, LocalWorkers, WorkerLost
 from service.ingest.solver_pool import Solver
 from service.ingest.submit import SubmissionService

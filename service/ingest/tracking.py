@@ -5,28 +5,30 @@ It becomes a part of the recorded batch: whatever is recorded later, the batch e
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from msgspec import structs
-from sqlalchemy import Connection
+from sqlalchemy import BigInteger, Connection, bindparam, select
 
+from service.attitude import prediction
+from service.attitude.prediction import Known
 from service.errors import BadInput
-from service.filtering import prediction
-from service.filtering.inputs import AttitudeMeasurements
-from service.grades.stretches import BIAS_SIGMAS, believed, gyro_samples, turns_beside_bias
+from service.gyro.samples import BIAS_SIGMAS, believed, gyro_samples, turns_beside_bias
 from service.interpolation import QUARTER_TURN_RAD, steps_between
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings, MotionSettings, TrackingSettings
 from service.observations.batch import ObservationBatch
+from service.observations.decode import RECORDED_RATES
 from service.observations.schema import NoPrediction, RateSource, Submission, submission_from_json
-from service.storage.grades.inputs import RecordedAttitude, gyro_in, last_attitudes
-from service.storage.gyro import BlockFilter
+from service.storage.gyro import BlockFilter, gyro_in
+from service.storage.queries.pages import COVARIANCE, PLACE, QUATERNION, covariance_of
 from service.storage.recording.results import last_good_results
 from service.storage.recording.unsaved_result import PredictedFrom
-from service.times import shifted
-from service.vectors import ARCSEC_PER_RADIAN
+from service.storage.sql.tables import batches, results, solutions
+from service.times import Utc, recorded_utc, shifted
+from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 MARGIN_SIGMAS = 3.0
 """A zone reaches beyond the field of view by so many sigmas of the prediction."""
@@ -34,6 +36,57 @@ LARGEST_SIGMAS = 5.0
 """Two attitudes tell no rate that is more than so many sigmas of the mission's."""
 SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
+
+_LAST = (
+    select(
+        *(results.c.id, batches.c.time, batches.c.time_ns, batches.c.input),
+        *(solutions.c[name] for name in (*QUATERNION, *COVARIANCE)),
+    )
+    .join_from(results, batches, results.c.batch_id == batches.c.id)
+    .join(solutions, solutions.c.result_id == results.c.id)
+    .where(
+        results.c.current,
+        results.c.spacecraft == bindparam("spacecraft"),
+        results.c.run == bindparam("run"),
+        results.c.time_ns <= bindparam("until_ns", type_=BigInteger),
+        results.c.time_ns >= bindparam("since_ns", type_=BigInteger),
+        results.c.status == "good",
+    )
+    .order_by(*(column.desc() for column in PLACE))
+    .limit(2)
+)
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedAttitude:
+    """A good attitude, the result that it is of, and the rates (3,) that its batch carried."""
+
+    result: str
+    time: Utc
+    known: Known
+    body_rates_deg_per_s: Vector
+
+
+def last_attitudes(
+    connection: Connection, spacecraft: str, run: str, until: Utc, within_s: float
+) -> list[RecordedAttitude]:
+    """The last two good attitudes that are not after a time, nor older than so much, latest first.
+
+    A suspect attitude is none of them.
+    """
+    asked = {
+        "spacecraft": spacecraft,
+        "run": run,
+        "until_ns": until.tai_ns,
+        "since_ns": until.tai_ns - round(within_s * 1e9),
+    }
+    found = []
+    for row in connection.execute(_LAST, asked):
+        covariance = np.array(covariance_of(row[8:]))
+        known = Known(row.time_ns, np.array(row[4:8]), covariance / ARCSEC_PER_RADIAN**2)
+        rates = np.array(RECORDED_RATES.decode(row.input).body_rates_deg_per_s or np.zeros(3))
+        found.append(RecordedAttitude(row.id, recorded_utc(row.time), known, rates))
+    return found
 
 
 def predicted_from(
@@ -248,10 +301,11 @@ def _turns(
         error_rad_s = math.radians(tracking.body_rate_sigma_deg_per_s) + gyro.bias_sigma_rad_s
         return fastest_rad_s > BIAS_SIGMAS * error_rad_s
     step = (before, last)
-    attitudes = AttitudeMeasurements(
+    turned = turns_beside_bias(
+        gyro,
         np.array([each.known.tai_ns for each in step]),
         np.stack([each.known.quaternion for each in step]),
         np.stack([each.known.covariance_rad2 for each in step]),
+        np.radians([each.body_rates_deg_per_s for each in step]),
     )
-    carried_rad_s = np.radians([each.body_rates_deg_per_s for each in step])
-    return bool(turns_beside_bias(gyro, attitudes, carried_rad_s)[0])
+    return bool(turned[0])

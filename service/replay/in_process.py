@@ -7,7 +7,7 @@ import msgspec
 
 from service.app.factory import App
 from service.errors import AcquisitionError, Busy, problem_of
-from service.gyro import GyroBlock
+from service.gyro.blocks import GyroBlock
 from service.replay.items import (
     AttitudeCarrier,
     Item,

@@ -17,7 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from service import vectors
 from service.ephemerides.known import Ephemeris, KnownAttitudes
 from service.errors import BadInput, Fault, problem_of, problem_of_faults, shown_value
-from service.gyro import GyroBlock, block_from_line, is_gyro_line
+from service.gyro.blocks import GyroBlock, block_from_line, is_gyro_line
 from service.interpolation import LARGEST_ERROR_RAD, QUARTER_TURN_RAD
 from service.observations.batch import ObservationBatch
 from service.observations.decompress import Line

@@ -18,7 +18,7 @@ from acquire_client.models import Replay
 from msgspec import to_builtins
 
 from service import errors
-from service.gyro import json_of_block
+from service.gyro.blocks import json_of_block
 from service.observations.telemetry import read_lines
 from service.replay.items import (
     AttitudeCarrier,

@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from sqlalchemy import ColumnElement, Connection, func, insert, select
 
-from service import gyro
 from service.contract.base import Page
 from service.contract.spacecraft import GyroBlockRow, GyroSamples
 from service.errors import AcquisitionError, BadBatch, Conflict, Fault, NotFound, shown_value
+from service.gyro import blocks as gyro
 from service.storage.recording import events
 from service.storage.sql.columns import Row
-from service.storage.sql.grade_tables import gyro_blocks
 from service.storage.sql.statements import insert_runs
-from service.storage.sql.tables import runs
+from service.storage.sql.tables import gyro_blocks, runs
 from service.table_files.table import Column, Table
 from service.table_files.table import Page as TablePage
 from service.times import Utc, recorded_utc, shifted
@@ -273,3 +273,27 @@ def _page(row: Any, selected: BlockFilter) -> TablePage:
     texts = gyro.texts_of(block.start, block.times_s[inside])
     names = [block.block] * len(texts)
     return [texts, times_ns[inside].tolist(), names, *block.rates_rad_per_s[inside].T.tolist()]
+
+
+def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[gyro.Nanoseconds, Vector]:
+    """The samples of a period in order of time; those of blocks that interleave are merged."""
+    times, rates = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
+    query = select(gyro_blocks).where(*selected.conditions()).order_by(gyro_blocks.c.start_ns)
+    for row in connection.execute(query).mappings():
+        times.append(gyro.tai_ns_of(row["start_ns"], times_of(row)))
+        rates.append(rates_of(row))
+    tai_ns, rate = np.concatenate(times), np.concatenate(rates)
+    places = inside(tai_ns, selected.start, selected.end)
+    tai_ns, rate = tai_ns[places], rate[places]
+    order = np.argsort(tai_ns, kind="stable")
+    return tai_ns[order], rate[order]
+
+
+def inside(tai_ns: gyro.Nanoseconds, start: Utc | None, end: Utc | None) -> npt.NDArray[np.intp]:
+    """The places of the times that lie in a period."""
+    chosen = np.ones(len(tai_ns), dtype=bool)
+    if start is not None:
+        chosen &= tai_ns >= start.tai_ns
+    if end is not None:
+        chosen &= tai_ns < end.tai_ns
+    return np.flatnonzero(chosen)

@@ -29,7 +29,6 @@ from service.web.api import (
     events,
     frames,
     probes,
-    products,
     runs,
     spacecraft,
     zones,
@@ -55,7 +54,6 @@ ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
     frames.router,
     spacecraft.router,
-    products.router,
     batches.gyro_router,
     batches.compare_router,
     zones.router,
@@ -89,8 +87,6 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
         reporting = asyncio.create_task(report_to_supervisor(app))
         try:
             await web_app.state.live.start()
-            app.live_filter.start()
-            app.definitive.start_schedule()
             async with AsyncExitStack() as running:
                 for module in feature_modules("serving", app.settings.features_off):
                     own = module.serving(app, web_app.state.metrics)

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from contextlib import closing
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -34,7 +35,7 @@ def test_every_folder_of_a_feature_is_in_the_list():
 def test_a_feature_brings_what_it_says_and_has_a_folder_of_tests(name):
     feature = known_features()[name]
     for kind in feature.brings:
-        assert (FEATURES / name / f"{kind}.py").exists()
+        assert find_spec(f"{feature.package}.{kind}")
     assert list((Path(__file__).parent / name).glob("test_*.py"))
 
 
@@ -56,7 +57,8 @@ def test_a_name_of_no_feature_is_refused_with_the_names_of_all(acquire, monkeypa
     code, _, complaint = acquire("version")
     assert code == 2
     assert (
-        "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, calibration, follow" in complaint
+        "ACQUIRE_FEATURES_OFF: must be features of advice, alarms, calibration, definitive"
+        in complaint
     )
     assert "(got 'folow')" in complaint
     with pytest.raises(BadConfiguration, match="ACQUIRE_FEATURES_OFF"):
@@ -130,15 +132,16 @@ def served(folder, off, *addresses, path=(), sent=""):
 
 def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(tmp_path):
     pages = ("/", "/about", "/missions", "/batches", "/annotations", "/spacecraft/XTE")
-    pages += ("/spacecraft/XTE/period", "/spacecraft/XTE/grades")
+    pages += ("/spacecraft/XTE/period",)
     history = "/api/v1/spacecraft/XTE/history?format=csv"
     gone = ("/webhooks", "/alarms", "/api/v1/alarms", "/api/v1/spacecraft/XTE/tracks")
     gone += ("/spacecraft/XTE/files", "/api/v1/spacecraft/XTE/attitude")
+    gone += ("/spacecraft/XTE/grades", "/api/v1/spacecraft/XTE/definitive-attitude")
     off = ",".join(SHIPPED)
     commands, modules, found = served(
         tmp_path, off, *pages, *gone, history, "/metrics", sent="docs/example-batch.json"
     )
-    assert not commands & {*SHIPPED, "export", "score", "calibrate"}
+    assert not commands & {*SHIPPED, "export", "score", "calibrate", "smooth"}
     assert {"serve", "replay", "history"} <= commands
     assert [found[each][0] for each in pages] == [200] * len(pages)
     assert found[history][0] == 200
@@ -149,14 +152,66 @@ def test_with_every_feature_off_the_pages_are_there_and_nothing_of_a_feature_is(
     assert "starid_alarms" not in found["/metrics"][1]
     assert "sky, residuals, rates" in found["/spacecraft/XTE"][1]
     shown = found["/"][1] + found["/spacecraft/XTE"][1] + found["/missions"][1]
-    shown += found["/spacecraft/XTE/period"][1] + found["/spacecraft/XTE/grades"][1]
-    for gone_page in ("/alarms", "/calibration", "/files", "/attitude?"):
+    shown += found["/spacecraft/XTE/period"][1]
+    for gone_page in ("/alarms", "/calibration", "/files", "/attitude?", "/grades"):
         assert gone_page not in shown
     loaded = {each for each in modules if each.startswith("service.features.")}
     # The names of the features, and the tables, which stay in the database.
     assert loaded <= {f"service.features.{name}" for name in SHIPPED} | {
         f"service.features.{name}.tables" for name in SHIPPED
     }
+
+
+PREDICTED = """
+import json, sys
+from service.app.factory import open_app
+from service.gyro.blocks import block_from_json
+from service.observations.schema import submission_from_json
+from service.settings import Settings
+from service.simulate.stretches import Pass
+from service.simulate.telemetry import GyroWanted, draw_pass, with_gyro
+
+app = open_app(
+    Settings(database="sqlite:///" + sys.argv[1], replay_processes=0, features_off=sys.argv[2])
+)
+mission = app.missions["XTE"]
+drawn = draw_pass(mission, app.sky, Pass(batches=4, cadence_s=10.0, seed=5))
+sent = list(with_gyro(drawn, mission, GyroWanted(), 30.0, 5))
+for block in [block for each in sent for block in each.gyro]:
+    own = {name: value for name, value in block.items() if name != "spacecraft"}
+    app.gyro.record(block_from_json(json.dumps(own), "XTE"))
+for number, each in enumerate(sent):
+    body = each.batch | ({"a_priori": {"from": "last"}} if number else {})
+    print(app.submissions.submit(submission_from_json(json.dumps(body))).body.decode())
+app.close()
+"""
+
+
+def predicted(file, off):
+    """What answers of batches that ask for the last attitude say of stars and attitude."""
+    run = subprocess.run(
+        [sys.executable, "-c", PREDICTED, str(file), off],
+        cwd=ROOT,
+        env=os.environ | {SETTING: off},
+        capture_output=True,
+        text=True,
+    )
+    assert run.returncode == 0, run.stderr
+    answers = [json.loads(line) for line in run.stdout.splitlines()]
+    predictions = [each["tracking"]["prediction"] for each in answers[1:]]
+    for each in predictions:
+        # The id of a result.
+        del each["result"]
+    named = ("observations", "counts", "attitude", "reason", "warnings")
+    return predictions, [{name: each[name] for name in named} for each in answers]
+
+
+def test_answers_of_the_main_job_are_the_same_with_every_feature_off(tmp_path):
+    """Predicted by a gyro, too: its blocks are the main job's."""
+    predictions, answers = predicted(tmp_path / "on.db", "")
+    assert [each["rate"] for each in predictions] == ["gyro"] * 3
+    assert all(each["attitude"]["status"] == "good" for each in answers)
+    assert predicted(tmp_path / "off.db", ",".join(SHIPPED)) == (predictions, answers)
 
 
 DWELL = {

@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow.parquet as parquet
 import pytest
 
-from service.gyro import SAME_TIME_NS
+from service.gyro.blocks import SAME_TIME_NS
 from service.times import parse_utc as utc
 from service.times import shifted
 from tests.gyro.blocks import START, body

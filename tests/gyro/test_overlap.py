@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.gyro import SAME_TIME_NS, first_shared_ns, tai_ns_of, times_of_steps
+from service.gyro.blocks import SAME_TIME_NS, first_shared_ns, tai_ns_of, times_of_steps
 
 TIMES = st.lists(st.integers(0, 60), min_size=1, max_size=12).map(
     # Small steps, so that many come near one another: below, at and beyond the bound.

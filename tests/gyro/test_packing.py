@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.gyro import pack, unpack
+from service.gyro.blocks import pack, unpack
 
 BITS = st.integers(0, 2**64 - 1)
 

@@ -7,9 +7,9 @@ from sqlalchemy import update
 
 from service.app.factory import open_app
 from service.errors import AcquisitionError
-from service.gyro import GyroBlockIn, block_from_model, pack
+from service.gyro.blocks import GyroBlockIn, block_from_model, pack
 from service.settings import Settings
-from service.storage.sql.grade_tables import gyro_blocks
+from service.storage.sql.tables import gyro_blocks
 from service.storage.upkeep.backup import back_up
 from service.storage.upkeep.prune import prune
 from service.storage.upkeep.verify import verify

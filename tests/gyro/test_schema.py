@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from service.errors import BadBatch
-from service.gyro import (
+from service.gyro.blocks import (
     MAX_SAMPLES,
     block_from_json,
     block_from_line,

@@ -10,7 +10,7 @@ from service.access import Caller
 from service.app.factory import open_app
 from service.errors import BadBatch, BadFile
 from service.features.products.part import Products
-from service.gyro import block_from_json, block_from_line, is_gyro_line, json_of_block
+from service.gyro.blocks import block_from_json, block_from_line, is_gyro_line, json_of_block
 from service.observations import gyro_rows
 from service.observations.telemetry import read_lines
 from service.replay.in_process import replay_in_process

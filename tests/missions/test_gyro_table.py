@@ -8,7 +8,7 @@ import pytest
 from service.app.context import Context
 from service.app.spacecraft import Gyro
 from service.errors import BadBatch, BadConfiguration
-from service.gyro import GyroBlockIn, block_from_model
+from service.gyro.blocks import GyroBlockIn, block_from_model
 from service.missions.mission import load_missions, parse_mission
 from tests.gyro.blocks import body
 from tests.missions.without_gyro import text_without_gyro

@@ -13,7 +13,7 @@ import pytest
 from service.acquire import acquire
 from service.ephemerides.files import read_attitudes, read_ephemeris
 from service.errors import BadInput
-from service.gyro import block_from_line
+from service.gyro.blocks import block_from_line
 from service.observations.csv_rows import COLUMNS
 from service.observations.input_formats import (
     CSV_COLUMNS,

@@ -8,12 +8,12 @@ import pytest
 
 from service.cli import main
 from service.errors import BadInput
-from service.gyro import block_from_line
+from service.gyro.blocks import block_from_line
 from service.simulate.stretches import NO_TROUBLES, Pass
 from service.simulate.telemetry import GyroWanted, draw_pass, read_objects, with_gyro, write_pass
 from service.times import parse_utc
 from service.vectors import ARCSEC_PER_RADIAN, rotation_vectors, turned_quaternion
-from tests.grades.passes import mission_with
+from tests.features.definitive.passes import mission_with
 from tests.missions.without_gyro import mission_without_gyro, text_without_gyro
 
 QUIET = {"sigma_v_rad_s0_5": 0.0, "sigma_u_rad_s1_5": 0.0, "bias_sigma_rad_s": 1e-30}

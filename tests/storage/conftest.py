@@ -6,7 +6,7 @@ from service.app.factory import open_app
 from service.settings import Settings
 from service.storage.recording.signing import PublicKey, make_key
 from service.storage.upkeep.verify import verify
-from tests.grades.passes import GYRO, mission_with
+from tests.features.definitive.passes import GYRO, mission_with
 from tests.storage import samples, sealed
 
 

@@ -6,7 +6,8 @@ from contextlib import contextmanager, suppress
 from sqlalchemy import create_engine, insert, select, text, update
 
 from service.errors import Busy
-from service.gyro import GyroBlockIn, block_from_model
+from service.features.definitive.part import Definitive
+from service.gyro.blocks import GyroBlockIn, block_from_model
 from service.imaging.submit import read_known
 from service.observations.schema import OptionsIn
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
@@ -83,7 +84,7 @@ def fill(app, make, missions):
     rates = [(0.0, 0.0, 0.0)] * 3_001
     gyro = GyroBlockIn(block="g1", start=START.text, step_s=1.0, rates_rad_per_s=rates)
     app.gyro.record(block_from_model(gyro, "XTE"))
-    app.grades.smooth("XTE")
+    app.part(Definitive).days.smooth("XTE")
     app.projector.make_heads()
     app.results.what_if(ids[0], TIGHT, adopt=True)
     app.results.what_if(ids[1], TIGHT, record=True)

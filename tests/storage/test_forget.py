@@ -5,12 +5,13 @@ from sqlalchemy import func, select
 
 from service.errors import BadConfiguration, NotFound
 from service.storage.sql.columns import metadata
-from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.definitive_tables import graded_days
 from service.storage.sql.tables import (
     archived_batches,
     archived_parts,
     audit,
     batches,
+    gyro_blocks,
     rollups_hourly,
     runs,
 )

@@ -9,10 +9,10 @@ import pytest
 
 from service.acquire import acquire
 from service.acquire.result import Path
+from service.features.definitive.inputs import recorded_in
 from service.missions.mission import load_missions
 from service.observations.schema import submission_from_json
 from service.simulate.motion import turned_by
-from service.storage.grades.inputs import recorded_in
 from service.times import parse_utc, shifted
 from service.vectors import quaternion_from_matrix, separation_deg
 from tests.chance import at_least, at_most

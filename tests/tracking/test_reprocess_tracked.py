@@ -6,7 +6,7 @@ import pytest
 
 from service.app.factory import open_app
 from service.errors import BadBatch
-from service.gyro import block_from_json
+from service.gyro.blocks import block_from_json
 from service.ingest.reprocess import ReprocessProgress
 from service.missions.mission import load_missions
 from service.missions.motion import GyroSettings

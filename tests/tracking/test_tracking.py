@@ -11,7 +11,7 @@ import pytest
 from service.acquire import acquire
 from service.app.factory import open_app
 from service.errors import BadBatch
-from service.gyro import block_from_json
+from service.gyro.blocks import block_from_json
 from service.missions.mission import load_missions
 from service.missions.motion import GyroSettings
 from service.observations.csv_rows import batch_cells, batch_fields

@@ -16,6 +16,7 @@ from typing import Any
 import httpx
 
 from service.app.factory import App, open_app
+from service.features.definitive.part import Definitive
 from service.missions.mission import load_missions
 from service.missions.motion import LiveFilterSettings
 from service.simulate.frames import FrameSettings, draw_frames, frame_bytes
@@ -291,7 +292,7 @@ def _measured(client: httpx.Client, app: App, take: Any) -> None:
         answer = client.post(f"{API}/batches", json=body)
         if number == 1:
             take("submit_batch", answer, "measured_attitude", body)
-    app.live_filter.refresh("SWAS")
+    app.part(Definitive).live_filter.refresh("SWAS")
     take("get_live_attitude", client.get(f"{API}/spacecraft/SWAS/attitude/latest"), "swas")
 
 

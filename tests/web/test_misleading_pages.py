@@ -11,6 +11,7 @@ from msgspec import structs
 
 from service.app.factory import open_app
 from service.contract.spacecraft import WindowCounts
+from service.features.definitive.part import Definitive
 from service.observations.telemetry import read_lines
 from service.storage.queries.fleet import DayCounts, FleetRow, TrackerCounts
 from service.storage.queries.results import answer_from_json
@@ -311,7 +312,7 @@ def test_without_gyro_data_the_pages_say_what_is_missing_and_link_no_file_that_i
             client.post("/api/v1/batches", json=each).raise_for_status()
         before = text_of(client.get("/spacecraft/XTE/grades"))
         assert before.count("There are no gyro data in this period") == 1
-        app.grades.smooth("XTE")
+        app.part(Definitive).days.smooth("XTE")
         after = client.get("/spacecraft/XTE/grades").text
         files = client.get("/spacecraft/XTE/files").text
         assert "None is good. There are no gyro data in this period" in files

@@ -15,8 +15,8 @@ from service.storage.queries.period import PeriodAttitudes, PeriodStars, Tracker
 from service.times import parse_utc, shifted
 from service.vectors import angle_between_deg, from_ra_dec, quaternion_from_matrix
 from service.web.console.charts.all_sky import EDGE, HEIGHT, WIDTH, all_sky_chart, hammer
+from service.web.console.charts.attitude import attitude_charts
 from service.web.console.charts.focal_plane import focal_plane_map
-from service.web.console.charts.grades import attitude_charts
 from service.web.console.charts.histogram import magnitude_chart, residual_histogram
 
 START = parse_utc("1999-03-01T00:00:00Z")

@@ -58,6 +58,9 @@ from .calibration import ResidualCell as ResidualCell
 from .calibration import ResidualMap as ResidualMap
 from .calibration import TrackerGeometry as TrackerGeometry
 from .calibration import TrackerMagnitudes as TrackerMagnitudes
+from .definitive import DefinitiveJob as DefinitiveJob
+from .definitive import Innovation as Innovation
+from .definitive import LiveAttitude as LiveAttitude
 from .events import Adopted as Adopted
 from .events import CalibrationChange as CalibrationChange
 from .events import LatestBatch as LatestBatch
@@ -70,9 +73,6 @@ from .pictures import PictureLens as PictureLens
 from .pictures import PictureStar as PictureStar
 from .problems import FieldFault as FieldFault
 from .problems import ProblemDocument as ProblemDocument
-from .products import DefinitiveJob as DefinitiveJob
-from .products import Innovation as Innovation
-from .products import LiveAttitude as LiveAttitude
 from .runs import ApidPackets as ApidPackets
 from .runs import LineProblem as LineProblem
 from .runs import RefusedLine as RefusedLine

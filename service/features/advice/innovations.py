@@ -28,10 +28,9 @@ import numpy as np
 import numpy.typing as npt
 
 from service.advice.intervals import Interval
+from service.attitude.definitive import MeasuredInnovations, Outcome
 from service.features.advice.statements import FileChange, Statement
 from service.features.advice.trackers import NoiseFinding
-from service.filtering.result import Outcome
-from service.grades.day import MeasuredInnovations
 from service.missions.mission import Mission
 from service.missions.motion import GyroSettings
 from service.vectors import Vector, full_matrices

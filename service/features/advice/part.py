@@ -42,7 +42,7 @@ from service.ingest.submit import SubmissionService
 from service.missions.mission import Mission
 from service.observations.batch import ObservationBatch
 from service.observations.schema import TolerancesIn
-from service.storage.grades.period import latest_innovations
+from service.storage.queries.definitive import latest_innovations
 from service.storage.queries.pages import ResultFilter
 from service.storage.queries.period import sample_period
 from service.storage.queries.results import BatchSample, sample_batches

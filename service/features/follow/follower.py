@@ -34,7 +34,7 @@ from prometheus_client import CollectorRegistry, Counter, Gauge
 
 from service.errors import AcquisitionError, BadConfiguration
 from service.features.follow.source import Source
-from service.gyro import is_gyro_line
+from service.gyro.blocks import is_gyro_line
 
 ACK_WAIT_S = 30.0
 """A message without a sign from its follower for so long is delivered to another one."""

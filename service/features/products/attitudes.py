@@ -43,7 +43,10 @@ class SeriesTracker:
 class SeriesInfo:
     """The subject of a series of attitudes: the spacecraft, the filters, and its identifiers.
 
-    Attitudes of the grade `raw` are those of batches; see `service.grades` for the others.
+
+    Attitudes of the grade `raw` are those of batches; `service.attitude.definitive` has the others.
+    Attitudes of the grade `raw` are those of batches; `service.attitude.definitive` has the others.
+    `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
     `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
     spacecraft's clock; without it kernels have a clock of our own.
     """

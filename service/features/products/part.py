@@ -19,9 +19,9 @@ from service.ingest.missions_in_force import adopted_missions
 from service.missions.mission import Mission, load_missions, mission_named
 from service.missions.product_settings import MAX_LARGEST_GAP_S
 from service.settings import Settings
-from service.storage.grades.days import count_samples_of, graded_pages
 from service.storage.gyro import BlockFilter, count_samples, sample_table
 from service.storage.projections.heads import newest_head
+from service.storage.queries.definitive import count_samples_of, graded_pages
 from service.storage.queries.histories import retired
 from service.storage.queries.pages import ResultFilter, count
 from service.storage.recording.unsaved_result import LIVE

@@ -13,7 +13,7 @@ from typing import Any
 import msgspec
 from sqlalchemy import Connection, Double, LargeBinary, Table, insert, select
 
-from service.storage.sql import grade_tables, tables
+from service.storage.sql import definitive_tables, tables
 from service.storage.sql.chain_tables import record_facts
 from service.storage.sql.columns import BOUND, Bound, Row
 from service.storage.sql.migrations import all_tables
@@ -166,8 +166,8 @@ _OWN: Mapping[Table, Bound] = {
     tables.calibrations: Bound(closed_by="ended", open_free=_OF_PROGRESS),
     tables.calibration_adoptions: Bound(),
     tables.annotations: Bound(),
-    grade_tables.graded_days: Bound(frozenset({"current"})),
-    grade_tables.gyro_blocks: Bound(),
+    definitive_tables.graded_days: Bound(frozenset({"current"})),
+    tables.gyro_blocks: Bound(),
 }
 
 

@@ -133,7 +133,7 @@ def all_tables() -> list[Table]:
     # A table is known to the metadata when its module is loaded.
     from service.storage.sql import (  # noqa: F401
         chain_tables,
-        grade_tables,
+        definitive_tables,
         tables,
     )
 

@@ -524,3 +524,30 @@ archived_hours = sa.Table(
     sa.Column("sums", sa.Text, nullable=False),
     sqlite_with_rowid=False,
 )
+
+gyro_blocks = sa.Table(
+    "gyro_blocks",
+    metadata,
+    sa.Column("id", Id, primary_key=True),
+    sa.Column("spacecraft", Name, nullable=False),
+    sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
+    sa.Column("block", Name, nullable=False),
+    # Of the first sample and of the last.
+    sa.Column("start", Moment, nullable=False),
+    sa.Column("end", Moment, nullable=False),
+    sa.Column("start_ns", sa.BigInteger, nullable=False),
+    sa.Column("end_ns", sa.BigInteger, nullable=False),
+    sa.Column("received", Moment, nullable=False),
+    sa.Column("fingerprint", sa.String(64), nullable=False),
+    sa.Column("samples", sa.Integer, nullable=False),
+    # Null where the block has times of its own.
+    sa.Column("step_s", sa.Double),
+    # Packed: see service/gyro/blocks.py.
+    sa.Column("times_s", sa.LargeBinary),
+    sa.Column("rates_rad_per_s", sa.LargeBinary, nullable=False),
+    sa.UniqueConstraint("spacecraft", "run", "block"),
+    # Periods, and blocks that may share a time with another: no block spans more than a day.
+    sa.Index("ix_gyro_blocks_by_start", "spacecraft", "run", "start_ns", "end_ns"),
+    # Pruning finds blocks by their end, in all runs or in one.
+    sa.Index("ix_gyro_blocks_by_end", "end_ns"),
+)

@@ -20,13 +20,14 @@ from service.errors import BadConfiguration, NotFound, shown_value
 from service.storage.projections import rollups
 from service.storage.recording.unsaved_result import LIVE
 from service.storage.sql.columns import Row
-from service.storage.sql.grade_tables import graded_days, gyro_blocks
+from service.storage.sql.definitive_tables import graded_days
 from service.storage.sql.statements import count, rows_of
 from service.storage.sql.tables import (
     archived_batches,
     archived_hours,
     archived_parts,
     batches,
+    gyro_blocks,
     runs,
 )
 from service.storage.store import Store

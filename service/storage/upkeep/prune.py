@@ -12,11 +12,12 @@ from sqlalchemy import ColumnElement, Connection, Table, delete, select
 
 from service.storage.projections import rollups, seals
 from service.storage.recording import chain
-from service.storage.sql.grade_tables import graded_blocks, graded_days, gyro_blocks
+from service.storage.sql.definitive_tables import graded_blocks, graded_days
 from service.storage.sql.statements import count, portions
 from service.storage.sql.tables import (
     batches,
     frames,
+    gyro_blocks,
     idempotency_keys,
     results,
     rollups_hourly,

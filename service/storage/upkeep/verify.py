@@ -18,31 +18,32 @@ import numpy as np
 import sqlalchemy as sa
 from sqlalchemy.exc import DatabaseError
 
-from service.errors import BadInput
-from service.grades.day import (
+from service.attitude.definitive import (
     GRADES,
     GradedSamples,
     MeasuredInnovations,
     unpacked,
     unpacked_innovations,
 )
-from service.gyro import SAME_TIME_NS, Nanoseconds, first_shared_ns
+from service.errors import BadInput
+from service.gyro.blocks import SAME_TIME_NS, Nanoseconds, first_shared_ns
 from service.observations.batch import ObservationBatch
 from service.observations.schema import fingerprint_of, submission_from_json
-from service.storage.grades.days import DaySummary
 from service.storage.gyro import block_of
 from service.storage.projections import rollups, seals
+from service.storage.queries.definitive import DaySummary
 from service.storage.queries.time_buckets import Bucket
 from service.storage.recording.identity import SETTINGS, agrees, digest_of, digest_of_row
 from service.storage.recording.result_metrics import is_waiting
 from service.storage.recording.signing import PublicKey
 from service.storage.sql import tables
 from service.storage.sql.columns import Row, metadata
+from service.storage.sql.definitive_tables import INNOVATIONS, graded_blocks, graded_days
 from service.storage.sql.dialects import dialect_of
 from service.storage.sql.engines import database_url, reading_engine
-from service.storage.sql.grade_tables import INNOVATIONS, graded_blocks, graded_days, gyro_blocks
 from service.storage.sql.migrations import check, disposed, reading, reported
 from service.storage.sql.statements import count, owned_rows, rows_of
+from service.storage.sql.tables import gyro_blocks
 from service.storage.upkeep.verify_chain import Anchor, faults_of_the_chain
 from service.times import unix_seconds, utc_of_unix
 

@@ -12,7 +12,7 @@ from service.contract.answers import Answer, BatchOutcome, BatchOutcomes, BatchP
 from service.contract.runs import Comparison
 from service.contract.spacecraft import GyroBlockPage, GyroBlockRow, GyroSamples
 from service.errors import BadBatch, BadInput, Fault
-from service.gyro import GyroBlockIn
+from service.gyro.blocks import GyroBlockIn
 from service.ingest.submit import MAX_ARRAY, Outcome
 from service.observations.schema import BatchIn, Key, OptionsIn, RunName, Wire
 from service.storage.recording.unsaved_result import Answered

@@ -21,7 +21,7 @@ from starlette.routing import Match
 
 from service import errors
 from service.contract.problems import Problem
-from service.gyro import SampleTaken
+from service.gyro.blocks import SampleTaken
 from service.missions.faults import causes, plain_message
 
 

@@ -14,12 +14,13 @@ from service.features.advice.innovations import (
     innovation_noise,
 )
 from service.features.advice.trackers import NoiseFinding
-from service.filtering.filter import filter_attitude
-from service.filtering.inputs import AttitudeMeasurements, GyroModel
-from service.filtering.smoother import smooth
-from service.grades.day import innovations_of
-from tests.filtering.simulated import attitudes_of, gyro_of, slews, truth_of
-from tests.grades.passes import GYRO, mission_with
+from service.features.definitive.day import innovations_of
+from service.features.definitive.kernels.filter import filter_attitude
+from service.features.definitive.kernels.inputs import AttitudeMeasurements
+from service.features.definitive.kernels.smoother import smooth
+from service.gyro.samples import GyroModel
+from tests.features.definitive.passes import GYRO, mission_with
+from tests.features.definitive.simulated import attitudes_of, gyro_of, slews, truth_of
 from tests.missions.without_gyro import mission_without_gyro
 
 TRUE = GyroModel(10**0.5 * 1e-6, 10**0.5 * 1e-10)

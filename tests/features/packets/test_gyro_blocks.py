@@ -12,7 +12,7 @@ from service.cli import main
 from service.errors import BadConfiguration, BadInput
 from service.features.packets.definition import PacketDefinition
 from service.features.packets.reader import PacketReader
-from service.gyro import block_from_line
+from service.gyro.blocks import block_from_line
 from service.missions.mission import SHIPPED_FOLDER
 from service.settings import Settings
 from service.simulate.stretches import Pass

@@ -1,15 +1,14 @@
 """Panels of one axis: traces, a band, marks, on a linear or logarithmic scale; strips."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta
 
 import numpy as np
 import numpy.typing as npt
 
-from service.filtering.result import Integers, Status
-from service.storage.grades.period import GradesOfPeriod
+from service.attitude.definitive import Integers
 from service.times import DAY_S, Utc
 from service.vectors import Vector
 
@@ -36,43 +35,6 @@ class Trace:
     kind: str
     line: str
     dots: str
-
-
-@dataclass(frozen=True)
-class GradePanel:
-    """One axis.  `marks` are of rejected values; those beyond an edge stand at it."""
-
-    axis: str
-    traces: tuple[Trace, ...]
-    band: str
-    marks: str
-    bounds: tuple[int, ...]
-    """Heights of horizontal lines."""
-    note: str
-    """The range of the values, and what else there is to say."""
-    scale: "Scale"
-    unit: str
-
-    @property
-    def ticks(self) -> list[tuple[float, str]]:
-        """Values of the vertical axis: percent from the top, and their text."""
-        values = self.scale.ticks()
-        heights = 100.0 * self.scale.y(np.array(values)) / self.scale.height
-        texts = [f"{value:.6g}".replace("-", "−") + self.unit for value in values]
-        return list(zip(np.round(heights, 1).tolist(), texts, strict=True))
-
-
-@dataclass(frozen=True)
-class GradeChart:
-    """Panels of one unit; `rows` are the same as a table: the axis, then a cell a column."""
-
-    id: str
-    title: str
-    panels: tuple[GradePanel, ...]
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
-    width: int = WIDTH
-    height: int = HEIGHT
 
 
 @dataclass(frozen=True)
@@ -203,102 +165,3 @@ def band_of(
         return ""
     x = axis.x(time_ns[known])
     return band_path(x, scale.y(high[known]), scale.y(low[known]), parts_of(joins))
-
-
-def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> str:
-    """A cross at each value."""
-    known = np.isfinite(value)
-    x, y = axis.x(time_ns[known]), np.clip(scale.y(value[known]), 8, HEIGHT - 8)
-    places = zip(x.tolist(), y.tolist(), strict=True)
-    return "".join(f"M{a - 7} {b - 7}l14 14m0 -14l-14 14" for a, b in places)
-
-
-def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
-    """Marks of the moments (n,) that belong together with the one before.
-
-    They do unless they are farther apart than three parts of the period and three times what
-    is usual, or `same` (n,) says that they are not of the same stretch.
-    """
-    step = np.diff(time_ns, prepend=time_ns[:1])
-    part = (axis.end.tai_ns - axis.start.tai_ns) / parts
-    usual = float(np.median(step[1:])) if len(step) > 1 else 0.0
-    return np.asarray((step <= 3.0 * max(part, usual)) & same)
-
-
-def scale_of(values: Mapping[str, Vector], *, is_log: bool = False) -> Scale | None:
-    """A scale that holds all known values; None where none is known."""
-    found = np.concatenate([each[np.isfinite(each)] for each in values.values()])
-    if is_log:
-        found = found[found > 0.0]
-    if not len(found):
-        return None
-    low, high = float(found.min()), float(found.max())
-    if is_log and high < 1.2 * low:
-        low, high = low / 1.2, high * 1.2
-    return Scale(low, high, is_log)
-
-
-STRIP_HEIGHT = 24
-WORDS = {
-    Status.GOOD: "good",
-    Status.STARTING: "suspect",
-    Status.DOUBTFUL: "suspect",
-    Status.LOST: "none",
-    Status.NONE: "none",
-}
-
-
-@dataclass(frozen=True)
-class Strip:
-    """Bars by their kind as one path each; kinds differ in height, so that colour only helps."""
-
-    id: str
-    title: str
-    bars: dict[str, str]
-    width: int = WIDTH
-    height: int = STRIP_HEIGHT
-
-
-def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
-    """Strips of the filter's model, and of the quality of both grades."""
-    drawn = [
-        Strip(
-            "model",
-            "Model",
-            _bars(
-                [model for model, _, _ in found.stretches],
-                axis.x(np.array([start for _, start, _ in found.stretches])),
-                axis.x(np.array([end for _, _, end in found.stretches])),
-                {"gyro": 4, "constant_rate": 14},
-            ),
-        )
-    ]
-    for grade, samples in found.samples.items():
-        x = axis.x(samples.tai_ns)
-        words = [WORDS[Status(code)] for code in samples.status.tolist()]
-        drawn.append(
-            Strip(grade, grade, _bars(words, x, x, {"good": 4, "suspect": 14, "none": 20}))
-        )
-    return drawn
-
-
-def _bars(
-    kinds: Sequence[str], left: Integers, right: Integers, tops: dict[str, int]
-) -> dict[str, str]:
-    """A path for each kind; bars of a kind that touch are one."""
-    paths = dict.fromkeys(tops, "")
-    begin = end = None
-    before = ""
-    for kind, a, b in zip(kinds, left.tolist(), right.tolist(), strict=True):
-        if begin is not None and end is not None and (kind != before or a - end > 6):
-            paths[before] += _bar(begin, end, tops[before])
-            begin = None
-        begin = a if begin is None else begin
-        end, before = max(b, a + 2), kind
-    if begin is not None and end is not None:
-        paths[before] += _bar(begin, end, tops[before])
-    return {kind: path for kind, path in paths.items() if path}
-
-
-def _bar(begin: int, end: int, top: int) -> str:
-    return f"M{begin} {STRIP_HEIGHT}V{top}H{end}V{STRIP_HEIGHT}z"

@@ -4,18 +4,16 @@ from dataclasses import dataclass
 
 from starlette.responses import Response
 
-from service.storage.grades.period import MOST_BLOCKS, GradesOfPeriod
 from service.storage.queries.period import TrackerStarsOfPeriod
 from service.web.console.charts.all_sky import all_sky_chart
+from service.web.console.charts.attitude import attitude_charts
 from service.web.console.charts.focal_plane import FocalPlaneMap, focal_plane_map
-from service.web.console.charts.grades import attitude_charts, grade_charts, innovation_charts
 from service.web.console.charts.histogram import (
     Histogram,
     MagnitudeChart,
     magnitude_chart,
     residual_histogram,
 )
-from service.web.console.charts.panels import GradeChart, Strip, TimeAxis, strips
 from service.web.console.page import ContextDep, FromQuery, PageContext, console_page
 from service.web.console.pages.spacecraft import (
     RANGES_S,
@@ -79,56 +77,6 @@ def _tracker_charts(tracker: TrackerStarsOfPeriod) -> TrackerCharts:
         focal_plane=focal_plane_map(tracker),
         histogram=residual_histogram(tracker),
         magnitudes=magnitude_chart(tracker),
-    )
-
-
-JOBS = 8
-"""The latest that the page lists."""
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """The drawings of a period."""
-
-    found: GradesOfPeriod
-    charts: list[GradeChart]
-    innovations: list[GradeChart]
-    strips: list[Strip]
-    ticks: list[tuple[float, str]]
-    """The ticks of the time axis: percent from the left, and their text."""
-
-
-@console_page(
-    "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
-)
-def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
-    mission = context.app.context.mission(name)
-    shown = shown_period(context, name, query)
-    drawn = None
-    if shown is not None:
-        found = context.app.grades.of_period(name, query.run, shown.start, shown.end)
-        if found is not None:
-            axis = TimeAxis(shown.start, shown.end)
-            met = found.innovations
-            drawn = Drawn(
-                found,
-                grade_charts(found, axis, mission.trackers[0]),
-                [] if met is None else innovation_charts(met, axis),
-                strips(found, axis),
-                axis.ticks(),
-            )
-    return context.rendered(
-        "grades.html.jinja",
-        query.run,
-        name=name,
-        missing=without_gyro(context, name, query.run, shown) if shown else "",
-        panels=context.panels("grades_page", name, query.run, shown) if shown else [],
-        stretch=shown,
-        ranges=list(RANGES_S),
-        drawn=drawn,
-        most_blocks=MOST_BLOCKS,
-        jobs=context.app.definitive.all(name)[:JOBS],
     )
 
 

@@ -1,0 +1,219 @@
+"""The grades of a UTC day: filtered, smoothed, and packed as compressed bytes for the record.
+
+A day depends on the record from six hours before it to two hours after it, and on nothing
+else: not on the period that is asked for, nor on what was computed of the days before.  So it
+can be computed again, alone, and gives the same bytes; a late batch concerns one day or two.
+
+An innovation is the rotation from the filter's prediction to a measured attitude.  A difference
+is that from the smoothed attitude to the measurement: the smoother has used it, so their errors
+are correlated, and the covariance of the difference is R - P; of a measurement that was not used
+it is R + P.  Both are what a page of grades shows and what noise is estimated from.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.attitude.definitive import (
+    Grade,
+    GradedSamples,
+    MeasuredInnovations,
+    Model,
+    Outcome,
+    Status,
+    day_bounds,
+    was_used,
+)
+from service.errors import BadInput, Fault
+from service.features.definitive.kernels.filter import filter_attitude
+from service.features.definitive.kernels.inputs import AttitudeMeasurements, ConstantRateModel
+from service.features.definitive.kernels.result import AttitudeHistory, FilterResult
+from service.features.definitive.kernels.smoother import smooth
+from service.features.definitive.kernels.updates import ATTITUDE
+from service.features.definitive.stretches import Mask, Recorded, Stretch, cut
+from service.missions.mission import Mission
+from service.times import Utc, shifted
+from service.vectors import ARCSEC_PER_RADIAN, UPPER, rotation_vectors
+
+
+def innovations_of(
+    attitudes: AttitudeMeasurements,
+    result: FilterResult,
+    smoothed: AttitudeHistory,
+    start_ns: int,
+    end_ns: int,
+) -> MeasuredInnovations:
+    """The innovations of the measured attitudes of a stretch from `start_ns` to before `end_ns`.
+
+    `attitudes` are those that the filter was given; single directions are left out.
+    """
+    met = result.innovations
+    chosen = np.flatnonzero(
+        (met.kind == ATTITUDE) & (met.tai_ns >= start_ns) & (met.tai_ns < end_ns)
+    )
+    row, outcome = met.row[chosen], met.outcome[chosen]
+    # Every measurement is an epoch.
+    epoch = np.searchsorted(smoothed.tai_ns, met.tai_ns[chosen])
+    measured = attitudes.covariance_rad2[row]
+    own = smoothed.model_covariance[epoch, :3, :3]
+    used = was_used(outcome)
+    axes = np.arange(3)
+    apart = measured[:, axes, axes] + np.where(used, -1.0, 1.0)[:, None] * own[:, axes, axes]
+    apart += smoothed.doubt_rad[epoch, None] ** 2
+    turned = rotation_vectors(smoothed.quaternion[epoch], attitudes.quaternion[row])
+    return MeasuredInnovations(
+        met.tai_ns[chosen],
+        outcome,
+        met.innovation_rad[chosen] * ARCSEC_PER_RADIAN,
+        met.covariance_rad2[chosen][:, *UPPER] * ARCSEC_PER_RADIAN**2,
+        met.nis[chosen],
+        measured[:, *UPPER] * ARCSEC_PER_RADIAN**2,
+        turned * ARCSEC_PER_RADIAN,
+        np.sqrt(np.maximum(apart, 0.0)) * ARCSEC_PER_RADIAN,
+    )
+
+
+METHOD = 5
+"""Counted up with every change of what is computed: then days are computed anew."""
+WARM_UP_S = 6 * 3600.0
+"""For the bias to settle (two hours), after a tracker that is wrong at the beginning was found
+out (an hour, and two in which everything is rejected)."""
+LOOK_AHEAD_S = 2 * 3600.0
+"""The data after a day for the smoother, and for doubts at its end to be settled."""
+STEP_NS = 10**9
+"""The time between samples: the first sample in each second of TAI is kept."""
+MOST_SAMPLES = 4_000_000
+"""The most samples of a day with its surroundings: 30 Hz, all in memory at 1 kB each."""
+OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
+"""The outcomes of a measurement; see `filtering.result.Outcome`."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradedStretch:
+    """A stretch of a day in both grades, which have the same times, and its measurements."""
+
+    model: Model
+    samples: dict[Grade, GradedSamples]
+    innovations: MeasuredInnovations
+
+
+@dataclass(frozen=True, eq=False)
+class GradedDay:
+    """The stretches of a day, and what became of what was recorded.
+
+    `measurements` counts by the names of `filtering.result.Outcome`, and `unusable` and `alone`
+    ones; `gyro` counts samples, gaps, those beyond the
+    largest rate, and zeros while the body turned.  `nis_per_degree` is
+    the mean of z^T S^-1 z of the accepted measurements by their degrees of freedom: about 1.
+    """
+
+    stretches: list[GradedStretch]
+    measurements: dict[str, int]
+    gyro: dict[str, int]
+    nis_per_degree: float | None
+
+    @property
+    def samples(self) -> int:
+        """The samples of one grade."""
+        return sum(len(each.samples["smoothed"]) for each in self.stretches)
+
+
+def window_of(day: int) -> tuple[Utc, Utc]:
+    """The time whose record a day depends on, its end excluded."""
+    start, end = day_bounds(day)
+    return shifted(start, -WARM_UP_S), shifted(end, LOOK_AHEAD_S)
+
+
+def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
+    """The grades of a day, of what was recorded in its window; see `window_of`.
+
+    Raises `BadInput` for more gyro samples than there is memory for.
+    """
+    if len(recorded.gyro_ns) > MOST_SAMPLES:
+        expected = f"a day and what is about it may have at most {MOST_SAMPLES:,} samples"
+        raise BadInput(Fault("gyro", expected, f"{len(recorded.gyro_ns):,}"))
+    start, end = (each.tai_ns for each in day_bounds(day))
+    found = cut(recorded, mission)
+    outcomes = dict.fromkeys(OUTCOMES, 0)
+    nis, degrees = 0.0, 0
+    gaps = 0
+    stretches = []
+    for each in found.stretches:
+        result = filter_attitude(each.model, each.gyro, each.attitudes, each.directions)
+        smoothed = smooth(result, each.model)
+        graded = _graded(each, result, smoothed, start, end)
+        if graded is not None:
+            stretches.append(graded)
+        met = result.innovations
+        inside = (met.tai_ns >= start) & (met.tai_ns < end)
+        for name, code in OUTCOMES.items():
+            outcomes[name] += int(np.sum(met.outcome[inside] == code))
+        used = inside & met.accepted
+        nis += float(met.nis[used].sum())
+        degrees += int(met.degrees[used].sum())
+        times = result.history.tai_ns
+        of_day = (times >= start) & (times < end)
+        # The first step of a gap begins with it.
+        gaps += int(np.count_nonzero(result.steps.gap_s[of_day] == 0.0))
+    of_gyro = (recorded.gyro_ns >= start) & (recorded.gyro_ns < end)
+    return GradedDay(
+        stretches,
+        {**outcomes, "unusable": recorded.unusable, "alone": found.alone},
+        {
+            "samples": int(np.count_nonzero(of_gyro)),
+            "gaps": gaps,
+            "beyond_largest": found.beyond_largest,
+            "not_given": found.not_given,
+        },
+        nis / degrees if degrees else None,
+    )
+
+
+def _graded(
+    stretch: Stretch, result: FilterResult, smoothed: AttitudeHistory, start: int, end: int
+) -> GradedStretch | None:
+    """The part of a stretch that lies in the day, or None."""
+    kept = _kept(result.history, start, end)
+    if not kept.any():
+        return None
+    is_constant = isinstance(stretch.model, ConstantRateModel)
+    return GradedStretch(
+        "constant_rate" if is_constant else "gyro",
+        {
+            "filtered": samples_of(result.history, kept, is_constant),
+            "smoothed": samples_of(smoothed, kept, is_constant),
+        },
+        innovations_of(stretch.attitudes, result, smoothed, start, end),
+    )
+
+
+def _kept(history: AttitudeHistory, start: int, end: int) -> Mask:
+    """The first epoch of each second of the day, from the first measured attitude on."""
+    times = history.tai_ns
+    inside = (times >= start) & (times < end) & (history.status != Status.NONE)
+    second = times // STEP_NS
+    is_first = np.append(True, np.diff(second) != 0)[: len(times)]
+    return np.asarray(inside & is_first)
+
+
+def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedSamples:
+    """The epochs of a history where a mask (n,) is true, as samples of a grade."""
+    quaternion = history.quaternion[kept]
+    quaternion = np.where(quaternion[:, 3:] < 0.0, -quaternion, quaternion)
+    covariance = history.model_covariance[kept]
+    axes = np.arange(3)
+    attitude = covariance[:, :3, :3].copy()
+    # A doubt is one more sigma about each axis.
+    attitude[:, axes, axes] += history.doubt_rad[kept, None] ** 2
+    upper = attitude[:, *UPPER] * ARCSEC_PER_RADIAN**2
+    bias = np.degrees(history.bias_rad_s[kept]) * 3600.0
+    sigma = np.sqrt(covariance[:, axes + 3, axes + 3])
+    return GradedSamples(
+        history.tai_ns[kept],
+        quaternion,
+        upper,
+        np.degrees(history.rate_rad_s[kept]),
+        np.full_like(bias, np.nan) if is_constant else bias,
+        np.degrees(sigma) * 3600.0,
+        history.status[kept],
+    )

@@ -1,0 +1,65 @@
+"""The page of the definitive attitude of a spacecraft."""
+
+from dataclasses import dataclass
+
+from starlette.responses import Response
+
+from service.features.definitive.chart_panels import GradeChart, Strip, strips
+from service.features.definitive.charts import grade_charts, innovation_charts
+from service.features.definitive.part import Definitive
+from service.features.definitive.period import GradesOfPeriod
+from service.storage.queries.definitive import MOST_BLOCKS
+from service.web.console.charts.panels import TimeAxis
+from service.web.console.page import ContextDep, FromQuery, console_page
+from service.web.console.pages.period import without_gyro
+from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, shown_period
+from service.web.requests.access import Policy
+
+JOBS = 8
+"""The latest that the page lists."""
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """The drawings of a period."""
+
+    found: GradesOfPeriod
+    charts: list[GradeChart]
+    innovations: list[GradeChart]
+    strips: list[Strip]
+    ticks: list[tuple[float, str]]
+    """The ticks of the time axis: percent from the left, and their text."""
+
+
+@console_page(
+    "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
+)
+def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
+    """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
+    definitive, mission = context.app.part(Definitive), context.app.context.mission(name)
+    shown = shown_period(context, name, query)
+    drawn = None
+    if shown is not None:
+        found = definitive.days.of_period(name, query.run, shown.start, shown.end)
+        if found is not None:
+            axis = TimeAxis(shown.start, shown.end)
+            met = found.innovations
+            drawn = Drawn(
+                found,
+                grade_charts(found, axis, mission.trackers[0]),
+                [] if met is None else innovation_charts(met, axis),
+                strips(found, axis),
+                axis.ticks(),
+            )
+    return context.rendered(
+        "grades.html.jinja",
+        query.run,
+        name=name,
+        missing=without_gyro(context, name, query.run, shown) if shown else "",
+        panels=context.panels("grades_page", name, query.run, shown) if shown else [],
+        stretch=shown,
+        ranges=list(RANGES_S),
+        drawn=drawn,
+        most_blocks=MOST_BLOCKS,
+        jobs=definitive.jobs.all(name)[:JOBS],
+    )

@@ -1,0 +1,113 @@
+"""Routes of the definitive attitude: the live one, innovations, and the jobs that make it."""
+
+from typing import Annotated, Self
+from urllib.parse import quote
+
+from fastapi import Path
+from pydantic import model_validator
+from starlette.requests import Request
+from starlette.responses import Response
+
+from service.features.definitive import records
+from service.features.definitive.part import Definitive
+from service.observations.schema import RunName, Wire
+from service.web.openapi import LINK, LOCATION, ApiRouter, Returns
+from service.web.requests import query_parameters as params
+from service.web.requests.access import (
+    AppDep,
+    CallerDep,
+    Policy,
+    author,
+    json_response,
+    page_response,
+)
+from service.web.requests.query_parameters import FromQuery, SpacecraftPath, Who
+from service.web.requests.request_body import JsonBody, read_model
+
+router = ApiRouter("products")
+ROUTERS = (router,)
+
+
+@router.serves(
+    "GET /spacecraft/{name}/attitude/latest",
+    Policy("read", "path"),
+    Returns("The attitude.", records.LiveAttitude),
+)
+def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
+    """The filtered attitude at the last epoch of live data, where the mission keeps it up.
+
+    404 if the mission has no live filter, or if there is no attitude yet, or it is lost.
+    """
+    return json_response(app.part(Definitive).live_filter.latest(name))
+
+
+@router.serves(
+    "GET /spacecraft/{name}/innovations",
+    Policy("read", "path"),
+    Returns("A page of innovations.", records.InnovationPage, LINK),
+)
+def list_innovations(
+    request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
+) -> Response:
+    """How each measured attitude met the filter, and how far it is from the smoothed one.
+
+    They are of the days that `acquire smooth` recorded, the latest revision of each.
+    """
+    return page_response(request, app.part(Definitive).days.innovations(name, **query.asked()))
+
+
+class DefinitiveIn(Wire):
+    """Which days get a definitive attitude."""
+
+    run: RunName = "live"
+    start: params.Start = None
+    end: params.End = None
+    who: Who = None
+
+    @model_validator(mode="after")
+    def _in_order(self) -> Self:
+        params.require_order(self.start, self.end)
+        return self
+
+
+@router.serves(
+    "POST /spacecraft/{name}/definitive-attitude",
+    Policy("operate", "path"),
+    Returns("The job, which is queued.", records.DefinitiveJob, LOCATION, status=202),
+    body=DefinitiveIn,
+)
+def make_definitive_attitude(
+    name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep
+) -> Response:
+    """Filter and smooth recorded days beside other work, and record both grades.
+
+    A day whose record has not changed stays as it is; one with later batches gets a new revision.
+    """
+    asked = read_model(DefinitiveIn, body)
+    job = app.part(Definitive).jobs.begin(
+        name, run=asked.run, start=asked.start, end=asked.end, who=author(caller, asked.who)
+    )
+    location = f"/api/v1/spacecraft/{quote(name)}/definitive-attitude/{job.id}"
+    return json_response(job, 202, headers={"Location": location})
+
+
+@router.serves(
+    "GET /spacecraft/{name}/definitive-attitude",
+    Policy("read", "path"),
+    Returns("The jobs.", records.DefinitiveJobList),
+)
+def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
+    """The jobs of a spacecraft since the start of the service, the newest first."""
+    return json_response(records.DefinitiveJobList(items=app.part(Definitive).jobs.all(name)))
+
+
+@router.serves(
+    "GET /spacecraft/{name}/definitive-attitude/{id}",
+    Policy("read", "path"),
+    Returns("The job.", records.DefinitiveJob),
+)
+def get_definitive_attitude(
+    name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep
+) -> Response:
+    """How far a job is."""
+    return json_response(app.part(Definitive).jobs.get(name, id))

@@ -1,1 +1,0 @@
-"""Filtered and smoothed attitudes in the records."""
