@@ -1,39 +1,25 @@
 """A picture from anybody's lens: its attitude, its lens and its stars, with no mission at all."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from service.acquire.picture_remarks import (
-    CLEAR_RATIO,
-    LEAST_CLEAR,
-    advice_on,
-    remarks_on,
-    remarks_on_light,
-)
-from service.identify.blind.lens import (
-    PROJECTIONS,
-    Lens,
-    LensFit,
-    shared_variance_px2,
-    simpler_fit,
-)
+from service.identify.blind.lens import Lens, LensFit, shared_variance_px2, simpler_fit
 from service.identify.blind.solver import (
-    ACCEPT_LOG_ODDS,
-    COARSE_GATE,
     WIDEST_FIELD_DEG,
     BlindResult,
     BlindSolver,
     FocalRange,
     rotation_between,
 )
-from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified, verify
+from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified
 from service.imaging.detection.points import (
     FIRST_THRESHOLD,
+    MAX_POINTS,
     SECOND_THRESHOLD,
     PointSources,
     find_points,
@@ -51,7 +37,6 @@ from service.times import parse_utc, utc_now
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
-    Projection,
     Vector,
     attitude_error_arcsec,
     quaternion_from_matrix,
@@ -62,11 +47,12 @@ from service.vectors import (
 GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
+CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
+"""Signal to noise of clear points, and how many of them without an attitude speak for a lens or
+pixels of another kind."""
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
 """Parts of the sides of a wide picture that are solved alone."""
-FAR_OUT = 0.5
-"""The distance from the middle, in half diagonals, from which a wide lens shows its kind."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
 """The share of the longer side above which an attitude's sigma is too large for an answer.
 
@@ -194,23 +180,16 @@ def solve_picture(
     solver: BlindSolver,
     guess_px: float | None = None,
     whole_only: bool = False,
-    projection: Projection | None = None,
 ) -> PictureResult:
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
-
-    With a `projection` an attitude is one of the whole picture behind such a lens, or there is
-    none; see `_of_projection`.
 
     Where what is told leads to nothing all other focal lengths are tried, and where the
     clear candidates do, so are fainter ones.  Where all of that leads to nothing, the mirror
     image is tried: a result then is of the mirrored frame, which it holds.  Last, unless
-    `whole_only`, its middle alone and pixels averaged in pairs are tried.  From the middle the
-    lens of the whole is looked for; a result is of the middle or of averaged pixels where none
-    fits.  Raises `BadFile` for a picture without light.
+    `whole_only`, its middle alone and pixels averaged in pairs are tried, and a result is of
+    such a frame.  Raises `BadFile` for a picture without light.
     """
     require_light(frame, math.inf)
-    if projection not in (None, "gnomonic"):
-        return _of_projection(frame, sky, solver, guess_px, projection)
     side = max(frame.width_px, frame.height_px)
     ranges = [FocalRange.of_fields(side, WIDEST_FIELD_DEG)]
     if guess_px is not None:
@@ -240,150 +219,35 @@ def solve_picture(
                 return found
     clear = np.count_nonzero(tried[0].signal_ratio > CLEAR_RATIO)
     if clear >= LEAST_CLEAR and not whole_only:
-        for whole, points in ((frame, tried[0]), (turned, tried[0].mirrored(is_by_rows(frame)))):
-            wide = _from_middle(whole, points, sky, solver, None, PROJECTIONS)
-            if wide is not None:
-                return wide
-        for changed, remark in _averaged(frame):
-            found = _solved_part(changed, sky, solver, None)
+        for changed, remark in other_shapes(frame):
+            if min(changed.counts.shape) < LEAST_SIDE_PX:
+                continue
+            points = find_points(changed.counts)
+            focal = FocalRange.of_fields(max(changed.counts.shape), WIDEST_FIELD_DEG)
+            found = _solved(changed, points, sky, solver, focal, None)
             if found.attitude is not None:
                 return replace(found, remarks=(remark, *found.remarks))
     points = tried[min(1, len(tried) - 1)]
-    return replace(result, points=points, remarks=tuple(advice_on(points, frame, guess_px)))
+    return replace(result, points=points, remarks=tuple(_advice(points, frame, guess_px)))
 
 
-def _solved_part(
-    frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None
-) -> PictureResult:
-    """The result of a changed picture; `guess_px` is its focal length within a quarter."""
-    points = find_points(frame.counts)
-    focal = FocalRange.of_fields(max(frame.counts.shape), WIDEST_FIELD_DEG)
-    if guess_px is not None:
-        focal = FocalRange.about(guess_px, GUESS_SHARE)
-    return _solved(frame, points, sky, solver, focal, None)
+def other_shapes(frame: Frame) -> Iterator[tuple[Frame, str]]:
+    """Changed pictures that a simple lens may fit, each with a remark that says what was changed.
 
-
-def _of_projection(
-    frame: Frame,
-    sky: BrightStars,
-    solver: BlindSolver,
-    guess_px: float | None,
-    projection: Projection,
-) -> PictureResult:
-    """The result of a picture through a fisheye that is told, or of its mirror image."""
-    points = find_points(frame.counts)
-    if points.trailed is not None:
-        return _refused_trails(frame, points)
-    mirror = mirrored(frame), points.mirrored(is_by_rows(frame))
-    for guess in (None,) if guess_px is None else (guess_px, None):
-        for whole, candidates in ((frame, points), mirror):
-            found = _from_middle(whole, candidates, sky, solver, guess, (projection,))
-            if found is not None:
-                return found
-    nothing = BlindResult(None, -math.inf, 0, 0, 0, False)
-    remark = (
-        f"no_match: neither the picture nor its middle fits the sky behind a lens of {projection} "
-        "projection: tell another projection, or none"
-    )
-    remarks = (remark, *remarks_on_light(points, has_dark(frame)))
-    return PictureResult(frame, points, None, nothing, remarks)
-
-
-def _from_middle(
-    frame: Frame,
-    points: PointSources,
-    sky: BrightStars,
-    solver: BlindSolver,
-    guess_px: float | None,
-    projections: Sequence[Projection],
-) -> PictureResult | None:
-    """The result of a wide picture, whose middle is like that of a plain lens; None without any.
-
-    The middle has the direction and the roll of the whole.  From its attitude the lens of the
-    whole is looked for; if none of all projections fits, the result is that of the middle.
+    The middle of a picture has the same direction and roll as the whole.  Behind a fisheye, or
+    where a plane spans more than the solver looks for, the middle is like any other lens's.
     """
-    for share in (*MIDDLE_SHARES, 1.0):
-        part = _middle_of(frame, share)
-        if min(part.counts.shape) < LEAST_SIDE_PX or (share == 1.0 and projections == PROJECTIONS):
-            continue
-        found = _solved_part(part, sky, solver, guess_px)
-        if found.attitude is None:
-            continue
-        whole = _widened(frame, points, found.attitude, sky, solver, projections)
-        if whole is not None:
-            return whole
-        if projections == PROJECTIONS:
-            size = f"{part.width_px} x {part.height_px} px"
-            remark = (
-                f"wide_lens: the whole picture fits no lens of {WIDEST_FIELD_DEG[1]:g} degrees or "
-                f"less, and no wider one without strong distortion; only its middle, {size}, was "
-                "solved, and field and lens are those of the middle"
-            )
-            return replace(found, remarks=(remark, *found.remarks))
-    return None
-
-
-def _fits_far_out(found: Verified, places: Points) -> bool:
-    """True if points far from the middle have stars about as often as those near it."""
-    middle_u, middle_v = _middle(found.fit.lens)
-    away = np.hypot(places.u_px - middle_u, places.v_px - middle_v) / found.fit.lens.radius_px
-    has_star = found.star >= 0
-    near, far = has_star[away < FAR_OUT], has_star[away >= FAR_OUT]
-    return len(far) > 0 and float(far.mean()) > 0.5 * float(near.mean() if len(near) else 0.0)
-
-
-def _middle_of(frame: Frame, share: float) -> Frame:
-    """The middle of a picture, of a share of its sides."""
     height, width = frame.counts.shape
-    down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
-    return replace(frame, counts=frame.counts[down : height - down, across : width - across])
-
-
-def _widened(
-    frame: Frame,
-    points: PointSources,
-    middle: PictureAttitude,
-    sky: BrightStars,
-    solver: BlindSolver,
-    projections: Sequence[Projection],
-) -> PictureResult | None:
-    """The result of the whole picture from the attitude of its middle; None where none fits.
-
-    Of several projections the one with the most evidence is taken.
-    """
-    places = places_of(points).first(REFINED_POINTS)
-    attitude = _of_the_middle(middle.lens, middle.fit.attitude)
-    focal = FocalRange.about(middle.lens.focal_px, GUESS_SHARE)
-    best: Verified | None = None
-    for projection in projections:
-        lens = Lens(frame.width_px, frame.height_px, middle.lens.focal_px, projection=projection)
-        gate_px = COARSE_GATE * lens.radius_px
-        found = verify(places, solver.stars, attitude, lens, focal.log_width, gate_px)
-        if found is not None and (best is None or found.log_odds > best.log_odds):
-            best = found
-    if best is None or best.log_odds < ACCEPT_LOG_ODDS or not _fits_far_out(best, places):
-        return None
-    best = solver.refined(best, places, focal)
-    whole = _attitude(best, places_of(points), points, frame, sky)
-    if whole.sigma_share > MOST_SIGMA_SHARE:
-        return None
-    width_deg, height_deg = whole.field_deg
-    remark = (
-        f"wide_lens: a lens of {whole.lens.projection} projection and {width_deg:.0f} x "
-        f"{height_deg:.0f} degrees fits the whole picture"
-    )
-    remarks = (
-        remark,
-        *remarks_on(whole.lens, best, points, None, GUESS_SHARE),
-        *remarks_on_light(points, has_dark(frame)),
-    )
-    search = BlindResult(best, best.log_odds, 0, 0, 0, False)
-    return PictureResult(frame, points, whole, search, remarks)
-
-
-def _averaged(frame: Frame) -> Iterator[tuple[Frame, str]]:
-    """Pictures whose pixels are averaged in pairs, each with a remark that says so."""
-    height, width = frame.counts.shape
+    for share in MIDDLE_SHARES:
+        down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
+        counts = frame.counts[down : height - down, across : width - across]
+        size = f"{counts.shape[1]} x {counts.shape[0]} px"
+        remark = (
+            f"wide_lens: the whole picture fits no lens of {WIDEST_FIELD_DEG[1]:g} degrees or less "
+            f"without strong distortion; only its middle, {size}, was solved, and field and lens "
+            "are those of the middle"
+        )
+        yield replace(frame, counts=counts), remark
     for name, counts in (
         ("columns", frame.counts[:, : width // 2 * 2].reshape(height, -1, 2).mean(axis=2)),
         ("rows", frame.counts[: height // 2 * 2].reshape(-1, 2, width).mean(axis=1)),
@@ -429,7 +293,7 @@ def _solved(
         return PictureResult(frame, points, None, search, ())
     remarks = [
         *remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE),
-        *remarks_on_light(points, has_dark(frame)),
+        *_light(points, has_dark(frame)),
     ]
     return PictureResult(frame, points, attitude, search, tuple(remarks))
 
@@ -601,3 +465,95 @@ def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> li
 
 MOST_OFF_MAG = 1.5
 """The change of a camera's zero point that clouds and another aperture explain."""
+CLIPPED_SHARE = 0.5
+BLURRED_PX = 3.5
+FEW_POINTS = 6
+NOTABLE_HOT = 20
+NOTABLE_BEND = 0.003
+NOTABLE_FOCAL = 0.005
+
+
+def remarks_on(
+    lens: Lens, found: Verified, points: PointSources, guess_px: float | None, guess_share: float
+) -> Iterator[str]:
+    """Remarks that a user should read about a picture whose attitude was found."""
+    fitted_px = lens.focal_px
+    if guess_px is not None:
+        off = fitted_px / guess_px - 1.0
+        if abs(math.log(fitted_px / guess_px)) > math.log1p(guess_share):
+            yield (
+                f"focal_length: {fitted_px:.0f} px fits, far from the {guess_px:.0f} px that were "
+                "told; the whole range was searched"
+            )
+        elif abs(off) > NOTABLE_FOCAL:
+            yield (
+                f"focal_length: residuals are radial: {fitted_px:.0f} px instead of "
+                f"{guess_px:.0f} fits"
+            )
+    if abs(lens.bend) > NOTABLE_BEND:
+        kind = "pincushion" if lens.bend < 0.0 else "barrel"
+        yield (
+            f"distortion: a {kind} of {abs(lens.bend) * lens.radius_px:.1f} px at the corners "
+            "was fitted"
+        )
+    unmatched = len(found.star) - found.matched
+    if unmatched > found.matched:
+        yield f"clutter: {unmatched} of {len(found.star)} candidates are no star of the catalog"
+
+
+def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
+    """Why there may be no attitude, and what to try next that was not given already."""
+    dark = has_dark(frame)
+    if points.count < 4:
+        yield (
+            f"too_few_points: {points.count} points of light, and four are needed: expose longer, "
+            "open the aperture, or focus on the stars"
+        )
+    elif points.count < FEW_POINTS:
+        yield f"few_points: {points.count} points of light hardly tell one field from another"
+    elif points.count >= MAX_POINTS:
+        steps = ["crop what is no sky"]
+        if not points.clipped_stars:
+            steps += [] if dark else ["take off hot pixels with a dark frame (--dark FILE)"]
+            steps.append("use a shorter exposure with less noise")
+        yield f"clutter: {MAX_POINTS} candidates and more: {', or '.join(steps)}"
+    clear = np.count_nonzero(points.signal_ratio > CLEAR_RATIO)
+    if clear >= LEAST_CLEAR:
+        least_deg, most_deg = WIDEST_FIELD_DEG
+        yield (
+            f"no_match: {clear} clear points fit no sky behind a lens of {least_deg:g} to "
+            f"{most_deg:g} degrees: they may be no stars, or the lens may be too wide, or the "
+            "pixels of unequal sides"
+        )
+    yield from _light(points, dark)
+    if guess_px is None:
+        yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
+
+
+def _light(points: PointSources, dark: bool) -> Iterator[str]:
+    if points.clipped_stars:
+        yield (
+            f"clipped_stars: {points.clipped_stars} stars are cut off at the largest count: their "
+            "places are from their flanks and less sure, their magnitudes unknown; a picture that "
+            "is not stretched shows more"
+        )
+    if points.trail_px is not None:
+        yield (
+            f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure; the "
+            "middles of their trails were taken, where they were at mid exposure"
+        )
+    if points.hot_pixels > NOTABLE_HOT:
+        more = "" if dark else "; a dark frame (--dark FILE) takes off all of them"
+        yield (
+            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars{more}"
+        )
+    if points.clipped_share > CLIPPED_SHARE:
+        yield (
+            f"clipped: {points.clipped_share:.0%} of the pixels are clipped to black: faint stars "
+            "are lost; raise the offset (black level) or expose longer"
+        )
+    if points.psf_sigma_px > BLURRED_PX:
+        yield (
+            f"blurred: images of stars are {2.35 * points.psf_sigma_px:.0f} px wide: out of focus, "
+            "or moved during the exposure"
+        )

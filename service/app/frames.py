@@ -23,7 +23,6 @@ from service.observations.schema import FromLastIn, Submission, submission_from_
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 from service.times import utc_now
-from service.vectors import Projection
 
 FRAME_WAIT_S = 30.0
 """The longest time that a frame waits for a thread: other frames may take seconds."""
@@ -91,7 +90,6 @@ class Frames:
         *,
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
-        projection: Projection | None = None,
         image: str | None = None,
         draws: bool = False,
     ) -> Picture:
@@ -122,9 +120,9 @@ class Frames:
                 frame = read_frame(file, limits)
                 if field_of_view_deg is not None:
                     side_px = max(frame.width_px, frame.height_px)
-                    guess_px = focal_px_of(side_px, field_of_view_deg, projection or "gnomonic")
+                    guess_px = focal_px_of(side_px, field_of_view_deg)
                 sky, solver = blind_sky(self._context.sky.catalog)
-                result = solve_picture(frame, sky, solver, guess_px, projection=projection)
+                result = solve_picture(frame, sky, solver, guess_px)
                 drawn = overlay_of(result, "") if draws else None
             finally:
                 self._picture_turn.release()

@@ -334,8 +334,8 @@ def positive(text: str) -> float:
 def degrees(text: str) -> float:
     """Parse a field of view."""
     number = positive(text)
-    if number > 180:
-        raise argparse.ArgumentTypeError(f"must be at most 180 degrees (got {text!r})")
+    if number >= 120:
+        raise argparse.ArgumentTypeError(f"must be below 120 degrees (got {text!r})")
     return number
 
 

@@ -7,12 +7,11 @@ from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any, Protocol, get_args
+from typing import Any, Protocol
 
 from service.cli import arguments
 from service.errors import AcquisitionError, BadInput, Busy, Fault, Unauthenticated, shown_value
 from service.settings import Settings
-from service.vectors import Projection
 
 SIDECAR = """\
 The metadata of a frame are in a JSON file of its name beside it, FILE.json for
@@ -84,11 +83,6 @@ def _add_lens(parser: ArgumentParser) -> None:
         "--fov", type=arguments.degrees, metavar="DEG", help="field of view, the longer side"
     )
     lens.add_argument(
-        "--lens",
-        choices=get_args(Projection),
-        help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
-    )
-    lens.add_argument(
         "--focal-px", type=arguments.positive, metavar="PX", help="focal length in pixels"
     )
     lens.add_argument("--focal-mm", type=arguments.positive, metavar="MM", help="with --pixel-um")
@@ -116,7 +110,7 @@ def run(parsed: Namespace) -> int:
         from service.cli.pictures import solve_pictures
 
         return solve_pictures(parsed, arguments.settings_of(parsed))
-    for name in ("fov", "lens", "focal_px", "focal_mm", "pixel_um", "dark"):
+    for name in ("fov", "focal_px", "focal_mm", "pixel_um", "dark"):
         value = getattr(parsed, name)
         if value is not None:
             message = "goes without --spacecraft; a mission's file describes its camera"

@@ -1,21 +1,17 @@
 """A lens fitted to stars whose directions are known: focal length, centre, radial distortion.
 
-A plain lens projects the sky on a plane (gnomonic), a fisheye in one of three other ways.
-
 The error of a star's place averages down with the number of stars.  That of the model of
 the lens, of the catalog's epoch or of refraction does not: neighbours share it
 (`shared_variance_px2`).
 """
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.vectors import Matrix, Projection, Vector, rotate_about
+from service.vectors import Matrix, Vector, rotate_about
 
 BEND_PRIOR = 0.04
 """One standard deviation of the radial displacement at the corner, as a share of the radius."""
@@ -30,52 +26,6 @@ _CONVERGED = 1e-8
 NEIGHBOURS = 3
 """Neighbours whose residuals estimate the correlated error of a star."""
 LEAST_RESIDUAL_PX = 0.05
-WIDEST_RAD = 2.1
-"""No lens shows what is farther from its axis."""
-
-PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
-_LEAST_COSINE: Mapping[Projection, float] = {
-    "gnomonic": 0.0,
-    **dict.fromkeys(PROJECTIONS[1:], math.cos(WIDEST_RAD)),
-}
-
-
-def distance_of(projection: Projection, angle_rad: float) -> float:
-    """The distance from the axis, in focal lengths, of what is at an angle from it."""
-    return {
-        "gnomonic": math.tan(angle_rad),
-        "equidistant": angle_rad,
-        "equisolid": 2.0 * math.sin(0.5 * angle_rad),
-        "stereographic": 2.0 * math.tan(0.5 * angle_rad),
-    }[projection]
-
-
-def _cosine_of(projection: Projection, distance: Vector) -> Vector:
-    """The cosines of the angles of what is at distances, in focal lengths, from the axis."""
-    if projection == "gnomonic":
-        return np.asarray(1.0 / np.sqrt(1.0 + distance**2))
-    if projection == "equidistant":
-        return np.asarray(np.cos(np.minimum(distance, math.pi)))
-    if projection == "equisolid":
-        return np.asarray(1.0 - 0.5 * np.minimum(distance, 2.0) ** 2)
-    return np.asarray((4.0 - distance**2) / (4.0 + distance**2))
-
-
-def _stretch_of(projection: Projection, body: Vector) -> tuple[Vector, Vector]:
-    """The distances of directions (n, 3) over the sines of their angles, and the slope by z."""
-    z = body[:, 2]
-    if projection == "gnomonic":
-        return 1.0 / z, -1.0 / z**2
-    if projection == "equisolid":
-        stretch = np.sqrt(2.0 / (1.0 + z))
-        return stretch, -0.5 * stretch / (1.0 + z)
-    if projection == "stereographic":
-        return 2.0 / (1.0 + z), -2.0 / (1.0 + z) ** 2
-    sine = np.hypot(body[:, 0], body[:, 1])
-    # On the axis both are 0 / 0.
-    off = np.maximum(sine, 1e-3)
-    stretch = np.where(sine < 1e-3, 1.0 + sine**2 / 6.0, np.arctan2(sine, z) / off)
-    return stretch, np.where(sine < 1e-3, -1.0 / 3.0, (stretch * z - 1.0) / off**2)
 
 
 @dataclass(frozen=True)
@@ -84,8 +34,7 @@ class Lens:
 
     `bend` is the radial displacement at the half diagonal `radius_px`, as a share of the radius:
     the true distance from the axis is r (1 + bend (r / radius_px)^2).  `off_u` and
-    `off_v` are those of the axis from the middle, in units of `radius_px`.  Near the axis the focal
-    length is that of a plain lens, whatever the projection.
+    `off_v` are those of the axis from the middle, in units of `radius_px`.
     """
 
     width_px: int
@@ -94,7 +43,6 @@ class Lens:
     bend: float = 0.0
     off_u: float = 0.0
     off_v: float = 0.0
-    projection: Projection = "gnomonic"
 
     @property
     def radius_px(self) -> float:
@@ -110,7 +58,7 @@ class Lens:
         )
 
     def plane(self, u_px: Vector, v_px: Vector) -> Vector:
-        """True coordinates (n, 2) in the projection, in focal lengths."""
+        """True coordinates (n, 2) on the plane at unit distance."""
         center_u, center_v = self.center_px
         x, y = np.asarray(u_px) - center_u, np.asarray(v_px) - center_v
         scale = (1.0 + self.bend * (x * x + y * y) / self.radius_px**2) / self.focal_px
@@ -119,32 +67,15 @@ class Lens:
     def directions(self, u_px: Vector, v_px: Vector) -> Vector:
         """Unit vectors (n, 3): x to the right of the picture, y down, z the boresight."""
         plane = self.plane(u_px, v_px)
-        if self.projection == "gnomonic":
-            vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
-            return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
-        distance = np.hypot(plane[..., :1], plane[..., 1:])
-        cosine = _cosine_of(self.projection, distance)
-        sine = np.sqrt(1.0 - np.minimum(cosine**2, 1.0))
-        share = np.where(distance > 0.0, sine / np.maximum(distance, 1e-12), 1.0)
-        return np.concatenate([plane * share, cosine], axis=-1)
-
-    @property
-    def reach_rad(self) -> float:
-        """The angle of the corners from the axis."""
-        distance = np.array(self.radius_px / self.focal_px * (1.0 + abs(self.bend)))
-        cosine = float(_cosine_of(self.projection, distance))
-        return min(math.acos(max(cosine, -1.0)), WIDEST_RAD)
-
-    def projected(self, body: Vector) -> Vector:
-        """Coordinates (n, 2) in the projection, in focal lengths, of unit vectors (n, 3)."""
-        return np.asarray(body[:, :2] * _stretch_of(self.projection, body)[0][:, None])
+        vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
         """Pixels of directions (n, 3); NaN for those behind or far outside the picture."""
         with np.errstate(divide="ignore", invalid="ignore"):
-            x, y = self.projected(directions).T
-            shown = directions[:, 2] > _LEAST_COSINE[self.projection]
-            true = np.where(shown, np.hypot(x, y), np.nan) * self.focal_px / self.radius_px
+            x = np.where(directions[:, 2] > 0.0, directions[:, 0] / directions[:, 2], np.nan)
+            y = np.where(directions[:, 2] > 0.0, directions[:, 1] / directions[:, 2], np.nan)
+            true = np.hypot(x, y) * self.focal_px / self.radius_px
             true[~(true < 1.6)] = np.nan
             seen = true.copy()
             for _ in range(8 if self.bend else 0):
@@ -221,13 +152,19 @@ def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
     """A lens with other parameters: the first value is of the logarithm of the focal length."""
     values = dict(zip(names[1:], free[1:].tolist(), strict=True))
     values["focal_px"] = lens.focal_px * math.exp(free[0])
-    return replace(lens, **values)
+    return Lens(lens.width_px, lens.height_px, **{**_bends(lens), **values})
+
+
+def _bends(lens: Lens) -> dict[str, float]:
+    return {"bend": lens.bend, "off_u": lens.off_u, "off_v": lens.off_v}
 
 
 def _residual(lens: Lens, attitude: Matrix, u_px: Vector, v_px: Vector, star: Vector) -> Vector:
-    """Observed minus predicted (2 n,), in pixels of the undistorted projection."""
-    predicted = lens.projected(star @ attitude.T)
-    return np.asarray(((lens.plane(u_px, v_px) - predicted) * lens.focal_px).ravel())
+    """Observed minus predicted (2 n,), in pixels of the undistorted plane."""
+    body = star @ attitude.T
+    return np.asarray(
+        ((lens.plane(u_px, v_px) - body[:, :2] / body[:, 2:]) * lens.focal_px).ravel()
+    )
 
 
 def linearised(
@@ -245,15 +182,10 @@ def linearised(
     """
     trial = lens_of(lens, names, free)
     body = star @ attitude.T
-    x, y, z = body.T
+    x, y = (body[:, :2] / body[:, 2:]).T
     plane = trial.plane(u_px, v_px)
-    residual = (plane - trial.projected(body)) * trial.focal_px
-    stretch, slope = _stretch_of(trial.projection, body)
-    turns = [
-        [slope * y * x, slope * y * y - stretch * z],
-        [stretch * z - slope * x * x, -slope * x * y],
-        [-stretch * y, stretch * x],
-    ]
+    residual = (plane - np.column_stack([x, y])) * trial.focal_px
+    turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
     columns = [trial.focal_px * np.array(each) for each in turns]
     # In pixels of one focal length: else a longer one would make all residuals longer.
     columns.append(trial.focal_px * plane.T)

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.identify.blind.lens import Lens, distance_of
+from service.identify.blind.lens import Lens
 from service.identify.blind.verify import Points, Stars, Verified, matched, refine, verify
 from service.sky.whole_sky.quads import (
     LEAST_WIDTH,
@@ -24,7 +24,7 @@ from service.sky.whole_sky.quads import (
     build_quad_level,
     quad_codes,
 )
-from service.vectors import Matrix, Projection, Vector
+from service.vectors import Matrix, Vector
 
 Sets = npt.NDArray[np.int64]
 
@@ -72,9 +72,9 @@ class FocalRange:
         return cls(least, most)
 
 
-def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomonic") -> float:
+def focal_px_of(side_px: int, field_deg: float) -> float:
     """The focal length with which a side spans a field of view."""
-    return 0.5 * side_px / distance_of(projection, math.radians(0.5 * field_deg))
+    return 0.5 * side_px / math.tan(math.radians(0.5 * field_deg))
 
 
 class BlindResult(NamedTuple):
