@@ -7,11 +7,12 @@ import subprocess
 from contextlib import closing
 
 import pytest
-from service.products.formats import write_attitudes
 from sqlalchemy import select, text, update
 
 from service.cli import main
 from service.errors import BadConfiguration
+from service.features.products.attitude_formats import write_attitudes
+from service.features.products.part import Products
 from service.storage.projections import heads
 from service.storage.recording import chain
 from service.storage.recording.signing import PublicKey, Signer, make_key
@@ -151,10 +152,10 @@ def test_a_head_is_in_the_answer_a_backup_an_archive_and_products_and_verify_rea
         head = app.service.record_head()
         assert hashlib.sha256(head.statement.encode()).hexdigest() == head.sha256
         products = [
-            b"".join(write_attitudes(format, app.products.attitudes("XTE"))).decode()
+            b"".join(write_attitudes(format, app.part(Products).attitudes("XTE"))).decode()
             for format in ("aem", "aem-xml", "acm", "json")
         ]
-        products.append(app.products.table("XTE", "stars").about["record_head"])
+        products.append(app.part(Products).table("XTE", "stars").about["record_head"])
         assert archiving.archive(app.store, place, LATER).batches
     (manifest,) = place.glob("spacecraft=XTE/day=*/manifest.json")
     assert main(["database", "backup", str(tmp_path / "b"), "--database", database]) == 0
