@@ -32,6 +32,7 @@ SOURCES = (
     "service/tracks/extending.py",
     "service/csv_cells.py",
     "service/errors.py",
+    "service/interpolation.py",
     "service/resources.py",
     "service/times.py",
     "service/vectors.py",
