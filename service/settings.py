@@ -17,7 +17,7 @@ from service.logs import FORMATS, LEVELS, LogSettings
 PREFIX = "ACQUIRE_"
 LOCAL_MISSIONS = Path("missions")
 MOST_USEFUL_PROCESSES = 4
-"""One process writes: it takes no more than so many can compute."""
+"""Most processes that are useful: the single writing process records no faster."""
 _TOKEN = re.compile(r"[!-~]+")
 _ROOT_PATH = re.compile(r"(/[A-Za-z0-9._~-]+)*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)

@@ -1,4 +1,4 @@
-"""From batches to acquisitions: identification of the stars, then the attitude."""
+"""Acquisition of batches: identification of the stars, then the attitude."""
 
 from service.acquire.pipeline import ResultColumns, acquire, acquire_many, acquired
 from service.acquire.result import Acquisition

@@ -1,4 +1,4 @@
-"""From pictures of the sky to the camera that took them: one lens for all, an attitude for each."""
+"""Calibration of a camera from pictures of the sky: one lens for all, an attitude for each."""
 
 import math
 from collections.abc import Sequence

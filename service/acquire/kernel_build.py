@@ -55,11 +55,11 @@ class _Share(NamedTuple):
     whole_sky: list[str]
     """Identifiers that search the whole sky."""
     beside_batches: bool
-    """True if it compiles what no batch needs: links of points, features, pictures."""
+    """True if kernels that no batch needs are compiled too: links of points, features, pictures."""
 
 
 class KernelBuild:
-    """One build of the kernels, where this machine's cache does not hold them yet."""
+    """A build of the kernels that the cache of this machine lacks."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -281,7 +281,7 @@ STEPS = {
     "tracks": "links of points",
     "kernels": "features",
 }
-"""What the kernels of a folder are for; the cache has a folder for each of them."""
+"""Purpose of the kernels by folder of the kernel cache."""
 EVERY_S = 10.0
 
 
@@ -301,7 +301,7 @@ class KernelProgress:
 
 
 def kernel_progress() -> KernelProgress:
-    """How far the compiling into this process's folder of kernels is."""
+    """Progress of compiling into this process's kernel cache."""
     config: Any = numba.config
     files = []
     for path in Path(config.CACHE_DIR).glob("*/*.nbc"):

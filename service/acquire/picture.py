@@ -266,7 +266,7 @@ def _refused_trails(frame: Frame, points: PointSources) -> PictureResult:
 
 
 def trail_refusal(points: PointSources) -> str:
-    """Why a picture of stars that moved has no attitude, and what to do about it."""
+    """Message that a picture with trailed stars has no attitude, with the reason and remedies."""
     return (
         f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure, "
         f"{points.trailed}: where they were at mid exposure cannot be told; use a shorter "
@@ -502,7 +502,7 @@ def remarks_on(
 
 
 def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
-    """Why there may be no attitude, and what to try next that was not given already."""
+    """Likely reasons why a picture has no attitude, and options that were not tried."""
     dark = has_dark(frame)
     if points.count < 4:
         yield (

@@ -81,7 +81,7 @@ class ResultColumns(Struct, frozen=True, eq=False):
         return acquired
 
     def acquisition_or_error(self, row: int) -> Acquisition | Exception:
-        """One row as the acquisition of its batch, or what kept it from having one."""
+        """The acquisition of the batch in a row, or the error that prevented it."""
         if row in self.finished:
             return self.finished[row]
         in_zones = self.zones.result(row)
@@ -106,7 +106,7 @@ def acquire(
 def acquired(
     batches: Sequence[ObservationBatch], mission: Mission, sky: SkyModel, *, at_once: bool = False
 ) -> list[Acquisition | Exception]:
-    """The acquisition of each of some batches of one mission, or what keeps it from having one."""
+    """For each batch of one mission: its acquisition, or the error that prevents it."""
     columns = acquire_many(BatchColumns.of(batches), mission, sky, at_once=at_once)
     return [columns.acquisition_or_error(row) for row in range(len(batches))]
 

@@ -28,7 +28,7 @@ ORION = 84.0, -1.0
 BRIGHT_MAG = 4.0
 """Limit of the warm-up catalog: few stars compile every kernel, and are indexed fast."""
 BRIGHTEST_MAG = 3.0
-"""And so few where every pair and every patch of the whole sky is to be indexed."""
+"""Limit of the warm-up catalog where every pair and patch of the whole sky is indexed."""
 
 
 def prewarm_sky(

@@ -76,7 +76,7 @@ class Path(StrEnum):
 
     ZONE = "zone"
     LOST_IN_SPACE = "lost_in_space"
-    """No a priori attitude was given, or it was not to be used."""
+    """The whole sky was searched: no a priori attitude was given, or its use was disabled."""
     MEASURED = "measured"
     """A tracker measured the attitude itself; nothing was searched for."""
     ZONE_THEN_LOST_IN_SPACE = "zone_then_lost_in_space"

@@ -19,7 +19,7 @@ from service.observations.calibrate import CorrectedColumns, CorrectedObservatio
 from service.vectors import attitude_error_arcsec, read_only
 
 FEWEST_NAMED = 2
-"""One tracker must name so many stars of a second group: two vectors have an attitude."""
+"""Fewest stars of a second group that one tracker must name: two vectors fix an attitude."""
 DIFFERENT_CHI_SQUARE = 30.0
 """Chi-square with three degrees of freedom that two attitudes of noise alone pass in 1e-6."""
 

@@ -50,7 +50,7 @@ class SearchResult(Struct, frozen=True, eq=False, gc=False):
 
     @property
     def good(self) -> bool:
-        """True if there is an attitude that its own residuals do not speak against."""
+        """True if an attitude was found and its residuals are not suspect."""
         return self.in_zones is not None and self.in_zones.good
 
     @property

@@ -123,7 +123,7 @@ class ZoneResult(Struct, frozen=True, eq=False):
 
     @property
     def good(self) -> bool:
-        """True if there is an attitude that its own residuals do not speak against."""
+        """True if an attitude was found and its residuals are not suspect."""
         return isinstance(self.solved, AttitudeSolution) and not self.solved.suspect
 
 

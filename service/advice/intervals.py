@@ -49,7 +49,7 @@ def wilson(share: float, count: float) -> Interval:
 
 
 def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
-    """How many independent trials tell as much as these marks (n,) of clusters (n,) do."""
+    """Number of independent trials with the information of clustered marks (n,)."""
     n, share = len(marks), float(marks.mean())
     if share in (0.0, 1.0):
         return float(n)

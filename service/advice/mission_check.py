@@ -31,12 +31,12 @@ SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5
 CORNER_SHARE = 0.05
 OTHER_SIGMA = 3.0
-"""A scan whose sigma is so many times more, or less, than the tracker's contradicts it."""
+"""Ratio of the sigmas of a scan and its tracker, either way, above which they contradict."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One setting by its key, and what about it is wrong or unusual."""
+    """A wrong or unusual mission setting, named by its key."""
 
     level: Level
     key: str

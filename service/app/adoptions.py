@@ -91,11 +91,11 @@ class CalibrationAdoptions:
         raise NotFound(f"{spacecraft} has no adoption with the id {shown_value(to)}")
 
     def file_of(self, spacecraft: str) -> Mission:
-        """The settings as the mission file has them, whatever was adopted; the last without one."""
+        """Mission settings without adopted calibrations; the last known ones if no file is left."""
         return self._in_force.files.get(spacecraft) or self._context.mission(spacecraft)
 
     def changed_files(self) -> dict[str, str]:
-        """By spacecraft, what the next start would change; raises `BadConfiguration`."""
+        """Mission file changes for the next start, by spacecraft; raises `BadConfiguration`."""
         settings = self._context.settings
         now = load_missions(*settings.mission_places, shipped=settings.ships_missions)
         found = {}

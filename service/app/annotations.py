@@ -38,7 +38,7 @@ class Annotations:
             )
 
     def get(self, id: str) -> Annotation:
-        """One annotation."""
+        """Return the annotation with an id."""
         with self._context.reading() as connection:
             return events.read_annotation(connection, known_id(id, "annotation"))
 

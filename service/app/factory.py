@@ -42,10 +42,10 @@ T = TypeVar("T")
 
 
 class Part(Protocol):
-    """What a feature adds to an open app."""
+    """The part that a feature adds to an open app."""
 
     def close(self) -> None:
-        """Stop what it has begun."""
+        """Stop the work that a feature's part has begun."""
 
 
 class App:
@@ -109,7 +109,7 @@ class App:
             self._parts[type(part)] = part
 
     def part(self, kind: type[T]) -> T:
-        """What a feature added to this app, by its class."""
+        """The part of the open app, found by its class, that a feature added."""
         part = self._parts[kind]
         assert isinstance(part, kind)
         return part
@@ -128,7 +128,7 @@ class App:
 
 
 def _signer_of(settings: Settings) -> Sign | None:
-    """What signs heads of the record; None without a key."""
+    """The function that signs heads of the record; None without a key."""
     if settings.record_key is None:
         return None
     return Signer(settings.record_key).sign

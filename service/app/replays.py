@@ -34,7 +34,7 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 MAX_REPLAYS, MAX_OF_ONE_TOKEN = 8, 4
-"""Each has a thread and a file of its own."""
+"""Most replays at a time, in all and of one token; each needs a thread and a file."""
 REPLAY_RETRY_S = 30
 CANCEL_WAIT_S = 5.0
 """The longest time that cancelling waits for the end of a replay."""
@@ -317,7 +317,7 @@ class Replays:
             return replays.read_replay(connection, known_id(id, "replay"))
 
     def processes(self) -> int:
-        """How many processes beside this one are ready to compute replays."""
+        """Number of worker processes that are ready to compute replays."""
         return self.bulk.workers.up
 
     def stop(self) -> None:

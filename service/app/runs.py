@@ -99,7 +99,7 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
     ) -> tuple[runs.RunComparison, list[runs.RunChange]]:
-        """The same of a spacecraft's latest batches of a period alone, and those that differ."""
+        """Compare two runs over a spacecraft's latest batches of a period; list what differs."""
         self._context.mission(spacecraft)
         place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
         with self._context.reading() as connection:

@@ -116,7 +116,7 @@ class Service:
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
 
     def _go_on_with_whole_sky(self) -> None:
-        """Load the kernels of searches of the whole sky, and build what these search."""
+        """Load the kernels of whole-sky searches, and build the catalogs that they search."""
         prewarm_kernels(self._context.sky, self._context.missions)
         self._prewarm_sky(self._context.missions.values(), utc_now(), whole_sky=True)
         log.info("ready for batches that need the whole sky; still compiling other kernels")

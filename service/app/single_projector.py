@@ -85,7 +85,7 @@ class SingleProjector:
         self._thread.start()
 
     def resume_with(self, resume: Callable[[], object]) -> None:
-        """Start to continue what ended services left behind on this machine."""
+        """Register the function that continues work of ended services on this machine."""
         self._resume = resume
 
     def ends_left_work(self, unfinished: Unfinished, interrupt: Interrupt) -> None:

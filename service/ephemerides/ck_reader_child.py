@@ -30,7 +30,7 @@ class Refused(Exception):
 
 
 def segments(handle: int) -> list[list[int]]:
-    """Each segment's structure, frame, type, whether it has rates, first and last address."""
+    """Segments of a CK: structure, frame, type, presence of rates, first and last address."""
     spice.dafbfs(handle)
     found = []
     while spice.daffna():

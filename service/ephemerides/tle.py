@@ -25,7 +25,7 @@ MAX_AGE_D = 7.0
 MOST_SETS = 100_000
 MAX_LINE_BYTES = 200
 _FIRST_CENTURY_YEAR = 57
-"""Two digits from here on are of 19.., those before of 20.. ."""
+"""First two-digit year of the 1900s in an element set; a smaller one is in the 2000s."""
 
 _NUMBER, _ANGLE = r" *\d+|[A-HJ-NP-Z]\d{4}", r" *\d+\.\d{4}"
 _EXPONENT = r"[ +-]\d{5}[+-]\d"

@@ -123,7 +123,7 @@ _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\
 
 
 class _NamedBatch(msgspec.Struct):
-    """As much of a batch as names it."""
+    """The fields of a batch that identify it: spacecraft and batch id."""
 
     spacecraft: _Name
     batch: _Name
@@ -264,7 +264,7 @@ class BulkChunk:
         self._require = require
         self._registry, self._stored = registry, stored
         self._blocks: Future[list[Recorded | AcquisitionError]] | None = None
-        """What becomes of the gyro blocks, in the order of their lines."""
+        """Outcomes of the gyro blocks, recorded or refused, in the order of their lines."""
         self._computed = bulk.compute(lines, require)
 
     def is_computed(self, within_s: float) -> bool:

@@ -29,7 +29,7 @@ from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 MAX_SHOWN = 100
 """Batches that are shown star by star; the others are counted."""
 MOST_AT_ONCE, PORTION_S = 512, 0.1
-"""As many batches are solved at once as take this long, both sides together."""
+"""Largest number of batches solved at once, and the seconds that they may take on both sides."""
 
 RunManyAgain = Callable[[Sequence[ObservationBatch]], Sequence[Acquisition]]
 
@@ -39,7 +39,7 @@ _OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
 
 @dataclass(frozen=True)
 class Pair:
-    """One recorded batch with the options of either side in place of its own."""
+    """A recorded batch twice, with the options of sides a and b in place of its own."""
 
     id: str
     a: ObservationBatch
@@ -102,7 +102,7 @@ class ComparisonTally:
     changed: list[records.BatchChange] = field(default_factory=list)
     changed_batches: int = 0
     counted: list[tuple[int, dict[str, int], dict[str, int]]] = field(default_factory=list)
-    """For each batch: its time in nanoseconds of TAI, and the stars by outcome on both sides."""
+    """Time (TAI, ns) of each batch, and its number of stars by outcome on both sides."""
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
         """Take one batch's two results."""

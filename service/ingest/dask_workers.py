@@ -86,7 +86,7 @@ class DaskWorkers:
 
     @property
     def most_pending(self) -> int:
-        """How many tasks should be begun before the first of them is taken."""
+        """Number of tasks to submit before the first result is collected."""
         return max(FEWEST_PENDING, PENDING_A_WORKER * self.workers)
 
     def submit(self, task: partition_tasks.PartitionTask) -> partition_tasks.Wait:

@@ -38,11 +38,11 @@ PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
 IDLE_S = 600.0
 """The time without a chunk after which the processes end, and give their memory back."""
 MOST_STARTS = 3
-"""The most starts of processes for one chunk, where they die before they have it."""
+"""Maximum number of process starts for one chunk, when each process dies before receiving it."""
 SERVER_RETRY_S, SERVER_GONE_S = 0.1, 10.0
 """How often, and for how long, starts are tried while the server of the workers is ending."""
 MOST_DEATHS = 2
-"""A chunk that was alone at work when so many processes died is given up."""
+"""Number of processes that die with one chunk alone at work before that chunk is given up."""
 
 log = logging.getLogger(__name__)
 
@@ -63,9 +63,9 @@ class _QueuedTask(Generic[Input, Output]):
     task: Input
     done: "Future[list[Output]]" = field(default_factory=Future)
     deaths: int = 0
-    """Processes that died while it was the only chunk at work."""
+    """Number of processes that died while one chunk alone was at work."""
     lost_starts: int = 0
-    """How often processes died before they were ready, while it was the only chunk."""
+    """Number of processes that died before they were ready, while one chunk alone was at work."""
 
 
 @dataclass(eq=False)

@@ -44,7 +44,7 @@ def _of_machine(proc: Path) -> Iterator[int]:
 
 
 def _of_groups(proc: Path, groups: Path) -> Iterator[int]:
-    """What is left in this process's groups and in those around them, of either version."""
+    """Memory left in the process's cgroups and their ancestors (v1 and v2), bytes."""
     try:
         lines = (proc / "self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:

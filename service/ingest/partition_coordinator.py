@@ -158,7 +158,7 @@ class Unit:
 
     @property
     def partitions(self) -> int:
-        """How many tasks it is at most."""
+        """Maximum number of tasks of the reprocessing."""
         left = self.batches - self.before
         return 1 if self.part else -(-left // MOST_BATCHES)
 
@@ -202,7 +202,7 @@ class Planner:
                     raise BadBatch(Fault("run", message, shown_value(self.plan.run)))
 
     def units(self) -> list[Unit]:
-        """All there is in the period, in order of time for each spacecraft."""
+        """All units of work in the period, in order of time for each spacecraft."""
         found: list[Unit] = []
         with self.store.reading() as connection:
             for spacecraft in sorted(self.plan.missions):

@@ -164,7 +164,7 @@ def _unsaved(
 
 
 def _repeatable(acquisition: Acquisition) -> Acquisition:
-    """Without what differs between equal runs: times, and which zones were cached."""
+    """The acquisition without values that differ between equal runs: timings and cached zones."""
     return structs.replace(
         acquisition,
         timings_us=dict.fromkeys(acquisition.timings_us, 0),
@@ -212,7 +212,7 @@ class Workers(Protocol):
 
     @property
     def most_pending(self) -> int:
-        """How many tasks should be begun before the first of them is taken."""
+        """Number of tasks to submit before the first result is collected."""
 
     def submit(self, task: PartitionTask) -> Wait:
         """Begin with a task, or queue it."""

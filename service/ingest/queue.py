@@ -117,7 +117,7 @@ class IngestQueue:
         self._shared_missions = in_force if store.lock is not None else None
         self._changed = threading.Condition()
         self._waiting: deque[PendingBatch] = deque()
-        """Those that the thread has to take: new ones, and those that the pool has computed."""
+        """Batches that wait for the queue's thread: new ones, and ones that the pool computed."""
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
         """The batches that are being computed or recorded, each with its repeats."""
         self._sequences: Sequences[PendingBatch] = Sequences()
@@ -185,7 +185,7 @@ class IngestQueue:
             self._answer([(pending, Stopping("the queue has ended")) for pending in left])
 
     def _take(self) -> list[PendingBatch]:
-        """Those that wait, at most `TOGETHER`; none after `close` when all are answered."""
+        """Take at most `TOGETHER` waiting batches; none after `close` when all are answered."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._waiting or (self._closing and not self._unanswered)

@@ -325,7 +325,7 @@ class _PendingChunk:
 
 
 class RunningReplay:
-    """One replay at work; the table has its progress a moment later."""
+    """A replay in progress; the database's table shows its progress with a short delay."""
 
     def __init__(
         self,

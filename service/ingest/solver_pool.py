@@ -87,7 +87,7 @@ class Solver:
     def all_acquired(
         self, batches: Sequence[ObservationBatch], mission: Mission | None = None
     ) -> list[Acquisition]:
-        """As `acquired`; raises the first error, for which a pool may have to wait."""
+        """Acquisitions of all batches; raises the first error, for which it may have to wait."""
         found = []
         for each in self.acquired(batches, mission):
             if isinstance(each, Exception):

@@ -71,7 +71,7 @@ class _WarmedUp(Exception):
 
 
 class SubmissionService:
-    """Each submission is identified, solved and recorded once, however often it is sent."""
+    """Identifies, solves and records each submission once, however often it is sent."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class SubmissionService:
         store: Store,
         kernels: KernelBuild | None = None,
     ) -> None:
-        """With `kernels`, batches are refused until those that they need are compiled."""
+        """Prepare to take batches; `kernels` refuses a batch until its kernels are compiled."""
         self.pool = SolverPool()
         self.solver = Solver(in_force.missions, replace(sky, builder=self.pool.builder))
         self._store = store
@@ -419,7 +419,7 @@ class SubmissionService:
 
 
 def _portions(submissions: Sequence[Submission]) -> Iterator[list[Submission]]:
-    """Those that take milliseconds together; what may take long by itself, so that it can stop."""
+    """Group fast submissions; keep each long one alone, so that it can be stopped."""
     portion: list[Submission] = []
     for each in submissions:
         is_long = may_take_long(each.batch)

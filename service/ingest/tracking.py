@@ -33,7 +33,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector
 MARGIN_SIGMAS = 3.0
 """A zone reaches beyond the field of view by so many sigmas of the prediction."""
 LARGEST_SIGMAS = 5.0
-"""Two attitudes tell no rate that is more than so many sigmas of the mission's."""
+"""Largest rate that two attitudes may give, in sigmas of the mission's rate."""
 SAMPLES_BEFORE_S = 60.0
 """Gyro samples are read from so long before the attitude: one of them begins the first step."""
 

@@ -91,7 +91,7 @@ def begin(
 
 
 def ready_pid() -> int:
-    """This process; each waits for the others, so that none answers for two."""
+    """Return the process id after all worker processes have started, so that each answers once."""
     _all_ready.wait()
     return os.getpid()
 

@@ -74,7 +74,7 @@ def checked_url(url: str) -> str:
 
 @contextmanager
 def translated(url: str) -> Iterator[None]:
-    """Raise what the client raises as this service's own errors, with what a user can do."""
+    """Translate the client's exceptions into the service's errors, with remedies for the user."""
     try:
         yield
     except answers.Unauthenticated as error:

@@ -20,7 +20,7 @@ SLEW_DEG_PER_S = 0.1
 CAP_JITTER_DEG_PER_S = 5e-4
 BAND_JITTER_DEG_PER_S = 2e-5
 CAP_HELD, BAND_HELD = (4, 13), (2, 5)
-"""From, and below, so many batches between two slews; a band's roll goes round in steps."""
+"""Number of batches between two slews (from, below), for a cap and for a band's steps of roll."""
 
 
 def body_rates_deg_per_s(mission: Mission, batches: int, rng: np.random.Generator) -> Vector:

@@ -68,7 +68,7 @@ class Score:
 
     @property
     def seen_sigma_arcsec(self) -> float:
-        """One sigma of the error along each attitude's own worst axis, as it was."""
+        """Actual error about the worst axis of each attitude, one sigma, in arcsec."""
         return _median(self.worst_axis_arcsec) / GAUSSIAN_MEDIAN
 
     @property

@@ -152,7 +152,7 @@ class Pass:
         return default if self.cadence_s is None else self.cadence_s
 
     def stretches(self, mission: Mission) -> list[Stretch]:
-        """One entry a batch: nominal at both ends and between the stretches, evenly."""
+        """Nominal or faulty stretch of each batch; nominal ones lie evenly about the faults."""
         in_band = isinstance(mission.zone, Band)
         default = BAND_ATTITUDE_ERROR_DEG if in_band else CAP_ATTITUDE_ERROR_DEG
         wanted = [

@@ -310,7 +310,7 @@ _DIGITS = 12
 
 @dataclass(frozen=True)
 class GyroWanted:
-    """How the gyro samples, and what befalls it; its noise is that of the mission."""
+    """Sampling and faults of a simulated gyro; the mission gives its noise."""
 
     step_s: float = 1.0
     quantum_arcsec: float = 0.0

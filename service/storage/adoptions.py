@@ -20,7 +20,7 @@ def add_adoption(connection: Connection, row: Row) -> None:
 
 
 def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationAdoption]:
-    """What a spacecraft's calibration was from when on, newest first."""
+    """Adoptions of calibrations for a spacecraft, newest first."""
     query = _adoptions().where(calibration_adoptions.c.spacecraft == spacecraft)
     return [_adoption(row) for row in rows_of(connection, query)]
 

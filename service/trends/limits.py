@@ -95,7 +95,7 @@ class LimitSettings(Strict):
 
     @cached_property
     def _levels(self) -> tuple[tuple[Severity, float, float], ...]:
-        """Each severity with its bounds, infinite where there is none."""
+        """Lower and upper bound of each severity; infinite where no bound is set."""
         levels = ((severity, self.bounds(severity)) for severity in Severity)
         return tuple(
             (

@@ -43,7 +43,7 @@ class Cause:
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity with all that derives from it."""
+    """A quantity of results with its unit, label and everything derived from it."""
 
     name: str
     unit: str

@@ -33,7 +33,7 @@ MAX_LISTENERS = 100
 MAX_OF_ONE_TOKEN = 10
 """Streams at a time: some pages in some browsers, and no more that would keep out others."""
 ADMITTED_EVERY_S = 1.0
-"""How often the database is asked whether those who listen may still do so."""
+"""Interval of checks in the database that listeners of events still have access, in seconds."""
 RETRY_MS = 2_000
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""What RFC 9112 has a server refuse in the head of a request, beyond what the parser refuses."""
+"""Checks of a request's head that RFC 9112 demands and the HTTP parser does not make."""
 
 import re
 from collections.abc import Iterable

@@ -32,7 +32,7 @@ from service.web.request_head import refusal_of
 RESERVED_FOR_LOOPBACK = 16
 """Connections that only clients on this machine may take, such as an operator's probes."""
 IPV6_SITE_BITS = 64
-"""One IPv6 client usually has all addresses of such a network to itself."""
+"""Prefix length (bits) of an IPv6 network counted as one client, which usually owns all of it."""
 
 
 class Closable(Protocol):

@@ -119,7 +119,7 @@ class Proportion:
 
 @dataclass(frozen=True)
 class Paper:
-    """All that is printed."""
+    """All figures printed in the 1994 paper."""
 
     worlds: dict[str, World]
     runs: tuple[Run, ...]

@@ -48,7 +48,7 @@ class StarsInField:
 
 @dataclass(frozen=True)
 class Printed:
-    """All of it.  `axis` and `mean_projection` are solved for from the nine rows of Table 1."""
+    """Figures printed in the paper.  `axis` and `mean_projection` are solved for from Table 1."""
 
     axis: tuple[float, ...]
     mean_projection: float

@@ -1,1 +1,1 @@
-"""The star image detection report, every claim of it held against what is built here."""
+"""The star image detection report, each claim compared with this project's implementation."""

@@ -1,4 +1,4 @@
-"""A claim of the report beside what is measured here, and the row that it belongs to."""
+"""Claims of the report beside this project's measured values, gathered in rows."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

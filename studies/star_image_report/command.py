@@ -106,7 +106,7 @@ def run_imaging(
 
 
 def table(row: Row) -> str:
-    """One row as Markdown."""
+    """A row of claims as a Markdown table."""
     lines = ["| section | the report | here | |", "|---|---|---|---|"]
     lines += [
         f"| {claim.section} | {_cell(claim.says)} | {_cell(claim.ours)} | {_mark(claim)} |"

@@ -23,7 +23,7 @@ def gaussian(u: Array, v: Array) -> Array:
 
 
 def gaussian_slopes(u: Array, v: Array) -> tuple[Array, Array]:
-    """Its derivatives."""
+    """Derivatives of a Gaussian image with respect to u and v."""
     return -u * gaussian(u, v), -v * gaussian(u, v)
 
 

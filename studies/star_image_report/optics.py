@@ -79,7 +79,7 @@ def transfer(study: Study) -> Row:
 
 
 def _wedge(cells: int = 64, moved: int = 3, index: float = 1.5) -> tuple[int, float]:
-    """How far a wedge should move the image, in lambda/D, and how much it differs there."""
+    """Image shift by a glass wedge, in lambda/D, and the image's difference from a shifted one."""
     pupil = disc(cells, DIAMETER_M / cells, DIAMETER_M / 2.0)
     angle = moved * LASER_M / DIAMETER_M
     glass = np.broadcast_to(pupil.places_m * angle / (index - 1.0), (cells, cells))

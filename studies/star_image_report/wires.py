@@ -37,7 +37,7 @@ class Mesh:
         return self.wire_m / self.pitch_m
 
     def wires(self, number: int) -> Wires:
-        """This many neighbouring wires about the middle."""
+        """A count of neighbouring wires about the middle of a mesh: (place, width) in m."""
         places = (np.arange(number) - (number - 1) / 2.0) * self.pitch_m
         return [(float(place), self.wire_m) for place in places]
 

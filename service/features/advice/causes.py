@@ -51,7 +51,7 @@ FALSE_SHARE = 0.02
 USUAL_SHARE = 0.15
 """Batches beyond the zone's room, by wrong attitudes or now and then, that are no cause."""
 OVER_SHARE, OVER_BATCHES = 0.1, 6
-"""A cause is over if so much of the period, and so many batches, follow without it."""
+"""Share of the period, and number of batches, without a cause after which the cause is over."""
 COMMON = 5
 
 Flags = npt.NDArray[np.bool_]
@@ -474,7 +474,7 @@ class Part:
 
 
 def parts(now: StarTable, before: StarTable | None) -> list[Part]:
-    """All stars, those of each tracker, the bright and faint, the inner and outer ones."""
+    """Groups of stars to compare: all, by tracker, bright and faint, inner and outer."""
     found = [_part("all stars", now, before, lambda t: np.ones(len(t.batch), bool))]
     if len(now.trackers) > 1:
         found += [_part(name, now, before, _of_tracker(name)) for name in now.trackers]

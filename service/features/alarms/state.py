@@ -375,7 +375,7 @@ def alarm_spans(
 
 
 def times_out(connection: Connection, found: Sequence[models.Alarm]) -> list[list[TimeOut]]:
-    """For each alarm, from when to when it was out of its limits, in telemetry time."""
+    """Intervals in telemetry time in which each alarm's value was out of its limits."""
     actions: dict[str, list[tuple[str, str | None]]] = {alarm.id: [] for alarm in found}
     noted = (
         select(alarm_actions.c.alarm_id, alarm_actions.c.action, alarm_actions.c.time)

@@ -117,7 +117,7 @@ def shelved(alarm: AlarmColumns, who: str, until: str, now: str) -> AlarmUpdate:
 
 
 def unshelved(alarm: AlarmColumns) -> AlarmUpdate:
-    """No longer shelved; raises `WrongState` if it was not."""
+    """End the shelving of an alarm; raises `WrongState` if the alarm is not shelved."""
     _require_active(alarm)
     if alarm["shelved_until"] is None:
         raise WrongState("the alarm is not shelved")

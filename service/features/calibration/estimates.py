@@ -196,7 +196,7 @@ class Estimator:
 def _calibrated(
     stars: IdentifiedStars, wanted: CalibrationRequest
 ) -> tuple[Calibration, tuple[HeldOut, ...]]:
-    """With the degree that is wanted, or the best of those that so many stars allow."""
+    """Calibrate with the requested degree, or the best degree that the number of stars allows."""
     if wanted.degree is not None:
         return calibrate(stars, wanted.model(wanted.degree)), ()
     for degree in range(LARGEST_CHOSEN_DEGREE, 0, -1):

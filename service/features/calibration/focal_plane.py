@@ -16,7 +16,7 @@ Side = Literal["before", "after"]
 
 @dataclass(frozen=True)
 class ResidualPicture:
-    """One picture; `key_px` is the length of an arrow of `key_arcsec`, `shades` are cells."""
+    """Chart of residuals over the focal plane; an arrow of `key_arcsec` is `key_px` long."""
 
     title: str
     tracker: str

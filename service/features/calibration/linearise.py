@@ -81,7 +81,7 @@ class Unknown:
 
     @property
     def shape(self) -> Kind:
-        """What the unknown changes, at a temperature or at all."""
+        """Kind of parameter that an unknown changes, directly or by temperature."""
         return self.of or self.kind
 
 
@@ -309,7 +309,7 @@ def directions(angles_rad: Vector) -> Vector:
 
 
 def _tangents(direction: Vector) -> Vector:
-    """Two unit vectors (n, 2, 3) across each direction, right-handed with it; the first along h."""
+    """Two tangent unit vectors (n, 2, 3) of each direction, right-handed; the first along h."""
     x, y, z = direction.T
     across = np.hypot(y, z)
     zero = np.zeros_like(x)

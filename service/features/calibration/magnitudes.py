@@ -223,7 +223,7 @@ def _beyond(names: Sequence[str], line: _Line) -> list[str]:
 
 
 def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
-    """The unknowns that differ enough between stars, whatever those before them are."""
+    """Names of the magnitude unknowns whose columns vary enough between stars to be estimated."""
     _, first = np.unique(star, return_index=True)
     if len(first) < LEAST_STARS:
         return []

@@ -109,7 +109,7 @@ class Calibrations:
         return self.get(id)
 
     def get(self, id: str) -> Calibration:
-        """One calibration."""
+        """Return the calibration with an id."""
         with self._context.reading() as connection:
             return records.read_calibration(connection, known_id(id, "calibration"))
 

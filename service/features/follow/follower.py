@@ -45,7 +45,7 @@ BEGIN_AGAIN_S = 5.0
 TRIES = 5
 """Attempts of this follower at which the service fails, before it refuses the message."""
 UNKEPT_S = 60.0
-"""For so long the follower does not ask again whether a stream keeps a subject."""
+"""Seconds before a follower asks again whether a stream keeps a subject."""
 MESSAGE_TOO_LARGE = 10_054
 """The code of NATS for a message above the largest one that a stream takes."""
 STATE_EVERY_S = 5.0

@@ -1,4 +1,4 @@
-"""What a follower follows: a stream of NATS, its consumer, and subjects to publish to."""
+"""Source of a follower: a stream of NATS, its consumer, and the subjects to publish to."""
 
 from dataclasses import dataclass
 from pathlib import Path

@@ -70,7 +70,7 @@ class SpacePacket:
         return ((self.content[2] & 0x3F) << 8) | self.content[3]
 
     segments: int = 1
-    """How many packets of the file it is joined of."""
+    """Number of packets in the file from which a segmented packet was joined."""
 
 
 class EndOfPackets(PacketFault):

@@ -231,7 +231,7 @@ def settings_file(folder: Path, digest: str) -> Path:
 
 
 def write_settings(folder: Path, settings: Settings) -> None:
-    """Keep what a digest stands for, unless it is there."""
+    """Store mission settings under their digest, unless their file exists."""
     file = settings_file(folder, settings.digest)
     if not file.exists():
         write_whole(file, msgspec.json.encode(settings))

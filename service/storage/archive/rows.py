@@ -71,7 +71,7 @@ def schema_of(table: sa.Table) -> pa.Schema:
 
 
 def read_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> Rows:
-    """All rows of these batches; ids of no batch are passed over."""
+    """All rows of the batches with the ids; unknown ids are skipped."""
     found = _ordered(_read(connection, tables.batches, "id", batch_ids), ("time_ns", "id"))
     made = _read(connection, tables.results, "batch_id", batch_ids)
     made = _in_order_of(made, "batch_id", found["id"], ("id",))

@@ -161,7 +161,7 @@ class HeadMaker:
 
 
 NOTHING = Statement(number=0, previous="", made="", first=0, last=0, counts={}, root="")
-"""What stands before the first head."""
+"""Statement that precedes the first head of the record."""
 
 
 def last_head(connection: Connection) -> Statement:

@@ -192,7 +192,7 @@ def _pairs(selected: pages.ResultFilter, other: str, latest: int | None = None) 
 
 
 def _transitions(connection: Connection, pairs: Subquery) -> dict[tuple[str, str, bool], int]:
-    """How many stars went from which outcome to which, and whether they name the same star."""
+    """Number of stars by old outcome, new outcome, and whether the catalog star is the same."""
     old, new = tables.star_results.alias("old_star"), tables.star_results.alias("new_star")
     same = case((old.c.star_id == new.c.star_id, 1), else_=0)
     query = (
@@ -323,7 +323,7 @@ def _opened(
 _SHOWN_BY_HOUR_S = 30 * DAY_S
 """The longest period with a cell an hour; a longer one has cells of one day or several."""
 _MOST_CELLS_OF_DAYS = 732
-"""Two years of days."""
+"""Largest number of one-day cells in a comparison of runs: two years."""
 _SHARES = ("ambiguous", "unmatched")
 
 

@@ -56,7 +56,7 @@ class GradedStretchInfo(Struct, frozen=True, kw_only=True):
 
 
 class DaySummary(Struct, frozen=True, kw_only=True):
-    """What became of what was recorded of a day."""
+    """Use of a day's recorded data in the attitude history."""
 
     stretches: list[GradedStretchInfo]
     measurements: dict[str, int]

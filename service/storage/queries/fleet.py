@@ -130,7 +130,7 @@ class FleetCells:
 
     @property
     def columns(self) -> int:
-        """How many cells there are in time."""
+        """Number of time cells of the fleet's chart."""
         return int(self.counts["batches"].shape[1])
 
 
@@ -268,7 +268,7 @@ def _newest_query(solved: bool) -> Select[Any]:
 
 
 def latest_inputs(connection: Connection, names: Iterable[str], now: Utc) -> Sequence[str]:
-    """The latest live batch of each of these spacecraft, as it was sent."""
+    """The latest live batch of each named spacecraft, as JSON in the form in which it was sent."""
     ids = _latest_ids(connection, list(names), LIVE, now)
     query = select(batches.c.input).join_from(results, batches, results.c.batch_id == batches.c.id)
     return connection.scalars(query.where(results.c.id.in_(list(ids.values())))).all()

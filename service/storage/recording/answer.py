@@ -21,7 +21,7 @@ _AMBIGUOUS = int(Outcome.AMBIGUOUS)
 
 
 class StarRow(NamedTuple):
-    """One observed star, and what it was identified as."""
+    """One observed star and its identification."""
 
     tracker: str
     position: int

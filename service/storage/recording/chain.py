@@ -31,7 +31,7 @@ _encode = msgspec.json.Encoder(order="sorted").encode
 
 
 class Statement(msgspec.Struct, frozen=True, kw_only=True):
-    """What a head states; its JSON, with sorted names, is what is hashed and signed."""
+    """Statement of a head of the record; its JSON with sorted names is hashed and signed."""
 
     version: int = 1
     number: int

@@ -229,7 +229,7 @@ def list_annotations(
 
 
 def read_annotation(connection: Connection, id: str) -> Annotation:
-    """One annotation; raises `NotFound`."""
+    """Return the annotation with an id; raises `NotFound`."""
     query = select(annotations).where(annotations.c.id == id)
     row = connection.execute(query).mappings().first()
     if row is None:

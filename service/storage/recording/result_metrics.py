@@ -158,7 +158,7 @@ def _summed(of: Table) -> Mapping[str, ColumnElement[Any]]:
 SUMMED = _summed(tables.results)
 """Each column as SQL over `results`, for a query that groups them or sums up all."""
 SUMMED_OF_TRACKERS = _summed(tables.tracker_values)
-"""The same over `tracker_values`."""
+"""Each column as SQL over `tracker_values`, for a query that groups or sums all rows."""
 OF_TRACKERS = tables.results.join(
     tables.tracker_values, tables.tracker_values.c.batch_id == tables.results.c.batch_id
 )

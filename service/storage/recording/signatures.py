@@ -35,7 +35,7 @@ def naming_result(body: str | None, id: str) -> str:
 
 
 def signature_of(connection: Connection, parent: str, id: str) -> Signature | None:
-    """Who recorded the what-if of `parent` that has the id; None where no entry names it."""
+    """The author of a recorded what-if of the result `parent`; None if no audit entry names it."""
     start = json.dumps({"result": id}).removesuffix("}")
     query = select(audit).where(
         audit.c.about == f"/api/v1/batches/{parent}/what-if",

@@ -34,7 +34,7 @@ STARS = ("observed", "unique", "ambiguous", "unmatched")
 
 _RECORD = b'"record":'
 _NOT_RECORDED = _RECORD + b"null"
-"""It stands in `timings_us`; within a client's text a backslash would precede its quotes."""
+"""Marker of an unrecorded answer in `timings_us`; in a client's text its quotes are escaped."""
 
 
 class Answered(Struct, frozen=True):
@@ -73,7 +73,7 @@ class UnsavedResult(Struct, eq=False):
     key: tuple[str, str] | None
     frame: Row | None = None
     handed_over_ns: int | None = None
-    """When it was handed to the writer, on the clock of `time.perf_counter_ns`."""
+    """Time at which the result was handed to the writer (`time.perf_counter_ns`)."""
     trackers: Sequence[Row] = ()
     """The values of each tracker, of a mission with several (`tracker_values`)."""
     audit: Row | None = None
@@ -88,7 +88,7 @@ class UnsavedResult(Struct, eq=False):
 
     @property
     def counts(self) -> dict[str, int]:
-        """Its stars: observed, and of them unique, ambiguous and unmatched."""
+        """Numbers of observed, unique, ambiguous and unmatched stars of the result."""
         return {name: self.result[name] for name in STARS}
 
     def to_json(self, together: int) -> bytes:

@@ -384,7 +384,7 @@ def is_of_the_database(error: BaseException) -> bool:
 
 
 def is_of_the_statement(error: BaseException) -> bool:
-    """True if SQLite, which calls it operational, says that a statement names what is not there."""
+    """True if SQLite's operational error is a fault of the statement, such as a missing table."""
     code = getattr(getattr(error, "orig", None), "sqlite_errorcode", None)
     return code is not None and code & 0xFF == sqlite3.SQLITE_ERROR
 

@@ -129,7 +129,7 @@ def _is_about(difference: Any, tables: Collection[str]) -> bool:
 
 
 def all_tables() -> list[Table]:
-    """All tables of the code, each after those that it refers to."""
+    """All database tables that the code defines, each after the tables that it refers to."""
     # A table is known to the metadata when its module is loaded.
     from service.storage.sql import (  # noqa: F401
         chain_tables,
@@ -228,7 +228,7 @@ def revision_in(connection: Connection) -> str | None:
 
 
 def _difference(connection: Connection) -> str | None:
-    """How the revision of the schema differs from this version's, and what to do; None: not."""
+    """Difference of the database's schema from this version's, with the remedy; None if equal."""
     found = revision_in(connection)
     if found == HEAD:
         if missing := [table.name for table in _missing(connection)]:

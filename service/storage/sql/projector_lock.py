@@ -31,7 +31,7 @@ Attempt = Literal["kept", "taken", "refused"]
 
 
 class NotProjecting(Busy):
-    """Another service that shares the database does what one of them does alone."""
+    """Refusal of work that only one service on a database does: another one does it."""
 
 
 class ProjectorLock:

@@ -76,7 +76,7 @@ MAX_ATTEMPTS = 5
 
 @dataclass
 class Archived:
-    """How many batches there are to archive, and are archived so far, in how many bytes."""
+    """Progress of archiving: batches in total, batches archived, parts and bytes written."""
 
     total: int
     batches: int = 0

@@ -29,7 +29,7 @@ from service.storage.sql.migrations import connected, reading, revision_of
 PAGES_AT_ONCE = 2_000
 """About eight megabytes: often enough to show how far it is."""
 SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
-"""How the files begin."""
+"""First bytes of an SQLite database file and of a PostgreSQL dump."""
 BESIDE = ("-wal", "-shm", "-journal")
 """The files that SQLite keeps beside a file: another database's would be taken for this one's."""
 

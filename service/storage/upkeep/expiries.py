@@ -22,7 +22,7 @@ _FIRST_YEAR = 2017
 
 
 class TokenTerm(Struct, frozen=True):
-    """When a token in force was made and when it expires: UTC texts."""
+    """Creation and expiry of a token in force, as UTC texts."""
 
     name: str
     created: str

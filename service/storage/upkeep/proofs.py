@@ -89,7 +89,7 @@ def read_proof(file: Path) -> Proof:
 def faults_of(
     proof: Proof, public_key: PublicKey | None = None, answer: bytes | None = None
 ) -> list[str]:
-    """What is wrong with a proof, a sentence each; empty: the head has the result."""
+    """Faults of a proof, one sentence each; empty if the head contains the result."""
     found = []
     if answer is not None and hashlib.sha256(answer).hexdigest() != proof.answer_sha256:
         found.append("the answer is not the one that was recorded")

@@ -42,7 +42,7 @@ Conditions = list[ColumnElement[bool]]
 
 @dataclass
 class Pruned:
-    """How many batches, gyro blocks and graded days there are before the time, and are gone."""
+    """Progress of pruning: batches, gyro blocks and graded days to delete, and deleted."""
 
     total: int
     batches: int = 0

@@ -33,7 +33,7 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
     batches: int
     """The number of batches of the selected period."""
     before: int
-    """How many of them were in the run before the command began."""
+    """Number of the period's batches that the run had before the command began."""
     recorded: int
     refused: int
     started: str
@@ -85,7 +85,7 @@ def reprocessings(folder: Path) -> list[Reprocessing]:
 
 
 def now_text() -> str:
-    """This moment as a state has it."""
+    """The current UTC time, as text for the state of a reprocessing."""
     return utc_now().text
 
 
