@@ -134,7 +134,7 @@ class Busy(AcquisitionError):
 
 
 class BeingBuilt(Busy):
-    """What the work needs is built by another thread; `done` tells when it is there."""
+    """Refusal while another thread builds a needed part of the sky; `done` is its future."""
 
     def __init__(self, done: "Future[Any]") -> None:
         super().__init__("a part of the sky that this needs is built for the first time", 5)

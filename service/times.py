@@ -147,7 +147,7 @@ def bucket_start(number: int, width_s: int) -> Utc:
 
 
 def utc_now() -> Utc:
-    """This moment by the machine's clock."""
+    """The current UTC time by the machine's clock."""
     return utc_of_unix(time.time())
 
 

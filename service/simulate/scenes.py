@@ -22,7 +22,7 @@ from service.vectors import Matrix, Vector, matrix_from_quaternion, read_only, u
 
 EPOCH_YEAR = 2000.0
 MERGE_WITHIN_ARCSEC = 60.0
-"""What the camera cannot separate, under two of its pixels, is one star of the sky."""
+"""Separation under which two stars are drawn as one: below two pixels of the camera."""
 FAINTEST_SIGMA = 4.5
 """Stars fainter than the limit by more than this many sigmas of magnitude are never seen."""
 MAX_TRIES = 10_000
@@ -56,7 +56,7 @@ class PinholeCamera:
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a scene is drawn with."""
+    """Conditions under which a scene is drawn: noise, limits and numbers of stars."""
 
     position_px: float = 1.0
     """One standard deviation per axis of the detector."""

@@ -51,7 +51,7 @@ class Liebe:
         return self.star.nbytes + self.feature.nbytes + self.nearer.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """Each star's most-voted name."""
+        """Name each observed star by the catalog star with the most votes."""
         image, feature = features(scene.direction)
         matched, guide = np.empty((2, MAX_MATCHES), np.int32)
         index = self.nearer

@@ -50,7 +50,7 @@ class PVector:
 
     @property
     def entries(self) -> int:
-        """One triangle a star, where it has two neighbours."""
+        """Number of catalog triangles: one for each star that has two neighbours."""
         return self.triangles.count
 
     @property
@@ -122,7 +122,7 @@ class Ptp:
         return self.triangles.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """What sharing stars validate, without the attitude check behind it."""
+        """Identify stars by triangles that share stars, without a check of the attitude."""
         proposals = propose(scene.direction, scene.sigma_rad, 0.0, self.triangles, self.stars)
         match = proposals.validated(len(scene.direction))
         return Proposed(match, proposals.image, proposals.star)

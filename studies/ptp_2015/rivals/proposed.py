@@ -1,4 +1,4 @@
-"""What an algorithm of the comparison gives back, and how it is made and asked."""
+"""Answers and interface of the identification algorithms in the comparison."""
 
 from dataclasses import dataclass
 from typing import Protocol
