@@ -106,7 +106,7 @@ def acquire(
 def acquired(
     batches: Sequence[ObservationBatch], mission: Mission, sky: SkyModel, *, at_once: bool = False
 ) -> list[Acquisition | Exception]:
-    """For each batch of one mission: its acquisition, or the error that prevents it."""
+    """The acquisition of each batch of one mission, or the error that prevents it."""
     columns = acquire_many(BatchColumns.of(batches), mission, sky, at_once=at_once)
     return [columns.acquisition_or_error(row) for row in range(len(batches))]
 

@@ -16,7 +16,7 @@ from tests.scale import size
 from tests.web.serving import ended
 
 MUTATIONS = 2_000
-"""Of each format, each way."""
+"""Damaged files of each format that are sent by each way."""
 MAX_GROWTH_MB = 400
 TELEMETRY = {
     "ndjson": {"Content-Type": "application/x-ndjson"},
