@@ -47,6 +47,11 @@ COPIED = (*LARGEST, "tracker_values", *TRENDS)
 # Of a copy the first letter of its ids, which is 0 in this millennium.
 _LETTERS = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 _KEYS = ("id", "batch_id", "result_id")
+# Sessions that still see rows as they were before a transaction.
+_OTHERS = """SELECT count(*) FROM pg_stat_activity
+    WHERE datname = current_database() AND pid <> pg_backend_pid()
+    AND greatest(age(backend_xid), age(backend_xmin)) > age(CAST(%s AS xid))"""
+_OTHERS_TRIES, _OTHERS_PAUSE_S = 600, 0.1
 _LATER = """to_char(
     CAST(time AS timestamptz) AT TIME ZONE 'UTC' + make_interval(days => {shift}),
     'YYYY-MM-DD"T"HH24:MI:SS.MS"Z"')"""
@@ -210,9 +215,18 @@ def _size(engine: Engine) -> int:
 
 
 def _vacuum(engine: Engine, how: str) -> float:
-    """Seconds of a VACUUM of the tables."""
-    start = time.perf_counter()
+    """Seconds of a VACUUM of the tables, once nobody else can see what was deleted.
+
+    VACUUM keeps a deleted row while any session of the database has a snapshot from before the
+    deletion.  Where such a session stays open for too long, the figures hold its rows.
+    """
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
+        deleted = connection.exec_driver_sql("SELECT pg_current_xact_id()::xid").scalar_one()
+        for _ in range(_OTHERS_TRIES):
+            if not connection.exec_driver_sql(_OTHERS, (deleted,)).scalar_one():
+                break
+            time.sleep(_OTHERS_PAUSE_S)
+        start = time.perf_counter()
         connection.exec_driver_sql(f"VACUUM ({how}) {', '.join(COPIED)}")
     return time.perf_counter() - start
 
