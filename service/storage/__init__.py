@@ -1,1 +1,1 @@
-"""Everything that is kept, in SQL."""
+"""Storage of the service in SQL: batches, results, and all that follows from them."""

@@ -1,4 +1,4 @@
-"""Calibrations in force: what an operator adopted in the place of a mission file's settings."""
+"""Calibrations in force: those that an operator adopted in place of a mission file's settings."""
 
 import msgspec
 from sqlalchemy import Connection, Select, func, insert, select
@@ -15,7 +15,7 @@ _NEWEST_ADOPTION = "SELECT max(id) FROM calibration_adoptions"
 
 
 def add_adoption(connection: Connection, row: Row) -> None:
-    """Record a change of the calibration in force."""
+    """Record an adoption: a change of the calibration in force of a spacecraft."""
     connection.execute(insert(calibration_adoptions), row)
 
 
@@ -26,15 +26,15 @@ def list_adoptions(connection: Connection, spacecraft: str) -> list[CalibrationA
 
 
 def newest_adoption(connection: Connection) -> str:
-    """The id of the last change of any spacecraft; empty where there was none."""
+    """Id of the newest adoption of a calibration, of any spacecraft; empty without one."""
     ((newest,),) = execute(connection, _NEWEST_ADOPTION)
     return newest or ""
 
 
 def begin_adoption(connection: Connection, id: str) -> str:
-    """An id for a change, at least this one: it follows all others, whatever clocks say.
+    """Choose the id of a new adoption: `id`, or a later one, so that it follows all others.
 
-    Until the end of the transaction no other process adds one.
+    The clock's time does not matter.  Until the end of the transaction no other process adds one.
     """
     dialect_of(connection).lock_table(connection, calibration_adoptions.name)
     newest = newest_adoption(connection)
@@ -42,7 +42,7 @@ def begin_adoption(connection: Connection, id: str) -> str:
 
 
 def latest_adoptions(connection: Connection) -> list[CalibrationAdoption]:
-    """The last change of every spacecraft."""
+    """The newest adoption of a calibration of every spacecraft."""
     latest = select(func.max(calibration_adoptions.c.id)).group_by(
         calibration_adoptions.c.spacecraft
     )

@@ -1,4 +1,4 @@
-"""Gyro blocks in the records: recorded once, listed, read, and as a table of samples."""
+"""Storage of gyro blocks: each recorded once, listed, read, and exported as a table of samples."""
 
 import re
 from collections.abc import Callable, Iterator, Mapping
@@ -26,12 +26,12 @@ from service.vectors import Vector
 SHOWN = GyroBlockRow.__struct_fields__
 SPAN_NS = int(gyro.MAX_SPAN_S) * 10**9
 TIMES = [gyro_blocks.c[name] for name in ("start_ns", "samples", "step_s", "times_s")]
-"""The columns that tell the times of a block's samples."""
+"""Columns of a gyro block that give the times of its samples."""
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """A recorded block, and whether it was recorded before."""
+    """Outcome of recording a gyro block: the block, and whether it was known before."""
 
     row: GyroBlockRow
     replayed: bool
@@ -50,11 +50,11 @@ class BlockFilter:
     end: Utc | None = None
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """The filter as SQL over `gyro_blocks`."""
+        """Convert the filter of gyro blocks to SQL conditions."""
         c = gyro_blocks.c
         chosen = [c.spacecraft == self.spacecraft, c.run == self.run]
         if self.start is not None:
-            # The index has the start alone, and a block spans no more than so much.
+            # The index has only the start, and no block spans more than SPAN_NS.
             chosen += [c.end_ns >= self.start.tai_ns, c.start_ns >= self.start.tai_ns - SPAN_NS]
         if self.end is not None:
             chosen.append(c.start_ns < self.end.tai_ns)
@@ -62,7 +62,7 @@ class BlockFilter:
 
 
 def row_of(block: gyro.GyroBlock, id: str, received: Utc) -> Row:
-    """The row of a new block."""
+    """Database row of a new gyro block."""
     times_ns = block.tai_ns
     return {
         "id": id,
@@ -83,7 +83,7 @@ def row_of(block: gyro.GyroBlock, id: str, received: Utc) -> Row:
 
 
 def find_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> GyroBlockRow | None:
-    """The block of the same body that is recorded already, or None.
+    """Find a recorded gyro block with the same body; None if there is none.
 
     Raises `Conflict` where another body has its name, `SampleTaken` where another block holds one
     of its times.
@@ -103,7 +103,7 @@ def find_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> GyroB
         c.run == block.run,
         c.start_ns < row["end_ns"] + gyro.SAME_TIME_NS,
         c.end_ns > row["start_ns"] - gyro.SAME_TIME_NS,
-        # The index has the start first, and no block spans more than so much.
+        # The index has the start first, and no block spans more than SPAN_NS.
         c.start_ns > row["start_ns"] - gyro.SAME_TIME_NS - SPAN_NS,
     )
     for other in connection.execute(near.order_by(c.start_ns)).mappings():
@@ -120,9 +120,9 @@ def find_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> GyroB
 
 
 def record_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> Recorded:
-    """Record a block that is new, and add an event; see `find_block`."""
+    """Record a gyro block and add an event, unless the block is known; see `find_block`."""
     insert_runs(connection, {block.run: row["received"]})
-    # Of two processes that record blocks of a run, one waits: neither sees the other's samples.
+    # Lock the run: of two processes that record blocks, neither sees the other's samples.
     lock = select(runs.c.name).where(runs.c.name == block.run)
     connection.execute(lock.with_for_update(key_share=True))
     found = find_block(connection, block, row)
@@ -137,7 +137,7 @@ def record_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> Rec
 def record_or_refuse(
     connection: Connection, block: gyro.GyroBlock, row: Row
 ) -> Recorded | AcquisitionError:
-    """Record a block, or give the error of `find_block`, before which nothing is inserted."""
+    """Record a gyro block, or return the error of `find_block`, which precedes any insert."""
     try:
         return record_block(connection, block, row)
     except AcquisitionError as error:
@@ -147,9 +147,9 @@ def record_or_refuse(
 def list_blocks(
     connection: Connection, selected: BlockFilter, *, limit: int, cursor: str | None
 ) -> Page[GyroBlockRow]:
-    """The selected blocks without their samples, the earliest first."""
+    """List the gyro blocks that a filter selects, without their samples, the earliest first."""
     c = gyro_blocks.c
-    # Blocks of a spacecraft and a run have different first samples.
+    # No two blocks of a spacecraft and a run have the same first sample.
     query = select(c.start_ns, *(c[name] for name in SHOWN)).where(*selected.conditions())
     if cursor is not None:
         query = query.where(c.start_ns > _read_cursor(cursor))
@@ -160,7 +160,7 @@ def list_blocks(
 
 
 def read_block(connection: Connection, spacecraft: str, id: str) -> GyroSamples:
-    """A block of a spacecraft with its samples; raises `NotFound`."""
+    """Read a gyro block of a spacecraft with its samples; raises `NotFound`."""
     chosen = gyro_blocks.c.id == id, gyro_blocks.c.spacecraft == spacecraft
     query = select(gyro_blocks).where(*chosen)
     row = connection.execute(query).mappings().first()
@@ -174,7 +174,7 @@ def read_block(connection: Connection, spacecraft: str, id: str) -> GyroSamples:
 
 
 def block_of(row: Any) -> gyro.GyroBlock:
-    """The block of a row; raises `ValueError` for samples that cannot be read."""
+    """Convert a database row to a gyro block; raises `ValueError` for unreadable samples."""
     return gyro.GyroBlock(
         row["spacecraft"],
         row["run"],
@@ -187,31 +187,31 @@ def block_of(row: Any) -> gyro.GyroBlock:
 
 
 def times_of(row: Any) -> Vector:
-    """The times of a block's samples, in seconds after its start."""
+    """Times of a gyro block's samples, in seconds after the block's start."""
     if row["step_s"] is not None:
         return gyro.times_of_steps(row["step_s"], row["samples"])
     return gyro.unpack(row["times_s"], (row["samples"],))
 
 
 def rates_of(row: Any) -> Vector:
-    """The rates of a block's samples, shape (n, 3)."""
+    """Angular rates of a gyro block's samples in rad/s, shape (n, 3)."""
     return gyro.unpack(row["rates_rad_per_s"], (row["samples"], 3))
 
 
 def shown(row: Any) -> GyroBlockRow:
-    """A row as it is answered."""
+    """Convert a database row to the record of a gyro block that answers show."""
     return GyroBlockRow(**{name: row[name] for name in SHOWN})
 
 
 def _read_cursor(cursor: str) -> int:
-    # From 2031-09 on a time has 19 digits.
+    # From 2031-09 on a time in nanoseconds has 19 digits.
     if not re.fullmatch(r"-?\d{1,19}", cursor, re.ASCII) or abs(int(cursor)) >= 1 << 63:
         raise BadBatch(Fault("cursor", "is not a cursor of this list", shown_value(cursor)))
     return int(cursor)
 
 
 BLOCKS = 20
-"""Blocks that are read together."""
+"""Number of gyro blocks read from the database at a time."""
 
 Reading = Callable[[], AbstractContextManager[Connection]]
 
@@ -231,15 +231,15 @@ COLUMNS = (
 
 
 def sample_table(reading: Reading, selected: BlockFilter, about: Mapping[str, str]) -> Table:
-    """The samples of a period, read as the table is.
+    """Table of a period's gyro samples, read from the database page by page.
 
-    Where blocks interleave, so do their samples only block by block.
+    Samples of interleaved blocks are in order within each block only.
     """
     return Table(COLUMNS, _pages(reading, selected), {"product": "gyro", **about})
 
 
 def count_samples(connection: Connection, selected: BlockFilter) -> int:
-    """The samples of the blocks that touch a period: at least those of the period."""
+    """Count the samples of the gyro blocks that overlap a period: an upper bound for the period."""
     total = select(func.sum(gyro_blocks.c.samples)).where(*selected.conditions())
     return int(connection.scalar(total) or 0)
 
@@ -261,7 +261,7 @@ def _pages(reading: Reading, selected: BlockFilter) -> Iterator[TablePage]:
 
 
 def _page(row: Any, selected: BlockFilter) -> TablePage:
-    """The samples of a block that lie in the period."""
+    """Table page with the samples of one gyro block that lie in the period."""
     block = block_of(row)
     times_ns = block.tai_ns
     first, last = 0, times_ns.size
@@ -276,7 +276,7 @@ def _page(row: Any, selected: BlockFilter) -> TablePage:
 
 
 def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[gyro.Nanoseconds, Vector]:
-    """The samples of a period in order of time; those of blocks that interleave are merged."""
+    """Gyro samples of a period, merged in order of time: times in ns of TAI, rates in rad/s."""
     times, rates = [np.zeros(0, np.int64)], [np.zeros((0, 3))]
     query = select(gyro_blocks).where(*selected.conditions()).order_by(gyro_blocks.c.start_ns)
     for row in connection.execute(query).mappings():
@@ -290,7 +290,7 @@ def gyro_in(connection: Connection, selected: BlockFilter) -> tuple[gyro.Nanosec
 
 
 def inside(tai_ns: gyro.Nanoseconds, start: Utc | None, end: Utc | None) -> npt.NDArray[np.intp]:
-    """The places of the times that lie in a period."""
+    """Indices of the times, in ns of TAI, from `start` to before `end`."""
     chosen = np.ones(len(tai_ns), dtype=bool)
     if start is not None:
         chosen &= tai_ns >= start.tai_ns

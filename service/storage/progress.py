@@ -1,4 +1,4 @@
-"""How far the projections have come after the record: the projector tells, readers wait."""
+"""Progress of the projections behind the record: set by the projector, awaited by readers."""
 
 import threading
 import time
@@ -10,11 +10,11 @@ from service.storage.recording.writer import Writer
 from service.storage.sql.statements import execute
 
 POLL_S = 0.02
-"""The time between two looks of a reader for where another process projects."""
+"""Seconds between a reader's checks of the position of another process's projector."""
 WAIT_S = 1.0
-"""The longest wait of a reader for the projections."""
+"""Longest wait of a reader for the projections, in seconds."""
 MOST_BEHIND = 20_000
-"""Results; bulk loads, replays and reprocessing wait while there are more."""
+"""Number of results not projected above which bulk loads, replays and reprocessing wait."""
 
 _BEHIND = "SELECT count(*) FROM results WHERE seq > (SELECT seq FROM projector)"
 _NEWEST_AND_POSITION = (
@@ -24,14 +24,14 @@ _NEWEST_AND_POSITION = (
 
 @dataclass(frozen=True)
 class Lag:
-    """How far the projections are behind the record: results, and seconds since they were not."""
+    """Lag of the projections: number of unprojected results, and seconds since there were none."""
 
     results: int
     seconds: float
 
 
 class Progress:
-    """Says how far the projector is, and lets readers wait for it."""
+    """Position of the projector, for which readers can wait."""
 
     def __init__(
         self,
@@ -40,28 +40,28 @@ class Progress:
     ) -> None:
         self._database, self._writer = readers, writer
         self.is_shared = readers.file is None
-        """True for a database in which other processes record and project, too."""
+        """True for a database in which other processes record and project as well."""
         self._changed = threading.Condition()
         self._is_followed = False
-        """True while this process has a projector, for which readers wait."""
+        """True while this process has a projector that readers wait for."""
         self.is_projecting = True
-        """False where another process projects, as far as is known."""
+        """False while another process is known to project."""
         self._position = 0
         self._projected = -1
-        """The writer's count of transactions up to which all is projected."""
+        """Count of the writer's transactions at the last time when all were projected."""
         self._readers = 0
         self._up_to_date_s = time.monotonic()
 
     # ---- for the projector -------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Let readers wait for the projector of this process."""
+        """Start letting readers wait for the projector of this process."""
         self._is_followed = True
 
     def report(self, position: int, projected: int | None = None) -> None:
-        """Tell readers the projector's place in the record.
+        """Set the projector's position in the record, and wake the waiting readers.
 
-        `projected` is the writer's count of transactions where all of them are projected.
+        `projected` is the writer's count of transactions, given if all of them are projected.
         """
         with self._changed:
             self._position = position
@@ -70,13 +70,13 @@ class Progress:
             self._changed.notify_all()
 
     def end(self) -> None:
-        """Let no reader wait any more."""
+        """Stop all waits of readers for the projector."""
         with self._changed:
             self._is_followed = False
             self._changed.notify_all()
 
     def wait_for_reader(self, seconds: float) -> None:
-        """Return when a reader waits, or after so many seconds."""
+        """Wait until a reader waits for the projector, at most `seconds`."""
         with self._changed:
             self._changed.wait_for(lambda: self._readers or not self._is_followed, seconds)
 
@@ -85,7 +85,7 @@ class Progress:
         return self._projected < self._writer.commits
 
     def places(self) -> tuple[int, int]:
-        """The places of the newest result and of the projector in the record."""
+        """Positions in the record of the newest result and of the projector."""
         asked_s = time.monotonic()
         with self._database.lookup() as connection:
             ((newest, position),) = execute(connection, _NEWEST_AND_POSITION)
@@ -96,10 +96,10 @@ class Progress:
     # ---- for readers -------------------------------------------------------------------------
 
     def wait(self) -> float:
-        """Return when all that is recorded now is projected, or after `WAIT_S`.
+        """Wait until everything recorded so far is projected, at most `WAIT_S`.
 
-        The seconds that the projections are behind then; zero where they are not, or where this
-        process has no projector.
+        Returns the lag of the projections in seconds: zero if there is none, or if this process has
+        no projector.
         """
         if not self._is_followed:
             return 0.0
@@ -108,7 +108,7 @@ class Progress:
         try:
             return self._waited()
         except Busy:
-            # The database does not give the record now; the projections may still be readable.
+            # The record cannot be read now; the projections may still be readable.
             return time.monotonic() - self._up_to_date_s
 
     def _waited(self) -> float:
@@ -117,7 +117,7 @@ class Progress:
         if position >= newest:
             return 0.0
         if not self.is_projecting:
-            # Another process projects.
+            # Another process projects: poll its position.
             end_s = time.monotonic() + WAIT_S
             while time.monotonic() < end_s and self._is_followed:
                 time.sleep(POLL_S)
@@ -126,7 +126,7 @@ class Progress:
             return time.monotonic() - self._up_to_date_s
 
         def has_passed() -> bool:
-            # The writer's count says nothing of results of other processes.
+            # The writer's count leaves out results of other processes.
             is_own = not self.is_shared and self._projected >= commits
             return self._position >= newest or is_own or not self._is_followed
 
@@ -138,23 +138,23 @@ class Progress:
             return 0.0 if is_passed else time.monotonic() - self._up_to_date_s
 
     def catch_up(self, most: int = 0) -> None:
-        """Wait while more than so many results are to be projected."""
+        """Wait while more than `most` results remain to be projected."""
         while self._is_followed and (self.is_projecting or self.is_shared):
             if self._count_behind(most) <= most:
                 return
             self.wait()
 
     def hold_back(self) -> None:
-        """Wait while too much is to be projected; called before much is recorded at once."""
+        """Delay a bulk write while too many results remain to be projected."""
         self.catch_up(MOST_BEHIND)
 
     def lag(self) -> Lag:
-        """How far behind the projections are."""
+        """Present lag of the projections behind the record."""
         behind = self._count_behind(0)
         return Lag(behind, time.monotonic() - self._up_to_date_s if behind else 0.0)
 
     def _count_behind(self, most: int) -> int:
-        """How many results are to be projected; counted only if there may be more than so many."""
+        """Number of results to be projected; counted exactly only where it may exceed `most`."""
         if not self.is_shared and not self.is_behind():
             return 0
         newest, position = self.places()

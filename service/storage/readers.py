@@ -1,4 +1,4 @@
-"""Connections that read a database, many at a time."""
+"""Pool of connections that read a database."""
 
 import logging
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ log = logging.getLogger(__name__)
 
 
 class Readers:
-    """Connections that see one snapshot of a database each, and cannot write."""
+    """Pool of read-only connections, each with one snapshot of a database."""
 
     def __init__(
         self,
@@ -26,10 +26,10 @@ class Readers:
         serving: bool = False,
         file: DatabaseFile | None = None,
     ) -> None:
-        """Connects to nothing yet; raises `BadConfiguration` for an invalid database URL.
+        """Prepare the pool without connecting; raises `BadConfiguration` for an invalid URL.
 
-        With `serving`, waiting for a database that does not answer is bounded.  The file of
-        SQLite must stay the one that is there now.
+        With `serving`, waiting for a database that does not answer is bounded.  SQLite's file must
+        not be replaced afterwards.
         """
         self.url = engines.database_url(database)
         self.file = file or engines.database_file(self.url)
@@ -47,14 +47,14 @@ class Readers:
         )
 
     def reading(self) -> AbstractContextManager[Connection]:
-        """A connection that sees one snapshot of the database and cannot write."""
+        """Provide a read-only connection with one snapshot of the database."""
         return self.reading_record()
 
     @contextmanager
     def reading_record(self) -> Iterator[Connection]:
-        """A connection for what reads no projection, and so waits for none.
+        """Provide a connection for reading recorded data, which need not wait for projections.
 
-        Raises `Busy` where the database is out of reach or every reader taken.
+        Raises `Busy` where the database cannot be reached or every connection is in use.
         """
         if self.file is not None:
             self.file.require()
@@ -63,7 +63,7 @@ class Readers:
 
     @contextmanager
     def lookup(self) -> Iterator[Connection]:
-        """A connection for prepared look-ups, each of which may see another snapshot.
+        """Provide a connection for prepared look-ups, each of which may see another snapshot.
 
         Look-ups take turns.
         """
@@ -71,17 +71,17 @@ class Readers:
             yield connection
 
     def close(self) -> None:
-        """Let go of the database; what is still read by then is read to its end."""
+        """Close the pool; reads in progress continue to their end."""
         self._lookup_connection.close()
         for engine in (self._lookup_engine, self._readers):
-            # Else a connection that comes back later would stay open in a pool that nobody has.
+            # Otherwise a connection returned later would stay open in a discarded pool.
             event.listen(engine, "checkin", lambda _, entry: entry.close())
             engine.dispose()
 
 
 @contextmanager
 def _unavailable_is_busy() -> Iterator[None]:
-    """Raise `Busy` for a fault of the database that may pass."""
+    """Convert a passing fault of the database into `Busy`."""
     try:
         yield
     except TimeoutError as error:

@@ -1,4 +1,4 @@
-"""An open database: one writer and many readers."""
+"""Open database with one writer and many readers."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -19,7 +19,7 @@ from service.storage.sql.projector_lock import ProjectorLock
 
 
 class Store(Readers):
-    """The one connection that writes, behind its thread, and the readers."""
+    """Open database: one writing connection with its thread, and a pool of reading connections."""
 
     def __init__(
         self,
@@ -32,13 +32,16 @@ class Store(Readers):
     ) -> None:
         """Open a database: SQLite is created and migrated, PostgreSQL must be up to date.
 
-        Without `create` SQLite's file must be there.  Batches that left the database are read
-        from the `archive_folder`.
-        One process at a time writes to a SQLite file, from its first write on; with `serving`,
-        from the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL
-        lets one service alone project.
-        Features that are not in the list `features_off` take part in what follows from the record.
-        Raises `BadConfiguration` with what to do.
+        Without `create` SQLite's file must exist.  Batches that left the database are read from the
+        `archive_folder`.
+
+        One process at a time writes to a SQLite file, from its first write on; with `serving`, from
+        the start.  `serving` bounds the waiting times, too, see `Readers`, and on PostgreSQL lets
+        one service alone project.
+
+        Features listed in `features_off` project nothing.
+
+        Raises `BadConfiguration` with the remedy.
         """
         self.features_off = features_off
         self.archive = Archive(archive_folder)
@@ -48,7 +51,7 @@ class Store(Readers):
             file.require_there()
         timeouts = engines.TO_COMMIT if serving else None
         self.file_lock = None if file is None else FileLock(file)
-        """The lock of a SQLite file."""
+        """Lock of the SQLite file against other writing processes; None on a server."""
         self._writing = engines.writing_engine(url, file=file, create=create, timeouts=timeouts)
         try:
             if self.file_lock is None:
@@ -68,15 +71,15 @@ class Store(Readers):
             raise
         super().__init__(database, serving=serving, file=file)
         self.lock = ProjectorLock() if serving and file is None else None
-        """The lock of PostgreSQL: nothing is projected before it is taken."""
+        """Lock of the projector on PostgreSQL: nothing is projected before it is taken."""
         wait_s = engines.LONGEST_WAIT_S if serving else None
         self.at_work = set[str]() if self.lock is None else self.lock.at_work
-        """The ids of replays and calibrations that this process is at work on."""
+        """Ids of the replays and calibrations in progress in this process."""
         self.writer = Writer(
             self._writing, file=file, wait_s=wait_s, lock=self.lock, file_lock=self.file_lock
         )
         self.progress = Progress(self, self.writer)
-        """How far the projections are; readers wait for them."""
+        """Progress of the projections, which readers wait for."""
         self._heard: HeardEvents | None = None
         if serving and self.file_lock is not None:
             self.writer.change(remove_probe)
@@ -85,15 +88,15 @@ class Store(Readers):
 
     @property
     def is_projecting(self) -> bool:
-        """True if this process projects, as far as is known without asking the database."""
+        """True if this process projects, to its own knowledge, without asking the database."""
         return self.lock is None or self.lock.is_held
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """A connection whose snapshot has the projections of what is recorded now.
+        """Provide a connection whose snapshot has the projections of everything recorded so far.
 
-        They are waited for, at most a second: see `Progress.wait`.  What they then still are
-        behind is noted for the answer of the request.
+        The wait is at most a second: see `Progress.wait`.  A remaining lag is noted for the answer
+        of the request.
         """
         behind_s = self.progress.wait()
         if behind_s and (request := logs.request.get()) is not None:
@@ -103,9 +106,9 @@ class Store(Readers):
 
     @contextmanager
     def reading_batch(self, id: str) -> Iterator[tuple[Connection, bool]]:
-        """A connection that has the batch of a result, and whether that is archived.
+        """Provide a connection that holds the batch of a result, and True if that is archived.
 
-        Where there is no such result the connection is that of the database.
+        For an unknown result the connection is the database's.
         """
         with self.reading_record() as connection:
             opened = self.archive.batch(connection, id)
@@ -116,16 +119,16 @@ class Store(Readers):
             yield connection, True
 
     def require_writing(self) -> None:
-        """Take the lock of a SQLite file now; raises `BadConfiguration` while another has it."""
+        """Take the lock of a SQLite file; raises `BadConfiguration` if another process has it."""
         if self.file_lock is not None:
             self.file_lock.take()
 
     def close(self) -> None:
-        """Write what is queued, then let go of the database."""
+        """Write the queued jobs, then close the database."""
         if self._heard is not None:
             self._heard.close()
         self.writer.close()
-        # The writer goes last: the last connection to leave checkpoints the log.
+        # Close the writer last: the last connection to close checkpoints the log.
         super().close()
         self._writing.dispose()
         if self.file_lock is not None:

@@ -1,1 +1,1 @@
-"""The archive: old batches in Parquet files beside the database."""
+"""Archive of old batches in Parquet files beside the database."""

@@ -1,4 +1,4 @@
-"""The folder of an archive: partitions of Parquet, and a manifest beside those of a day.
+"""Folder of an archive: Parquet files (parts), and a manifest beside those of each day.
 
     archive.json
     spacecraft=NAME/day=YYYY-MM-DD/part-N.parquet
@@ -6,7 +6,7 @@
     spacecraft=NAME/day=YYYY-MM-DD/manifest.json
     settings/DIGEST.json
 
-A partition is whole when the manifest names it with its hash.  Every file appears whole, by a
+A part is complete when the manifest names it with its hash.  Every file appears complete, by a
 rename or a link.
 """
 
@@ -39,76 +39,76 @@ MANIFEST = "manifest.json"
 OWNER = "archive.json"
 LOCK = "archive.lock"
 UNFINISHED = ".part"
-"""The end of the name of a file that is being written."""
+"""Ending of the name of a file that is being written."""
 COMPRESSION_LEVEL = 1
-"""The level of zstd: higher ones take longer, and those up to 9 make nothing smaller."""
+"""Compression level of zstd: higher levels take longer, and up to 9 give no smaller files."""
 ROWS_TOGETHER = 2_048
-"""The rows of a row group, the least that is read of a text column."""
+"""Number of rows in a Parquet row group, the least that is read of a text column."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""The errors of a full disk, of a used-up quota and of a limit for the size of files."""
+"""Operating system errors for a full disk, an exhausted quota, and a limit on file sizes."""
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS)
-"""The errors of file systems without hard links."""
+"""Operating system errors of file systems without hard links."""
 
 
 class Part(Struct, frozen=True, kw_only=True):
-    """A partition as the manifest of its day names it."""
+    """Entry of an archive part in the manifest of its day."""
 
     file: str
     run: str
     batches: int
     results: int
     first: str
-    """UTC of the earliest batch."""
+    """UTC of the earliest batch in the part."""
     last: str
     first_ns: int
     last_ns: int
     bytes: int
     sha256: str
     missions: list[str]
-    """Digests of the settings in `settings/`."""
+    """Digests of the missions' settings, which are stored in `settings/`."""
     catalogs: list[str]
     source: str | None = None
-    """The digest of what a reprocessed partition was made from."""
+    """Digest of the inputs of a reprocessed part; None for a part of recorded batches."""
     tracked: bool = False
-    """True if its run was reprocessed with tracking; see `runs`."""
+    """True if the part's run was reprocessed with tracking; see `runs`."""
     record_head: str | None = None
-    """Number, SHA-256 and time of the last head of the record when it was written."""
+    """Number, SHA-256 and time of the record's last head when the part was written."""
 
 
 class Manifest(Struct, frozen=True, kw_only=True):
-    """The partitions of a spacecraft's day."""
+    """Manifest of a spacecraft's day: the list of its archive parts."""
 
     spacecraft: str
     day: str
     parts: list[Part]
 
     def with_part(self, part: Part) -> "Manifest":
-        """The manifest with a part, in the place of one of the same file."""
+        """Copy of the manifest with a part added, replacing one of the same file."""
         return structs.replace(self, parts=[*self.without(part).parts, part])
 
     def without(self, part: Part) -> "Manifest":
-        """The manifest without a part."""
+        """Copy of the manifest without a part."""
         return structs.replace(self, parts=[each for each in self.parts if each.file != part.file])
 
 
 class Owner(Struct, frozen=True, kw_only=True):
-    """The database whose batches an archive has."""
+    """Owner of an archive: the database whose batches it holds."""
 
     database: str
-    """A digest; see `identity_of`."""
+    """Digest that identifies the database; see `identity_of`."""
 
 
 class Settings(Struct, frozen=True, kw_only=True):
-    """The settings of a mission, or a catalog, that results of the archive name."""
+    """Settings of a mission, or a catalog, to which results in the archive refer."""
 
     digest: str
     row: dict[str, Any]
-    """The row as the database has it."""
+    """Row of the settings or the catalog in the database."""
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Have a folder to oneself; raises `BadConfiguration` while another command works on it."""
+    """Lock an archive folder; raises `BadConfiguration` while another command works on it."""
     if not folder.is_dir():
         raise BadConfiguration(f"{folder}: there is no such folder")
     with (folder / LOCK).open("ab") as lock:
@@ -120,7 +120,7 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 def is_locked(folder: Path) -> bool:
-    """True while a command works on a folder."""
+    """True while a command works on an archive folder."""
     try:
         lock = (folder / LOCK).open("rb")
     except OSError:
@@ -134,36 +134,36 @@ def is_locked(folder: Path) -> bool:
 
 
 def day_folder(folder: Path, spacecraft: str, day: str) -> Path:
-    """The folder of the partitions of a spacecraft's day."""
+    """Folder with the archive parts of a spacecraft's day."""
     return folder / f"spacecraft={quote(spacecraft, safe='')}" / f"day={day}"
 
 
 def path_of(folder: Path, manifest: Manifest, part: Part) -> str:
-    """The path of a partition below the folder."""
+    """Path of an archive part below the archive folder."""
     file = day_folder(folder, manifest.spacecraft, manifest.day) / part.file
     return str(file.relative_to(folder))
 
 
 def manifests(folder: Path) -> Iterator[Manifest]:
-    """Every manifest, in order of spacecraft and day."""
+    """All manifests of an archive, in order of spacecraft and day."""
     for file in sorted(folder.glob(f"spacecraft=*/day=*/{MANIFEST}")):
         yield _decoded(file, Manifest)
 
 
 def parts_of(folder: Path) -> Iterator[tuple[str, Manifest, Part]]:
-    """Every partition with its path below the folder and the manifest that names it."""
+    """All parts of an archive, each with its path below the folder and its manifest."""
     for manifest in manifests(folder):
         for part in manifest.parts:
             yield path_of(folder, manifest, part), manifest, part
 
 
 def day_folders(folder: Path) -> list[Path]:
-    """The folders of all spacecraft and days, in this order, also those without a manifest."""
+    """Folders of all spacecraft and days, in this order, including those without a manifest."""
     return sorted(each for each in folder.glob("spacecraft=*/day=*") if each.is_dir())
 
 
 def manifest_of(folder: Path, spacecraft: str, day: str) -> Manifest:
-    """The manifest of a day; one without partitions where there is none."""
+    """Manifest of a spacecraft's day; an empty one if there is none."""
     file = day_folder(folder, spacecraft, day) / MANIFEST
     if not file.exists():
         return Manifest(spacecraft=spacecraft, day=day, parts=[])
@@ -171,13 +171,13 @@ def manifest_of(folder: Path, spacecraft: str, day: str) -> Manifest:
 
 
 def write_manifest(folder: Path, manifest: Manifest) -> None:
-    """Put a manifest in the place of the one before."""
+    """Write the manifest of a spacecraft's day, replacing the previous one."""
     file = day_folder(folder, manifest.spacecraft, manifest.day) / MANIFEST
     write_whole(file, msgspec.json.format(msgspec.json.encode(manifest), indent=1))
 
 
 def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
-    """Take a part out of the manifest, then delete its file."""
+    """Remove an archive part from the manifest, then delete its file."""
     manifest = manifest.without(part)
     write_manifest(folder, manifest)
     (day_folder(folder, manifest.spacecraft, manifest.day) / part.file).unlink()
@@ -185,13 +185,13 @@ def remove_part(folder: Path, manifest: Manifest, part: Part) -> Manifest:
 
 
 def write_partition(file: Path, partition: pa.Table) -> bytes:
-    """Write a partition; returns the bytes that then stand in the file."""
+    """Write an archive part to a file; returns the bytes read back from the file."""
     write_whole(file, encoded(partition))
     return file.read_bytes()
 
 
 def encoded(partition: pa.Table) -> bytes:
-    """The bytes of a partition's file; the same for the same rows and version of pyarrow."""
+    """Encode an archive part as Parquet; equal for the same rows and version of pyarrow."""
     buffer = io.BytesIO()
     parquet.write_table(
         partition,
@@ -200,8 +200,8 @@ def encoded(partition: pa.Table) -> bytes:
         compression_level=COMPRESSION_LEVEL,
         row_group_size=ROWS_TOGETHER,
         write_page_checksum=True,
-        # Of a day of few batches each of these defaults would be a tenth of the file: hardly a
-        # number stands there twice, and Parquet's own types are those of the partition.
+        # For a day of few batches each of these defaults would make a tenth of the file: hardly any
+        # number occurs twice, and Parquet's own types are those of the part.
         use_dictionary=False,
         write_statistics=["time_ns"],
         store_schema=False,
@@ -210,12 +210,12 @@ def encoded(partition: pa.Table) -> bytes:
 
 
 def read_partition(content: bytes) -> pa.Table:
-    """The partition of a file's content."""
+    """Decode an archive part from the bytes of its Parquet file."""
     return parquet.read_table(io.BytesIO(content), page_checksum_verification=True)
 
 
 def whole_content(folder: Path, path: str, sha256: str) -> bytes:
-    """The content of a partition; raises `BadConfiguration` where it is missing or damaged."""
+    """Read the file of an archive part; raises `BadConfiguration` if missing or damaged."""
     try:
         content = (folder / path).read_bytes()
     except OSError as error:
@@ -226,7 +226,7 @@ def whole_content(folder: Path, path: str, sha256: str) -> bytes:
 
 
 def settings_file(folder: Path, digest: str) -> Path:
-    """The file of a mission's settings or of a catalog."""
+    """File with a mission's settings or a catalog, by digest."""
     return folder / "settings" / f"{digest.replace(':', '-')}.json"
 
 
@@ -238,32 +238,32 @@ def write_settings(folder: Path, settings: Settings) -> None:
 
 
 def read_settings(folder: Path, digest: str) -> Settings:
-    """The settings for which a digest stands."""
+    """Read the settings or the catalog with a digest."""
     return _decoded(settings_file(folder, digest), Settings)
 
 
 def write_first(file: Path, content: bytes) -> bytes:
-    """Write a file that appears whole, unless it is there; returns the bytes that are there then.
+    """Write a complete file, unless it exists; returns the bytes in the file afterwards.
 
-    Several processes may write the same file at a time: each writes one of its own beside it, and
-    that of the first stays.
+    Several processes may write the same file at a time: each writes a temporary file beside it, and
+    that of the first is kept.
     """
     if not file.exists():
         beside_as = f".{file.name}.{uuid.uuid4().hex}{UNFINISHED}"
-        # Another process was faster.
+        # Another process has written the file first.
         with suppress(FileExistsError):
             write_whole(file, content, beside_as, _move_unless_there)
     return file.read_bytes()
 
 
 def _move_unless_there(beside: Path, file: Path) -> None:
-    """Rename a file; raises `FileExistsError` where there is one of that name."""
+    """Rename a file; raises `FileExistsError` if the new name exists already."""
     try:
         os.link(beside, file)
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        # Here the last one would stay: between equal machines they are the same.
+        # Without links the last file is kept instead: files of equal machines are identical.
         beside.replace(file)
     else:
         beside.unlink(missing_ok=True)
@@ -275,9 +275,9 @@ def write_whole(
     beside_as: str | None = None,
     move: Callable[[Path, Path], object] = Path.replace,
 ) -> None:
-    """Write a file that appears whole and outlasts a power cut.
+    """Write a file that appears complete and survives a power cut.
 
-    Until then it is written under another name beside it, from which `move` takes it.
+    It is written under another name in the same folder, from which `move` renames it.
     """
     new = [folder for folder in file.parents if not folder.exists()]
     file.parent.mkdir(parents=True, exist_ok=True)
@@ -315,14 +315,14 @@ def _decoded(file: Path, kind: type[T]) -> T:
 
 # The database that an archive belongs to: another one with the same batches could discard parts.
 #
-# A database that was restored from an archive has the batches of the archive's own one.  What its
-# `acquire archive` takes for left over are parts that the other one needs.
+# A database restored from an archive has the batches of the archive's owner.  Its `acquire archive`
+# would take parts for unfinished that the owner needs.
 
 
 def identity_of(connection: Connection) -> str:
-    """A digest that two databases share only if one is a copy of the other.
+    """Digest that two databases share only if one is a copy of the other.
 
-    It is of the settings that the database was first served with, and of when that was, to the
+    It covers the settings that the database was first served with, and the time of that, to the
     microsecond.  Raises `BadConfiguration` for a database that was never served.
     """
     c = mission_uses.c
@@ -337,7 +337,7 @@ def identity_of(connection: Connection) -> str:
 
 
 def claim(connection: Connection, folder: Path) -> str:
-    """Note a database as the owner of an archive that has none; returns its identity.
+    """Note a database as the owner of an archive without one; returns its identity.
 
     The folder must be locked.  Raises `BadConfiguration` where another database owns it.
     """

@@ -1,4 +1,4 @@
-"""Reads archived batches for the service: the one place that knows where a batch is."""
+"""Reading of archived batches for the service; only this module knows where a batch is stored."""
 
 import logging
 from collections.abc import Collection, Iterator, Sequence, Set
@@ -25,12 +25,12 @@ log = logging.getLogger(__name__)
 
 
 CACHE_BYTES = 64 << 20
-"""The size of opened results, which are those of a few row groups."""
+"""Size in bytes of the cache of opened row groups."""
 
 
 @dataclass(frozen=True)
 class PlacedPart:
-    """A part that has batches of the database, with the times of its first and last batch."""
+    """Archive part with batches of the database, and the times of its first and last batch."""
 
     id: int
     path: str
@@ -42,7 +42,7 @@ class PlacedPart:
 
 @dataclass(frozen=True)
 class Block:
-    """A row group of a part: the least that is opened."""
+    """Row group of an archive part: the least that is opened."""
 
     part: PlacedPart
     group: int
@@ -51,10 +51,10 @@ class Block:
 
 
 class Archive:
-    """The folder with the parts of a database; None: none is set.
+    """Reader of the archive folder of a database; the folder is None if none is configured.
 
-    Every method raises `Busy` where a file cannot be read, and `NotAvailable` without the
-    folder, or without the package that reads it.
+    Every method raises `Busy` where a file cannot be read, and `NotAvailable` without the folder,
+    or without the package that reads it.
     """
 
     def __init__(self, folder: Path | None) -> None:
@@ -62,7 +62,7 @@ class Archive:
         self.cache = LruCache(CACHE_BYTES)
 
     def stored_answers(self, connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
-        """The answers of recorded or archived results, byte for byte; of others there is none."""
+        """Answers of recorded or archived results by id, byte for byte; without unknown ids."""
         found = stored_answers(connection, ids)
         if len(found) == len(ids):
             return found
@@ -75,7 +75,7 @@ class Archive:
     def answers_or_faults(
         self, connection: Connection, ids: Set[str]
     ) -> dict[str, bytes | AcquisitionError]:
-        """`stored_answers`, or for archived results what keeps them from being read."""
+        """Answers of recorded or archived results by id, or the error that prevents reading one."""
         found: dict[str, bytes | AcquisitionError] = {**stored_answers(connection, ids)}
         if archived := ids - found.keys():
             try:
@@ -85,9 +85,9 @@ class Archive:
         return found
 
     def read(self, path: str, columns: Sequence[str] | None, filters: Any) -> "pa.Table":
-        """Some columns, or all, of those results of a part that pass pyarrow's `filters`.
+        """Read columns, or all, of the results in an archive part that pass pyarrow's `filters`.
 
-        A column that the version that wrote the part did not have is left out.
+        Columns unknown to the version that wrote the part are left out.
         """
         with self._readable(path) as file:
             from pyarrow import parquet
@@ -104,7 +104,7 @@ class Archive:
             )
 
     def batch(self, connection: Connection, id: str) -> "Opened | None":
-        """The batch of an archived result with all its results; None: it is not archived."""
+        """Open the batch of an archived result with all its results; None if it is not archived."""
         if (
             connection.scalar(select(tables.results.c.id).where(tables.results.c.id == id))
             is not None
@@ -132,7 +132,7 @@ class Archive:
         return self.cache.get((path, batch_id), build)[0]
 
     def blocks(self, part: PlacedPart) -> list[Block]:
-        """The row groups of a part, in order of time."""
+        """Row groups of an archive part, in order of time."""
         with self._readable(part.path) as file:
             from pyarrow import parquet
 
@@ -144,7 +144,7 @@ class Archive:
         return [Block(part, k, each.min, each.max) for k, each in enumerate(times)]
 
     def open(self, block: Block, needs: Collection[str]) -> "Opened":
-        """The results of a row group, with what is needed of them; see `rows.columns_of`."""
+        """Open the results of a row group with the columns in `needs`; see `rows.columns_of`."""
 
         def build() -> "Opened":
             from service.storage.archive.rows import Opened, columns_of
@@ -164,7 +164,7 @@ class Archive:
     def current_ids(
         self, part: PlacedPart, start_ns: int | None, end_ns: int | None
     ) -> "pa.ChunkedArray":
-        """The ids of the current results of a part from a time to before another, in order."""
+        """Ids of an archive part's current results from a time to before another, in order."""
         filters: list[tuple[str, str, object]] = [("current", "=", True)]
         filters += [("time_ns", ">=", start_ns)] if start_ns is not None else []
         filters += [("time_ns", "<", end_ns)] if end_ns is not None else []
@@ -172,12 +172,13 @@ class Archive:
 
     @contextmanager
     def _readable(self, path: str) -> Iterator[Path]:
-        """The file of a part; whatever is wrong with it is told as what to do."""
+        """Provide the file of an archive part; errors are raised with the remedy."""
         require_extra("tables", "pyarrow", "archive", path)
         import pyarrow as pa
 
         if self.folder is None:
-            # A client that tries again changes nothing: only a start with the setting does.
+            # A new attempt of the client would not help, only a start of the service with the
+            # setting.
             message = (
                 "is archived, and no folder of an archive is set: set ACQUIRE_ARCHIVE_FOLDER to "
                 "the folder that `acquire archive` wrote; a service must be started again with it"
@@ -200,7 +201,7 @@ def parts_between(
     first_ns: int | None,
     end_ns: int | None,
 ) -> list[PlacedPart]:
-    """The parts that reach into a period, of every spacecraft or run where none is named."""
+    """Archive parts that overlap a period; for None, those of every spacecraft or run."""
     c = tables.archived_parts.c
     chosen: list[ColumnElement[bool]] = []
     if spacecraft is not None:
@@ -218,9 +219,9 @@ def parts_between(
 def parts_with(
     connection: Connection, spacecraft: str | None, run: str | None, batch: str
 ) -> set[int]:
-    """The ids of the parts that have a batch of this name."""
+    """Ids of the archive parts that have a batch with this name."""
     c = tables.archived_batches.c
-    # The unique index begins with spacecraft and run: neither is left open.
+    # The unique index begins with spacecraft and run: give both.
     in_runs = select(tables.runs.c.name) if run is None else [run]
     query = select(c.part_id).where(
         c.spacecraft == spacecraft, c.run.in_(in_runs), c.batch == batch
@@ -229,13 +230,13 @@ def parts_with(
 
 
 def batch_of(connection: Connection, id: str) -> str:
-    """The id of the batch of an archived result."""
+    """Id of the batch that an archived result belongs to."""
     what_ifs = tables.archived_what_ifs.c
     return connection.scalar(select(what_ifs.batch_id).where(what_ifs.id == id)) or id
 
 
 def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]:
-    """The ids of archived results by the path of their part."""
+    """Group ids of archived results by the path of their archive part."""
     batches, what_ifs = tables.archived_batches.c, tables.archived_what_ifs.c
     path, has_part = tables.archived_parts.c.path, tables.archived_parts.c.id == batches.part_id
     first = select(batches.id, path).where(has_part, batches.id.in_(ids))
@@ -248,11 +249,11 @@ def places(connection: Connection, ids: Collection[str]) -> dict[str, list[str]]
 
 
 def holds_any(connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc) -> bool:
-    """True if a part reaches into a period, so that batches of it may be archived."""
+    """True if an archive part overlaps a period, so that some of its batches may be archived."""
     return bool(parts_between(connection, spacecraft, run, start.tai_ns, end.tai_ns))
 
 
 def archived_paths(connection: Connection) -> dict[str, str]:
-    """The hashes of the parts that a database has batches in, by path."""
+    """SHA-256 of all archive parts with batches of a database, by path."""
     query = select(tables.archived_parts.c.path, tables.archived_parts.c.sha256)
     return dict(map(tuple, connection.execute(query)))

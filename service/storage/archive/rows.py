@@ -1,7 +1,7 @@
-"""All that the database keeps of some batches, as Arrow tables in one fixed order.
+"""Rows of batches as Arrow tables in a fixed order, with everything that the database keeps.
 
-What is read here, put into a partition and inserted again is the same row by row, byte for
-byte: archiving, verifying, restoring and the pages that read the archive share these functions.
+Rows that are read, written to a part and inserted again are identical, byte for byte: archiving,
+verifying, restoring and the pages that show the archive share these functions.
 
 Some archived results are also opened as a database in memory, which the queries of the record read
 unchanged.
@@ -30,7 +30,7 @@ from service.storage.sql.statements import insert_all, portions
 from service.storage.sql.tables import batches, missions, results, runs
 
 Rows = dict[str, pa.Table]
-"""Tables by the name of the SQL table: batches in order of time, the rest in their order."""
+"""Arrow tables by the name of the SQL table: batches in order of time, the rest in their order."""
 Columns = dict[str, pa.ChunkedArray]
 
 CHILDREN = {
@@ -40,14 +40,14 @@ CHILDREN = {
     "frame": (tables.frames, "batch_id", ()),
     "keys": (tables.idempotency_keys, "result_id", ("token_id", "key")),
 }
-"""A partition's list columns: the table, what names its result, and its order within one.
+"""List columns of a part: the SQL table, its column with the result's id, and its order.
 
 The first result of a batch has the batch's id, and so the rows of a batch are those of a result.
 """
 OF_BATCHES = ("batch", "time", "received", "fingerprint", "input")
-"""The columns that results do not have."""
+"""Columns of batches that results do not have."""
 
-# Of two that fit, the narrower stands first; Text is a String.
+# Where two types fit, the narrower stands first; Text is a String.
 _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
     (sa.BigInteger, pa.int64()),
     (sa.SmallInteger, pa.int16()),
@@ -61,7 +61,7 @@ _TYPES: Sequence[tuple[type[TypeEngine[Any]], pa.DataType]] = (
 
 
 def schema_of(table: sa.Table) -> pa.Schema:
-    """The Arrow schema of an SQL table."""
+    """Arrow schema that matches an SQL table."""
     return pa.schema(
         [
             (each.name, next(arrow for kind, arrow in _TYPES if isinstance(each.type, kind)))
@@ -71,7 +71,7 @@ def schema_of(table: sa.Table) -> pa.Schema:
 
 
 def read_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> Rows:
-    """All rows of the batches with the ids; unknown ids are skipped."""
+    """Read all rows of batches by their ids; unknown ids are skipped."""
     found = _ordered(_read(connection, tables.batches, "id", batch_ids), ("time_ns", "id"))
     made = _read(connection, tables.results, "batch_id", batch_ids)
     made = _in_order_of(made, "batch_id", found["id"], ("id",))
@@ -86,10 +86,10 @@ def read_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> Rows:
 
 
 def lock_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> None:
-    """Let no other process add anything to these batches, or change it, before the commit.
+    """Lock batches, so that until the commit no other process changes or extends them.
 
-    What others write refers to a result or to a batch.  Results come first, as where one is
-    adopted.
+    Rows of other processes refer to a result or to a batch.  Results are locked first, as where one
+    is adopted.
     """
     for table, owner in (
         (tables.results, tables.results.c.batch_id),
@@ -101,9 +101,9 @@ def lock_rows(connection: sa.Connection, batch_ids: Sequence[str]) -> None:
 
 
 def insert_rows(connection: sa.Connection, rows: Rows) -> None:
-    """Insert all rows, what others refer to first."""
+    """Insert all rows of batches, referenced rows first."""
     made = rows["results"]
-    # A what-if refers to the result that it began with, which has a lower id.
+    # A what-if refers to the result that it started from, which has a lower id.
     made = made.sort_by("id")
     for table, read in ((tables.batches, rows["batches"]), (tables.results, made)):
         insert_all(connection, table, read.to_pylist())
@@ -112,7 +112,7 @@ def insert_rows(connection: sa.Connection, rows: Rows) -> None:
 
 
 def to_partition(rows: Rows) -> pa.Table:
-    """The rows as one table: one row per result with its batch, and lists of what belongs to it."""
+    """Combine rows into one table: each result with its batch, and lists of its children."""
     made = rows["results"]
     place = pc.index_in(made["batch_id"], value_set=rows["batches"]["id"])
     columns = {name: made[name] for name in made.column_names}
@@ -130,7 +130,7 @@ def to_partition(rows: Rows) -> pa.Table:
 
 
 def _without_copies(columns: Columns) -> Columns:
-    """The columns with nulls where a value follows from another one: a tenth of the space."""
+    """Replace values that follow from other columns by null, which saves a tenth of the space."""
     for name, copy in _copies(columns).items():
         own = columns[name]
         columns[name] = pc.if_else(pc.equal(own, copy), pa.scalar(None, own.type), own)
@@ -138,7 +138,7 @@ def _without_copies(columns: Columns) -> Columns:
 
 
 def _copies(columns: Columns | pa.Table) -> Columns:
-    """The values that mostly follow from those of other columns, by the name of their column."""
+    """Predict values that usually follow from other columns, by the predicted column."""
     digests = [hashlib.sha256(each.encode()).hexdigest() for each in columns["input"].to_pylist()]
     return {
         "batch_id": columns["id"],
@@ -148,12 +148,12 @@ def _copies(columns: Columns | pa.Table) -> Columns:
 
 
 def read_part(folder: Path, path: str, sha256: str) -> Rows:
-    """The rows of a part; raises `BadConfiguration` where its file is missing or damaged."""
+    """Read the rows of an archive part; raises `BadConfiguration` if missing or damaged."""
     return from_partition(read_partition(whole_content(folder, path, sha256)))
 
 
 def from_partition(partition: pa.Table) -> Rows:
-    """The rows that were put into a partition; columns of a later version than its are null."""
+    """Extract the rows of batches from an archive part; columns of a later version are null."""
     for name, copy in _copies(partition).items():
         place = partition.column_names.index(name)
         partition = partition.set_column(place, name, pc.coalesce(partition[name], copy))
@@ -169,14 +169,14 @@ def from_partition(partition: pa.Table) -> Rows:
 
 
 def children_of(partition: pa.Table, name: str) -> pa.Table:
-    """The rows in a list column of a partition, each with the id of its result."""
+    """Rows in a list column of an archive part, each with the id of its result."""
     lists, owner = partition[name], CHILDREN[name][1]
     parts = pa.Table.from_struct_array(_whole(pc.list_flatten(lists)))
     return parts.append_column(owner, partition["id"].take(pc.list_parent_indices(lists)))
 
 
 def _selected(read: pa.Table, table: sa.Table) -> pa.Table:
-    """The columns of an SQL table, in its order; null where they were not written."""
+    """Columns of an SQL table from an archive part, in order; null where not written."""
     for field in schema_of(table):
         if field.name not in read.column_names:
             read = read.append_column(field, pa.nulls(len(read), field.type))
@@ -184,9 +184,9 @@ def _selected(read: pa.Table, table: sa.Table) -> pa.Table:
 
 
 def differing(one: Rows, other: Rows) -> str | None:
-    """The name of a table whose rows differ in any bit; None: there is none.
+    """Name of a table whose rows differ in any bit between two sets; None if all are equal.
 
-    Zero and minus zero are different numbers here, and any number that is none equals another.
+    Zero and minus zero are different numbers here, and all NaN values are equal.
     """
     for name in one.keys() | other.keys():
         if not _as_bits(one[name]).equals(_as_bits(other[name])):
@@ -218,7 +218,7 @@ def _read(connection: sa.Connection, table: sa.Table, owner: str, ids: Sequence[
 def _in_order_of(
     table: pa.Table, owner: str, ids: pa.ChunkedArray, within: Sequence[str]
 ) -> pa.Table:
-    """The rows in the order in which their owner's id stands among the ids."""
+    """Sort rows by the position of their owner's id in a list of ids."""
     place = pc.index_in(table[owner], value_set=ids)
     return _ordered(table.append_column("", place), ("", *within)).drop_columns([""])
 
@@ -228,29 +228,29 @@ def _ordered(table: pa.Table, names: Sequence[str]) -> pa.Table:
 
 
 def _whole(column: pa.ChunkedArray | pa.Array) -> pa.Array:
-    """A column in one piece."""
+    """Merge the chunks of an Arrow column into one array."""
     return column.combine_chunks() if isinstance(column, pa.ChunkedArray) else column
 
 
 LARGE = ("input", "answer")
-"""The text columns of a partition that are read only where they are wanted."""
+"""Long text columns of an archive part, read only on request."""
 WHOLE = frozenset((*LARGE, *(name for name in CHILDREN if name != "keys")))
-"""All that pages and products read of a batch."""
+"""Columns and lists of an archive part that pages and products may request."""
 
 _CHILD_TABLES = [table for table, _, _ in CHILDREN.values()]
 _TABLES = (runs, missions, batches, results, *_CHILD_TABLES)
 
 
 def columns_of(needs: Collection[str]) -> list[str]:
-    """The columns of a partition to read for `needs`, which are names of `WHOLE`."""
+    """Columns of an archive part to read for `needs`, which are names in `WHOLE`."""
     names = [*(each.name for each in results.columns), *OF_BATCHES]
     return [*(name for name in names if name not in LARGE), *sorted(needs)]
 
 
 class Opened:
-    """A database in memory with some results and what belongs to them, for one thread at a time.
+    """Database in memory with archived results and their rows, for one thread at a time.
 
-    Columns that were not read from the file are empty there: null, an empty text, no stars.
+    Columns that were not read from the file are empty: null, an empty text, no stars.
     """
 
     def __init__(self) -> None:
@@ -261,12 +261,12 @@ class Opened:
         with self._engine.begin() as connection:
             for table in _TABLES:
                 connection.execute(CreateTable(table))
-        # Where nothing refers to it any more, its memory is given back.
+        # Its memory is freed when the last reference is gone.
         weakref.finalize(self, self._engine.dispose)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of its pages."""
+        """Memory used by the database in bytes."""
         with self.reading() as connection:
             pages, size = (
                 connection.exec_driver_sql(f"PRAGMA {name}").scalar_one()
@@ -276,14 +276,15 @@ class Opened:
 
     @contextmanager
     def reading(self) -> Iterator[Connection]:
-        """The connection to it."""
+        """Provide the connection to the database in memory."""
         with self._lock, self._engine.connect() as connection:
             yield connection
 
     def add_indexes(self) -> None:
-        """Give it the record's indexes: without them a join of thousands of results takes minutes.
+        """Create the record's indexes in the database in memory.
 
-        A page of a list is read faster without.
+        Without them a join of thousands of results takes minutes; a page of a list is faster
+        without.
         """
         with self._engine.begin() as connection:
             for table in _TABLES:
@@ -291,10 +292,10 @@ class Opened:
                     connection.execute(CreateIndex(index))
 
     def add_partition(self, partition: pa.Table) -> None:
-        """Add results of a part, with the columns of it that were read."""
+        """Add results of an archive part, with those of its columns that were read."""
         columns = {name: partition[name] for name in partition.column_names}
         columns["batch_id"] = pc.coalesce(columns["batch_id"], columns["id"])
-        # Of a batch whose first result is in another row group, a later one has all.
+        # The first result of a batch may be in another row group: fall back to a later one.
         of_batches = {each.name: columns.get(each.name) for each in batches.columns}
         of_batches["id"] = columns["batch_id"]
         of_batches["received"] = pc.coalesce(columns["received"], columns["created"])
@@ -313,7 +314,7 @@ class Opened:
                 _insert(connection, table, values)
 
     def add_rows(self, rows: Rows) -> None:
-        """Add rows of the record."""
+        """Add rows of the recorded database."""
         with self._engine.begin() as connection:
             for table in (batches, results, *_CHILD_TABLES):
                 read = rows[table.name]
@@ -321,7 +322,7 @@ class Opened:
                 _insert(connection, table, columns)
 
     def add_settings(self, found: Iterable[Settings]) -> None:
-        """Add settings of missions."""
+        """Add rows of missions' settings."""
         with self._engine.begin() as connection:
             for each in found:
                 connection.execute(missions.insert().prefix_with("OR IGNORE"), each.row)

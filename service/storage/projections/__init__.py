@@ -1,1 +1,1 @@
-"""Projections: what follows from the record of batches and results, made after the answer."""
+"""Projections: data derived from recorded batches and results after the answer is sent."""

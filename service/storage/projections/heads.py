@@ -1,8 +1,7 @@
-"""Heads of the record: after a turn, the projector binds what is new into the chain.
+"""Heads of the record: statements by which the projector adds new rows to the chain.
 
-A head is made once a minute, or as soon as there are many new leaves, in a transaction of its
-own.  Results that have no leaf yet, of a database of an earlier version, get theirs here,
-some at a time.
+A head is made once a minute, or as soon as there are many new leaves, in a transaction of its own.
+Results recorded by an earlier version, which have no leaf yet, get one here, some at a time.
 """
 
 import logging
@@ -41,37 +40,37 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 EVERY_S = 60.0
-"""The longest time that a recorded fact is in no head while the service runs."""
+"""Longest time in seconds until a recorded fact is covered by a head, while the service runs."""
 MOST_LEAVES = 2_000
-"""The leaves of one head, about: more are bound by the next one, in another transaction."""
+"""Approximate number of leaves of one head; further ones go to the next, in a new transaction."""
 ADOPTED_AT_ONCE = 500
-"""The results of earlier versions that get a leaf in one transaction."""
+"""Results of earlier versions that get a leaf in one transaction."""
 _HOUR = len("2026-03-01T12")
-"""The first head of an hour is an event, so that receivers elsewhere get one each hour."""
+"""Length of a time's text up to its hour; the first head of each hour is sent as an event."""
 LATE_S = 3_600.0
-"""How long a transaction may take that adds a row to a bound table."""
+"""Longest duration in seconds of a transaction that adds a row to a bound table."""
 
 Sign = Callable[[bytes], str]
 
 
 @dataclass
 class HeadMaker:
-    """Makes the heads of one database; one process at a time does, in its projector's turns."""
+    """Maker of a database's heads; runs in one process at a time, in its projector's turns."""
 
     sign: Sign | None = None
     _due_s: float = 0.0
     _bound: int = 0
-    """The position up to which results are bound, as far as this process knows."""
+    """Position up to which results are bound into the chain, as far as this process knows."""
     _seen: dict[Table, tuple[float, object]] = field(default_factory=dict)
-    """The greatest key of a table whose older rows are all facts, and since when that is known."""
+    """Greatest key of each table whose older rows are all facts, with the time of that finding."""
     _seen_now: dict[Table, tuple[float, object]] = field(default_factory=dict)
 
     def is_due(self, position: int) -> bool:
-        """True if it is time for another head, at a position of the projector."""
+        """True if another head is due at the projector's position."""
         return time.monotonic() >= self._due_s or position - self._bound >= MOST_LEAVES
 
     def make(self, connection: Connection, position: int) -> Statement | None:
-        """Bind what is new, up to the projector's position; None where nothing is.
+        """Make a head of everything new up to the projector's position; None if nothing is new.
 
         The caller holds the lock on the position.
         """
@@ -131,12 +130,12 @@ class HeadMaker:
             events.add_event(connection, "head", head)
 
     def _find_facts(self, connection: Connection) -> None:
-        """Add a fact for each row of the bound tables that is new, or closed since."""
+        """Add a fact to the chain for each new or newly closed row of the bound tables."""
         now = time.monotonic()
         for table, bound in chain.bound_tables().items():
             chosen = self._not_seen(table) if bound.rises and not bound.closed_by else None
             if "row_digest" in table.c:
-                # Of an earlier version: it is given a digest first.
+                # A row of an earlier version gets its digest first.
                 is_digested = table.c.row_digest.is_not(None)
                 chosen = is_digested if chosen is None else and_(chosen, is_digested)
             found = _without_fact(connection, table, table.name, chosen)
@@ -165,19 +164,19 @@ NOTHING = Statement(number=0, previous="", made="", first=0, last=0, counts={}, 
 
 
 def last_head(connection: Connection) -> Statement:
-    """The statement of the last head; `NOTHING` without one."""
+    """Statement of the newest head of the record; `NOTHING` without one."""
     newest = newest_head(connection)
     return NOTHING if newest is None else msgspec.json.decode(newest.statement, type=Statement)
 
 
 def newest_head(connection: Connection) -> RecordHead | None:
-    """The last head as it is given away; None where none was made yet."""
+    """Newest head of the record, in its published form; None if there is none."""
     query = select(record_heads).order_by(record_heads.c.number.desc()).limit(1)
     return next((RecordHead(**row) for row in rows_of(connection, query)), None)
 
 
 def require_head(connection: Connection) -> RecordHead:
-    """The last head; raises `NotFound` where none was made yet."""
+    """Newest head of the record; raises `NotFound` if there is none."""
     if (newest := newest_head(connection)) is None:
         raise NotFound("the record has no head yet: the service makes one each minute")
     return newest
@@ -186,7 +185,7 @@ def require_head(connection: Connection) -> RecordHead:
 def new_leaves(
     connection: Connection, before: Statement, position: int, most: int
 ) -> list[tuple[int, bytes]]:
-    """Places and leaves after a head in the order of the chain: those of before the chain last."""
+    """Leaves after a head with their places, in the chain's order; pre-chain ones last."""
     place = record_leaves.c.seq
     query = select(place, record_leaves.c.leaf).where(place > before.last, place <= position)
     found = [tuple(row) for row in connection.execute(query.order_by(place).limit(most))]
@@ -198,13 +197,13 @@ def new_leaves(
 
 
 def leaves_of(rows: Sequence[tuple[int, bytes]], facts: Sequence[Row]) -> list[bytes]:
-    """The leaves of a head's tree: results, then facts."""
+    """Leaves of a head's tree: those of results, then those of facts."""
     of_facts = (chain.leaf_of_fact(each["kind"], each["key"], each["sha256"]) for each in facts)
     return [*(leaf for _, leaf in rows), *of_facts]
 
 
 def contents(connection: Connection, made: Sequence[Row]) -> Iterator[tuple[Row, bytes]]:
-    """Rows of `results`, each with the encoding of all rows of the result."""
+    """Pair each row of `results` with the encoding of all rows of that result."""
     ids = [row["id"] for row in made]
     stars = owned_rows(connection, star_results, "result_id", ids)
     others = [
@@ -217,8 +216,8 @@ def contents(connection: Connection, made: Sequence[Row]) -> Iterator[tuple[Row,
 
 
 def _adopt(connection: Connection) -> int:
-    """Give some results that have no place one before all others, and their leaves; how many."""
-    # Those without a digest are given one first.
+    """Give some results without a place in the record a negative place and a leaf; counts them."""
+    # Results without a digest get one first.
     chosen = select(results).where(results.c.seq == 0, results.c.digest.is_not(None))
     made = rows_of(connection, chosen.limit(ADOPTED_AT_ONCE))
     if not made:
@@ -237,9 +236,9 @@ def _adopt(connection: Connection) -> int:
 
 
 def _give_leaves(connection: Connection, last: int, position: int) -> int:
-    """Give some results after a place that an earlier version recorded their leaves.
+    """Add missing leaves of some results that an earlier version recorded after a place.
 
-    The place up to which every result has one, at most the position.
+    Returns the place up to which every result has a leaf, at most the position.
     """
     known = select(record_leaves.c.seq).where(record_leaves.c.seq == results.c.seq).exists()
     place = results.c.seq

@@ -1,12 +1,12 @@
-"""The projector: brings the projections up to date with the record, after the answers.
+"""Projector: brings the projections up to date with the record, after the answers.
 
     record ──► projector ──► rollups, events, features      one transaction, with its position
 
-It takes results in the order of the record, many at a time, and notes how far it came in the
-same transaction: after a crash it goes on from there, and no result is projected twice or not
-at all.  Of the services on one database the one that holds the lock projects what all of them
-record (`ProjectorLock`).  Commands may project beside it; the row with the position is locked,
-so that they take turns.
+It takes results in the order of the record, many at a time, and notes its position in the same
+transaction: after a crash it continues from there, and every result is projected exactly once.
+Among services on one database, the one that holds the lock projects the results of all
+(`ProjectorLock`).  Commands may project beside it; the row with the position is locked, so that
+they take turns.
 """
 
 import logging
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 
 def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
-    """Add one event for the new batches of each spacecraft and run, and one for each new state."""
+    """Add one event for new batches of a spacecraft's run, and one for each change of state."""
     of_owner: dict[tuple[str, str], list[RecordedResult]] = {}
     for each in new:
         if each.is_first:
@@ -62,10 +62,10 @@ def _add_events(connection: Connection, new: Sequence[RecordedResult]) -> None:
 def _note_states(
     connection: Connection, spacecraft: str, run: str, new: Sequence[RecordedResult]
 ) -> None:
-    """Add an event for each new batch of a spacecraft and a run that changes the state.
+    """Add an event for each new batch that changes the tracking state of its spacecraft and run.
 
-    The state is that of the latest batch, where that asks for the last attitude.  A late batch
-    changes none, and neither does a live one that is dated ahead.
+    The state is that of the latest batch that asks for the last attitude.  A late batch changes
+    none, and neither does a live one that is dated ahead.
     """
     states = {each.seq: state_in(unpack(each.result["answer"])) for each in new}
     tracked = [each for each in new if states[each.seq] is not None and not each.is_ahead]
@@ -99,41 +99,41 @@ PROJECTIONS: Sequence[Callable[[Connection, Sequence[RecordedResult]], None]] = 
     rollups.apply,
     _add_events,
 )
-"""Each adds new results, in the order of the record, to tables that it alone fills.
+"""Functions that add new results, in the record's order, to tables that no other one fills.
 
 Those of features follow.
 """
 MOST_AT_ONCE = 500
 LONGEST_S = 0.05
-"""The duration of one transaction; the next one takes fewer results where this one took longer."""
+"""Target duration of a transaction in seconds; after a longer one the next has fewer results."""
 EVERY_S = 0.2
-"""The time between the beginnings of two turns, unless a reader waits."""
+"""Seconds between the starts of two turns of the projector, unless a reader waits."""
 GAP_S = 0.01
-"""The pause before a gap in the record is looked at again."""
+"""Seconds until the projector checks a gap in the record again."""
 RETRY_S = 1.0
-"""The pause after a turn that failed."""
+"""Seconds until the projector tries again after a failed turn."""
 HOURS_AT_ONCE = 24
-"""The hours of trends that are counted anew in one transaction."""
+"""Number of hours of trends recounted in one transaction."""
 CLOSE_S = 5.0
-"""The longest time that is spent on what is left when the service stops."""
+"""Longest time in seconds for the remaining results when the service stops."""
 MOST_LAST_HEADS = 10
-"""The most heads of the record that are made then."""
+"""Largest number of heads of the record made when the service stops."""
 
 
 @dataclass(frozen=True)
 class _Step:
-    """The outcome of a transaction of the projector."""
+    """Outcome of one transaction of the projector."""
 
     position: int
     is_all: bool
     """True if the transaction projected every result that it could see."""
     is_blocked: bool = False
-    """True if the next result is one after a gap that may still be filled."""
+    """True if the next result follows a gap that may still be filled."""
 
 
 @dataclass(frozen=True)
 class _Gap:
-    """Results that were missing between two places, and the number of the next transaction then."""
+    """Gap between two places of the record, with the number of the next transaction then."""
 
     before: int
     after: int
@@ -141,10 +141,10 @@ class _Gap:
 
 
 class Projector:
-    """A thread that projects what the writer records, some of it in each turn."""
+    """Thread that projects recorded results, some in each turn."""
 
     def __init__(self, store: Store, head_maker: HeadMaker | None = None) -> None:
-        """Readers of the store wait for the projections once the thread is started.
+        """Prepare the projector; once it is started, readers of the store wait for the projections.
 
         Without `head_maker` no heads of the record are made.
         """
@@ -159,13 +159,13 @@ class Projector:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Keep the projections up from now on."""
+        """Start the projector's thread."""
         self._progress.begin()
         self._thread = threading.Thread(target=self._run, name="projector", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Project what is recorded, and end the thread."""
+        """Project the remaining results, and end the projector's thread."""
         self._closing.set()
         self._progress.end()
         if self._thread is not None:
@@ -179,7 +179,7 @@ class Projector:
             try:
                 step = self._turn()
             except Exception:
-                # Without this thread, nothing would be projected until the service ends.
+                # Without this thread nothing would be projected until the service ends.
                 log.exception("the record could not be projected")
                 self._closing.wait(RETRY_S)
                 continue
@@ -201,7 +201,7 @@ class Projector:
         return is_due and self._progress.is_projecting
 
     def make_heads(self, most: int = sys.maxsize) -> None:
-        """Bind what is projected into heads of the record, at most so many, now."""
+        """Make up to `most` heads of the record from the projected results, now."""
         made: Statement | None = NOTHING
         while self._head_maker is not None and made is not None and most:
             made = self._write(partial(_make_head, self._head_maker))
@@ -211,11 +211,11 @@ class Projector:
         try:
             self.make_heads(most)
         except Exception:
-            # The next head has what this one lacks.
+            # The next head covers the rows that this one lacks.
             log.exception("no head of the record could be made")
 
     def _turn(self) -> _Step | None:
-        """Project some results, where there are any to project, and tell the readers."""
+        """Project some results, if any are left, and report the position to readers."""
         commits = self._store.writer.commits
         step = self._try_step() if self._may_step(commits) else None
         if step is not None:
@@ -224,9 +224,9 @@ class Projector:
         return step
 
     def _may_step(self, commits: int) -> bool:
-        """False if nothing is to be projected, or by another process.
+        """True if this process may have results to project.
 
-        A transaction of the projector locks its row, even where it finds nothing.
+        The check avoids a transaction, which locks the projector's row even if it finds nothing.
         """
         progress = self._progress
         if not progress.is_shared:
@@ -243,11 +243,11 @@ class Projector:
         return False
 
     def _try_step(self) -> _Step | None:
-        """Project some results; None where nothing can be written now."""
+        """Project some results; None if the database cannot be written now."""
         try:
             return self._write(self._step)
         except Exception:
-            # One faulty result must not hold up the others: it is looked for one by one.
+            # One faulty result must not hold up the others: find it one by one.
             if self._most > 1:
                 self._most = 1
                 return _Step(self._position, is_all=False)
@@ -263,16 +263,16 @@ class Projector:
             self._progress.is_projecting = False
             return None
         except Busy:
-            # The writer has logged it.
+            # The writer has logged the error.
             return None
         self._progress.is_projecting = True
         return done
 
     def _step(self, connection: Connection) -> _Step:
-        """Project some results in the writer's transaction."""
+        """Project some results in a transaction of the writer."""
         begun_s, most = time.monotonic(), self._most
         position = lock_position(connection)
-        # Before the results are read: those of older transactions are among them.
+        # Ask before the results are read: they then include those of older transactions.
         oldest = dialect_of(connection).oldest_transaction(connection)
         new = recorded_after(connection, position, most)
         is_all = len(new) < most
@@ -292,11 +292,11 @@ class Projector:
     def _without_gaps(
         self, connection: Connection, position: int, new: list[RecordedResult], oldest: int
     ) -> list[RecordedResult]:
-        """The first of the results before which none is missing that may still be committed.
+        """Results before the first gap in the record that may still be filled by a commit.
 
-        A transaction has its number before it takes places in the record.  Where none of the
-        transactions that there were when a later place was seen is left, the missing ones were
-        rolled back, or deleted.
+        A transaction has its number before it takes places in the record.  Once all transactions
+        have ended that ran when a later place was seen, the missing results were rolled back or
+        deleted.
         """
         for k, each in enumerate(new):
             if each.seq != position + 1 and not self._is_final(
@@ -307,7 +307,7 @@ class Projector:
         return new
 
     def _is_final(self, connection: Connection, before: int, after: int, oldest: int) -> bool:
-        """True if no result between two places will come any more."""
+        """True if no result can appear between two places of the record any more."""
         gap = self._gap
         if gap is None or gap.before != before or gap.after < after:
             self._gap = _Gap(before, after, next_transaction(connection))
@@ -315,7 +315,7 @@ class Projector:
         return oldest >= gap.next
 
     def _step_around(self, connection: Connection) -> _Step:
-        """Project one result by those projections that can, and move on."""
+        """Project one result with those projections that accept it, and advance the position."""
         position = lock_position(connection)
         for each in recorded_after(connection, position, 1):
             position = each.seq
@@ -328,7 +328,7 @@ class Projector:
 def _applied_or_left_out(
     connection: Connection, apply: Callable[..., None], result: RecordedResult
 ) -> None:
-    """Apply a projection to a result, or nothing of it; raises trouble of the database itself."""
+    """Apply a projection to a result, undone if it fails; raises faults of the database itself."""
     noted = events.noted(connection)
     execute(connection, "SAVEPOINT projection")
     try:
@@ -348,7 +348,7 @@ def _make_head(maker: HeadMaker, connection: Connection) -> Statement | None:
 
 @contextmanager
 def projected(store: Store) -> Iterator[None]:
-    """Project all that is recorded, and what the block records or deletes: for commands."""
+    """Project everything recorded before and within a `with` block; for commands."""
     projector = Projector(store)
     projector.start()
     try:
@@ -359,9 +359,9 @@ def projected(store: Store) -> Iterator[None]:
 
 
 def rebuild_trends(store: Store, step: Callable[[int, int], object]) -> int:
-    """Count all trends anew, some hours at a time; how many hours there are.
+    """Recount all trends, some hours at a time; returns the number of hours.
 
-    `step` is called with the hours done and all hours.  Interrupted, it has left right trends.
+    `step` is called with the hours done and all hours.  Interrupted, it leaves correct trends.
     """
     with store.reading_record() as connection:
         hours = sorted(rollups.hours_of_all(connection))

@@ -1,11 +1,9 @@
 """Trends: sums and extremes per spacecraft, run and UTC hour or day, by the time of the batch.
 
-Of spacecraft with several trackers also per tracker.
+Spacecraft with several trackers have them per tracker as well.
 
 They always equal a count of the current results whose `seq` is at most the position of the
-projector.
-
-Recorded results come as all projections take them, in the order of the record.
+projector, which passes new results in the order of the record.
 """
 
 import json
@@ -66,15 +64,15 @@ _TRACKERS = prepared(
 
 
 class RecordedResult(Struct, eq=False, dict=True):
-    """A result with its batch, and what each tracker contributed where there are several."""
+    """A result with its batch, and with each tracker's contribution where there are several."""
 
     result: Row
-    """The columns of `results`, and the name, time and moment of receipt of the batch."""
+    """Columns of `results`, with the batch's name, time and moment of receipt."""
     trackers: Sequence[Row] = ()
 
     @property
     def seq(self) -> int:
-        """The result's place in the record."""
+        """Place of the result in the record."""
         return int(self.result["seq"])
 
     @property
@@ -84,29 +82,29 @@ class RecordedResult(Struct, eq=False, dict=True):
 
     @property
     def owner(self) -> tuple[str, str]:
-        """(run, spacecraft)."""
+        """Run and spacecraft of the result."""
         return self.result["run"], self.result["spacecraft"]
 
     @property
     def hour(self) -> tuple[str, str, int]:
-        """(spacecraft, run, number of the UTC hour of the batch)."""
+        """Hour of the batch: (spacecraft, run, number of the UTC hour)."""
         row = self.result
         return row["spacecraft"], row["run"], recorded_utc(row["time"]).bucket(HOUR_S)
 
     @cached_property
     def received_ns(self) -> int:
-        """When the batch came, as `Utc.tai_ns`."""
+        """Time of the batch's receipt, as `Utc.tai_ns`."""
         return recorded_utc(self.result["received"]).tai_ns
 
     @property
     def is_ahead(self) -> bool:
-        """True for a live batch dated so far ahead that its time cannot be believed."""
+        """True for a live batch dated too far in the future for its time to be trusted."""
         row = self.result
         return bool(row["run"] == LIVE and row["time_ns"] > self.received_ns + AHEAD_NS)
 
 
 def recorded_after(connection: Connection, position: int, count: int) -> list[RecordedResult]:
-    """The results after a place in the record, in order, at most so many."""
+    """Results after a place in the record, in order, at most `count`."""
     rows = _AFTER.read(connection, {"position": position, "count": count})
     if not rows:
         return []
@@ -117,22 +115,22 @@ def recorded_after(connection: Connection, position: int, count: int) -> list[Re
 
 
 BucketKey = tuple[str, str, int]
-"""(spacecraft, run, bucket)."""
+"""Key of a rollup: (spacecraft, run, bucket)."""
 Rollups = dict[Any, Row]
-"""Rows by (spacecraft, run, tracker, bucket), or by a part of it."""
+"""Rollup rows by (spacecraft, run, tracker, bucket), or by a part of it."""
 WHOLE = ""
-"""The tracker that stands for the spacecraft as a whole."""
+"""Tracker name that stands for the spacecraft as a whole."""
 _KEY = ("spacecraft", "run", "bucket")
 _TRACKER_KEY = ("spacecraft", "run", "tracker", "bucket")
 _NOTHING: Row = dict.fromkeys((*COUNTS, *tables.SUMS), 0) | dict.fromkeys(
     (*tables.MINIMA, *tables.MAXIMA)
 )
 ROWS_AT_ONCE = 500
-"""Rows of results, with their answers, that a recount holds."""
+"""Number of result rows, with their answers, that a recount holds in memory."""
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
-    """Add new batches to their hours and days, and count anew the hours of adopted what-ifs.
+    """Add new batches to the trends of their hours and days; recount the hours of adopted what-ifs.
 
     A batch whose first result is superseded already comes with the what-if that is current.
     """
@@ -143,9 +141,9 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
 
 
 def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
-    """Add current results, or rows of `tracker_values`, to the hours and days of their owners.
+    """Add current results, or rows of `tracker_values`, to the trends of their hours and days.
 
-    Each comes with its spacecraft, run and hour.
+    Each row comes with its spacecraft, run and hour.
     """
     of_hour: dict[tuple[str, str, str, int], list[Row]] = {}
     for (spacecraft, run, hour), row in new:
@@ -156,7 +154,7 @@ def add(connection: Connection, new: Iterable[tuple[BucketKey, Row]]) -> None:
 def add_shares(
     connection: Connection, spacecraft: str, run: str, of_hour: Mapping[int, Mapping[str, Row]]
 ) -> None:
-    """Add rollups that are there already, by hour and by tracker; `WHOLE` is the spacecraft's."""
+    """Add existing rollups to the trends, by hour and tracker; `WHOLE` is the spacecraft itself."""
     lock_position(connection)
     hourly: Rollups = {
         (spacecraft, run, tracker, hour): share
@@ -167,9 +165,9 @@ def add_shares(
 
 
 def lock_position(connection: Connection) -> int:
-    """Lock the projector's place in the record, and with it all rollups; returns the place.
+    """Lock the projector's place in the record, and thereby all rollups; returns the place.
 
-    Every change of a rollup begins with this.
+    Every change of a rollup begins here.
     """
     query = select(projector.c.seq).with_for_update()
     return int(connection.execute(query).scalar_one())
@@ -187,11 +185,11 @@ def _add_hours(connection: Connection, hourly: Rollups) -> None:
 
 
 def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
-    """Count hours anew in which a current result was replaced or taken out, and their days.
+    """Recount the trends of hours, and their days, in which a current result changed or went.
 
-    An extreme that is gone cannot be subtracted.  The projector's place in the record is
-    locked before anything is read: what comes after it will be added, and is not counted here.
-    Where nothing is left of an hour or a day, its row goes too.
+    A deleted extreme cannot be subtracted.  The projector's place in the record is locked before
+    anything is read: results after it are added later, and not counted here.  An hour or a day
+    without results loses its row.
     """
     changed = sorted(set(hours))
     if not changed:
@@ -205,7 +203,7 @@ def renew(connection: Connection, hours: Iterable[BucketKey]) -> None:
 
 
 def _replace(connection: Connection, trend: Trend, key: BucketKey, of_tracker: Rollups) -> None:
-    """Replace the rows of a spacecraft and of its trackers of an hour or a day."""
+    """Replace the trend rows of a spacecraft and its trackers in one hour or day."""
     own = dict(zip(_KEY, key, strict=True))
     for table, is_whole in ((trend.table, True), (trend.tracker_table, False)):
         connection.execute(delete(table).where(*(table.c[name] == own[name] for name in own)))
@@ -218,7 +216,7 @@ def _replace(connection: Connection, trend: Trend, key: BucketKey, of_tracker: R
 
 
 def _of_hour(connection: Connection, key: BucketKey) -> Rollups:
-    """The rollups of the current results of an hour by tracker, archived ones included."""
+    """Rollups of the current results of an hour by tracker, archived ones included."""
     spacecraft, run, hour = key
     of_tracker = _summed(
         connection,
@@ -235,7 +233,7 @@ def _of_hour(connection: Connection, key: BucketKey) -> Rollups:
 
 
 def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
-    """The rollups of some results by tracker, that of the `WHOLE` first."""
+    """Rollups of the chosen results by tracker, with that of the `WHOLE` first."""
     whole = (
         connection.execute(select(*result_metrics.SUMMED.values()).where(*chosen)).mappings().one()
     )
@@ -251,7 +249,7 @@ def _summed(connection: Connection, *chosen: ColumnElement[bool]) -> Rollups:
 
 
 def _of_day(connection: Connection, spacecraft: str, run: str, day: int) -> Rollups:
-    """The rollups of the hours of a day by tracker."""
+    """Rollups of a day by tracker, merged from those of its hours."""
     of_tracker: Rollups = {}
     for table in (tables.rollups_hourly, tables.tracker_rollups_hourly):
         query = select(table).where(
@@ -270,12 +268,12 @@ def _put(found: Rollups, key: Any, row: Row) -> None:
     if key in found:
         result_metrics.merge(found[key], row)
     else:
-        # A copy: merging changes it in place.
+        # A copy, since merging changes rows in place.
         found[key] = dict(row)
 
 
 def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
-    """The trends as they are kept: of spacecraft, or of their trackers."""
+    """Stored trends of all spacecraft, or of their trackers."""
     trend = TRENDS[bucket]
     table, names = (trend.tracker_table, _TRACKER_KEY) if of_trackers else (trend.table, _KEY)
     return {
@@ -285,9 +283,9 @@ def stored(connection: Connection, bucket: Bucket, *, of_trackers: bool = False)
 
 
 def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False) -> Rollups:
-    """The trends counted anew from the current results: what `stored` must equal.
+    """Trends counted from the current results, which `stored` must equal.
 
-    Of archived batches, from what was kept of them when they were archived.
+    Archived batches count by the share kept when they were archived.
     """
     place = results.c.spacecraft, results.c.run, batches.c.time
     query = select(results, batches.c.time).join_from(
@@ -298,7 +296,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
         query = select(tracker_values, *place).select_from(source)
     width_s = TRENDS[bucket].width_s
     found: Rollups = {}
-    # PostgreSQL's client would hold all rows at once.
+    # Otherwise PostgreSQL's client would hold all rows at once.
     in_pieces = {"yield_per": ROWS_AT_ONCE}
     with connection.execute(query.where(results.c.current), execution_options=in_pieces) as read:
         for row in read.mappings():
@@ -314,7 +312,7 @@ def recount(connection: Connection, bucket: Bucket, *, of_trackers: bool = False
 
 
 def hours_of_all(connection: Connection) -> set[BucketKey]:
-    """Every hour with batches, recorded or archived, and every hour that has a trend."""
+    """All hours with batches, recorded or archived, or with a trend."""
     hour = func.substr(batches.c.time, 1, len("2026-11-27T12"))
     columns = batches.c.spacecraft, batches.c.run
     query = select(*columns, func.min(batches.c.time)).group_by(*columns, hour)
@@ -329,7 +327,7 @@ def hours_of_all(connection: Connection) -> set[BucketKey]:
 
 
 def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
-    """The hours or days of results that the projector has not come to."""
+    """Hours or days with results that the projector has not reached."""
     query = select(results.c.spacecraft, results.c.run, batches.c.time).join_from(
         results, batches, results.c.batch_id == batches.c.id
     )
@@ -343,8 +341,8 @@ def waiting(connection: Connection, bucket: Bucket) -> set[BucketKey]:
 
 # The share of archived batches in the trends, hour by hour.
 #
-# A trend holds recorded and archived batches alike.  Where an hour is counted anew from the
-# recorded ones, the share that is kept here is added.
+# A trend covers recorded and archived batches alike.  A recount reads the recorded ones, then adds
+# the share that is kept here.
 
 
 def keep_share(
@@ -354,7 +352,7 @@ def keep_share(
     run: str,
     of_hour: Mapping[int, Sequence[str]],
 ) -> None:
-    """Note what the current results of recorded batches add to each hour.
+    """Store the contribution of recorded batches to the trends of each hour, before archiving.
 
     `of_hour` has the ids of the batches by the number of their hour.
     """
@@ -372,7 +370,7 @@ def insert_share(
     run: str,
     of_hour: Mapping[int, Mapping[str, Row]],
 ) -> None:
-    """Note the share of a part in each hour, by tracker and for the `WHOLE`."""
+    """Store an archive part's share of the trends of each hour, by tracker and for the `WHOLE`."""
     own = {"spacecraft": spacecraft, "run": run, "part_id": part_id}
     rows = [
         own | {"bucket": hour, "tracker": tracker, "sums": json.dumps(share)}
@@ -384,14 +382,14 @@ def insert_share(
 
 
 def forget_share(connection: Connection, part_id: int, spacecraft: str, run: str) -> None:
-    """Delete the share of a part whose batches are recorded again."""
+    """Delete the share of an archive part whose batches are recorded again."""
     c = tables.archived_hours.c
     own = c.spacecraft == spacecraft, c.run == run, c.part_id == part_id
     connection.execute(delete(tables.archived_hours).where(*own))
 
 
 def shares_of_hour(connection: Connection, spacecraft: str, run: str, hour: int) -> dict[str, Row]:
-    """The share of all archived batches of an hour, by tracker and for the `WHOLE`."""
+    """Share of all archived batches in the trends of an hour, by tracker and for the `WHOLE`."""
     c = tables.archived_hours.c
     found: Rollups = {}
     own = c.spacecraft == spacecraft, c.run == run, c.bucket == hour
@@ -403,7 +401,7 @@ def shares_of_hour(connection: Connection, spacecraft: str, run: str, hour: int)
 def _shares(
     connection: Connection, *chosen: ColumnElement[bool]
 ) -> Iterator[tuple[str, str, str, int, Row]]:
-    """The chosen shares, or all, as (spacecraft, run, tracker, hour, columns)."""
+    """Shares of archived batches in the trends, as (spacecraft, run, tracker, hour, columns)."""
     c = tables.archived_hours.c
     query = select(c.spacecraft, c.run, c.tracker, c.bucket, c.sums).where(*chosen)
     for spacecraft, run, tracker, hour, sums in connection.execute(query):

@@ -1,8 +1,8 @@
-"""Seals: how many results there are of each hour, and the sum of their digests.
+"""Seals: the number of results of each hour, and the sum of their digests.
 
-A result that was removed, added or exchanged by anybody but the service does not agree with
-them.  The projector adds new results.  `prune`, `archive`, `restore` and `forget` change the seals
-in the transaction that deletes or inserts the results.
+They reveal a result that was removed, added or exchanged by anybody but the service.  The projector
+adds new results.  `prune`, `archive`, `restore` and `forget` change the seals in the transaction
+that deletes or inserts the results.
 """
 
 from collections.abc import Sequence
@@ -26,15 +26,15 @@ from service.storage.sql.tables import projector, results, seals
 
 HOUR_NS = 3_600_000_000_000
 SUMMED_BITS = (1 << 40) - 1
-"""The bits of each digest that are summed: eight million add up within 63 bits."""
+"""Mask for the summed bits of each digest: eight million sums fit in 63 bits."""
 
 Seal = tuple[str, str, int]
-"""(spacecraft, run, hour of TAI)."""
+"""Key of a seal: (spacecraft, run, hour of TAI)."""
 _OWN = (results.c.spacecraft, results.c.run, results.c.time_ns // HOUR_NS)
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
-    """Add new results."""
+    """Add new results to the seals of their hours."""
     _ADD_RANGE.run(connection, [{"first_seq": new[0].seq, "last_seq": new[-1].seq}])
 
 
@@ -54,19 +54,19 @@ def _adding(dialect: Any, chosen: ColumnElement[bool], sign: int = 1) -> Executa
 
 
 def take_out(connection: Connection, batch_ids: Sequence[str]) -> None:
-    """Take out the results of batches that are to be deleted, if they are in the seals yet."""
+    """Remove results of batches to be deleted from the seals, if the projector has added them."""
     passed = results.c.seq <= lock_position(connection)
     add(connection, results.c.batch_id.in_(batch_ids) & passed, -1)
     connection.execute(delete(seals).where(seals.c.results == 0))
 
 
 def stored(connection: Connection) -> dict[Seal, tuple[int, int]]:
-    """Number and sum of digests of each hour, as they are kept."""
+    """Stored seals: number of results and sum of digests of each hour."""
     return {(s, r, hour): (n, sum) for s, r, hour, n, sum in connection.execute(select(seals))}
 
 
 def counted(connection: Connection) -> dict[Seal, tuple[int, int]]:
-    """The same of the results that the projector has come to."""
+    """Seals counted from the results that the projector has passed."""
     passed = results.c.seq <= select(projector.c.seq).scalar_subquery()
     query = select(*_OWN, *_sums()).where(passed).group_by(*_OWN)
     return {(s, r, hour): (n, sum) for s, r, hour, n, sum in connection.execute(query)}

@@ -1,1 +1,1 @@
-"""Reading results, trends and settings."""
+"""Queries for results, trends and settings."""

@@ -1,4 +1,4 @@
-"""Two runs of one spacecraft side by side: batch by batch, and the rates of each over time."""
+"""Comparison of two runs of one spacecraft: batch by batch, and their rates over time."""
 
 import math
 from collections import Counter
@@ -31,11 +31,11 @@ def compare_runs(
     other: str,
     latest: int | None = None,
 ) -> models.RunComparison:
-    """The current results of a period beside those of the same batches in another run.
+    """Compare the current results of a period with those of the same batches in another run.
 
-    `stars` counts what became of each, from the one run (`before`) to the other
-    (`after`); `same_star` tells whether both name it, and alike.  `attitudes`
-    compares what both have.  With `latest`, of the period's latest batches alone.
+    `stars` counts the stars by outcome in the first run (`before`) and in the other one (`after`);
+    `same_star` is True if both name the same catalog star.  `attitudes` compares the attitudes that
+    both have.  With `latest`, only the latest batches of the period are compared.
     """
     stars: Counter[tuple[str, str, bool]] = Counter()
     before: Counter[str] = Counter()
@@ -52,7 +52,7 @@ def compare_runs(
         models.RunTransition(before=old, after=new, same_star=alike, stars=number)
         for (old, new, alike), number in stars.items()
     ]
-    # The most frequent first.
+    # Order by frequency, the highest first.
     transitions.sort(key=lambda each: (-each.stars, each.before, each.after))
     angles = np.concatenate(angles_arcsec)
     statistics = None
@@ -86,7 +86,7 @@ def changed_batches(
     latest: int,
     limit: int,
 ) -> list[models.RunChange]:
-    """The batches whose counts of stars or whose status differ in the other run, latest first.
+    """Batches whose counts of stars or whose status differ in the other run, latest first.
 
     At most `limit` of the period's `latest` batches.
     """
@@ -105,9 +105,9 @@ def _groups(
     other: str,
     latest: int | None,
 ) -> Iterator[tuple[Connection, Subquery]]:
-    """The pairs of results of both runs with the database that they are in, latest first.
+    """Pairs of results of both runs, in groups with the database that holds them, latest first.
 
-    Without an archive that is one group.
+    Without an archive there is one group.
     """
     is_archived = any(
         parts_between(connection, selected.spacecraft, run, *pages.bounds_of(selected))
@@ -125,7 +125,7 @@ def _changed(connection: Connection, pairs: Subquery, limit: int) -> list[models
     old, new = results.alias("old"), results.alias("changed")
     differ = or_(
         *(old.c[name] != new.c[name] for name in (*tables.COUNTED, "status")),
-        # Without an attitude the status is null.
+        # Status is null without an attitude.
         old.c.status.is_(None) != new.c.status.is_(None),
     )
     sides = [
@@ -162,11 +162,11 @@ def _side(row: Any, side: str) -> models.RunChangeSide:
 
 
 def _pairs(selected: pages.ResultFilter, other: str, latest: int | None = None) -> Subquery:
-    """The ids and states of the two current results of each batch that is in both runs."""
+    """Query for the ids and statuses of the two current results of each batch in both runs."""
     again, new = batches.alias("again"), results.alias("new")
     of_run = selected.conditions()
     if latest is not None:
-        # The limit comes first: to look for partners of millions of batches takes minutes.
+        # Limit first: to look for partners of millions of batches takes minutes.
         chosen = pages.newest_first(select(results.c.id).where(*of_run))
         of_run = [results.c.id.in_(select(chosen.limit(latest).subquery().c.id))]
     return (
@@ -225,7 +225,7 @@ def _sums(stars: Iterable[tuple[str, int]]) -> models.OutcomeCounts:
 
 
 def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
-    """The angles between the attitudes that both have, in arrays."""
+    """Angles in arcsec between the attitudes of result pairs that both have one, in arrays."""
     old, new = tables.solutions.alias("old_solution"), tables.solutions.alias("new_solution")
     query = (
         select(*(each.c[name] for each in (old, new) for name in pages.QUATERNION))
@@ -238,14 +238,14 @@ def _angles_arcsec(connection: Connection, pairs: Subquery) -> list[Vector]:
 
 
 def _between(rows: Vector) -> Vector:
-    """The angle between the attitudes of each row, eight numbers: accurate near zero."""
+    """Angle in arcsec between two quaternions a row (n, 8); accurate near zero."""
     one, other = rows[:, :4], rows[:, 4:]
     apart = np.minimum(np.linalg.norm(one - other, axis=1), np.linalg.norm(one + other, axis=1))
     return np.asarray(4.0 * np.arcsin(np.minimum(1.0, apart / 2.0)) * ARCSEC_PER_RADIAN)
 
 
 GROUP = 2_000
-"""Batches of a run that are compared together."""
+"""Number of batches of a run compared at a time."""
 _COMPARED = ("solution", "stars")
 _AT_ONCE = 1_000
 
@@ -257,10 +257,10 @@ def both_runs(
     other: str,
     latest: int | None,
 ) -> Iterator["Opened"]:
-    """The selected batches with those of the same names in another run, latest first.
+    """Open the selected batches together with those of the same names in another run, latest first.
 
     At most the `latest` of those selected.  Recorded and archived ones are copied into one
-    database, so that any of the two may be in either place.
+    database, so that a batch of either run may be in either place.
     """
     named = (results.c.spacecraft, batches.c.batch)
     query = select(*pages.PLACE, *named).join_from(
@@ -290,7 +290,7 @@ def both_runs(
 def _named(
     connection: Connection, table: Table, run: str, names: Sequence[tuple[str, str]]
 ) -> list[str]:
-    """The ids of batches of a run by spacecraft and name."""
+    """Ids of a run's batches by spacecraft and name."""
     c = table.c
     found: list[str] = []
     for first in range(0, len(names), _AT_ONCE):
@@ -303,7 +303,7 @@ def _named(
 def _opened(
     connection: Connection, archive: Archive, recorded: Sequence[str], archived: Sequence[str]
 ) -> "Opened":
-    """Recorded and archived batches in one database."""
+    """Open recorded and archived batches together in one database in memory."""
     from service.storage.archive.rows import Opened, columns_of, read_rows
 
     opened = Opened()
@@ -321,14 +321,14 @@ def _opened(
 
 
 _SHOWN_BY_HOUR_S = 30 * DAY_S
-"""The longest period with a cell an hour; a longer one has cells of one day or several."""
+"""Longest period in seconds with cells of an hour; a longer one has cells of whole days."""
 _MOST_CELLS_OF_DAYS = 732
 """Largest number of one-day cells in a comparison of runs: two years."""
 _SHARES = ("ambiguous", "unmatched")
 
 
 def cell_width_s(period_s: float) -> int:
-    """The width of the cells that a period's trends have: an hour, a day or several days."""
+    """Width in seconds of the time cells for a period: an hour, a day or several days."""
     if period_s <= _SHOWN_BY_HOUR_S:
         return HOUR_S
     return DAY_S * math.ceil(period_s / (DAY_S * _MOST_CELLS_OF_DAYS))
@@ -337,10 +337,10 @@ def cell_width_s(period_s: float) -> int:
 def run_rates(
     connection: Connection, spacecraft: str, runs: Sequence[str], start: Utc | None, end: Utc | None
 ) -> models.RatesOfRuns | None:
-    """The rates of all stars of each run, in total and over time.
+    """Rates of stars by outcome for each run, in total and over time.
 
     The period is that between `start` and `end`, and at most the days that all runs have; None
-    where there are none.
+    without common days.
     """
     common = _common_days(connection, spacecraft, runs)
     if common is None:
@@ -385,7 +385,7 @@ def _common_days(
 
 
 def _share(buckets: Columns, name: str, place: Vector, cells: int) -> Vector:
-    """The share of the observed stars in each cell; NaN in one without a star."""
+    """Fraction of the observed stars with an outcome in each time cell; NaN without a star."""
     part, whole = (
         np.bincount(place, weights=buckets[column], minlength=cells)
         for column in (name, "observed")

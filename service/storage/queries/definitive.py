@@ -1,4 +1,4 @@
-"""Reading the definitive attitude that is recorded: samples page by page, innovations."""
+"""Queries for the recorded definitive attitude: samples page by page, and innovations."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
@@ -29,7 +29,7 @@ from service.times import DAY_S
 from service.trends.limits import Sample
 
 METHODS: dict[Grade, str] = {"filtered": "ekf", "smoothed": "filter_smoother"}
-"""The words of CCSDS ACM's AD_METHOD."""
+"""Words for the method of each grade, as in AD_METHOD of CCSDS ACM."""
 STATUS = {Status.GOOD: "good", Status.STARTING: "suspect", Status.DOUBTFUL: "suspect"}
 PLACE = (graded_days.c.day, graded_blocks.c.position)
 BLOCKS = select(
@@ -41,7 +41,7 @@ BLOCKS = select(
     graded_blocks.c.packed,
 ).join_from(graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id)
 MOST_BLOCKS = 48
-"""Blocks read for each grade: two days at 1 Hz; spread evenly over a longer period."""
+"""Largest number of blocks read for a grade: two days at 1 Hz, or spread over longer periods."""
 
 
 class GradedStretchInfo(Struct, frozen=True, kw_only=True):
@@ -78,9 +78,10 @@ def graded_pages(
     newest_first: bool = False,
     page: int | None = None,
 ) -> Iterator[AttitudeRows]:
-    """The samples of the latest revisions in a period, a block of up to an hour at a time.
+    """Samples of the latest revisions in a period, page by page: a block of up to an hour each.
 
-    Of each block no more than the first `page`.  Between two blocks no connection is held.
+    A page has at most the first `page` samples of a block.  Between two blocks no connection is
+    held.
     """
     order = [column.desc() if newest_first else column for column in PLACE]
     query = BLOCKS.where(*block_conditions(selected, grade)).order_by(*order).limit(1)
@@ -100,7 +101,7 @@ def graded_pages(
 
 
 def count_samples_of(connection: Connection, selected: ResultFilter, grade: Grade) -> int:
-    """The samples of the blocks that touch a period: at least those of the period."""
+    """Count the samples of the blocks that overlap a period: an upper bound for the period."""
     total = select(func.sum(graded_blocks.c.samples)).join_from(
         graded_days, graded_blocks, graded_blocks.c.day_id == graded_days.c.id
     )
@@ -108,7 +109,7 @@ def count_samples_of(connection: Connection, selected: ResultFilter, grade: Grad
 
 
 def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bool]]:
-    """The blocks of a grade, or of innovations, that touch a period, as SQL; latest revisions."""
+    """SQL conditions for blocks of a grade or of innovations in a period; latest revisions."""
     days, blocks = graded_days.c, graded_blocks.c
     chosen: list[ColumnElement[bool]] = [
         days.current,
@@ -125,7 +126,7 @@ def block_conditions(selected: ResultFilter, kind: str) -> list[ColumnElement[bo
 
 
 def _rows(row: Any, selected: ResultFilter, grade: Grade) -> AttitudeRows:
-    """The samples of a block that lie in the period."""
+    """Convert the samples of a block that lie in the period to attitude rows."""
     found = unpacked(row["packed"], row["samples"])
     found = found.taken(inside(found.tai_ns, selected.start, selected.end))
     n = len(found)
@@ -165,7 +166,7 @@ def _repeated(value: str | None, n: int) -> Any:
 
 @dataclass(frozen=True)
 class Block:
-    """A block without its samples: its place, model and times in TAI nanoseconds."""
+    """Position of a block of samples, with its model and times in TAI nanoseconds."""
 
     day_id: str
     position: int
@@ -177,7 +178,7 @@ class Block:
 def latest_innovations(
     connection: Connection, selected: ResultFilter, *, of_gyro: bool = False
 ) -> list[MeasuredInnovations]:
-    """The innovations of a period's latest blocks, in order of time; perhaps of a gyro alone."""
+    """Innovations of a period's latest blocks, or latest gyro blocks, in order of time."""
     blocks = blocks_of(connection, selected, INNOVATIONS)
     blocks = [each for each in blocks if each.model == "gyro" or not of_gyro]
     rows = packed_samples(connection, INNOVATIONS, blocks[-MOST_BLOCKS:])
@@ -186,7 +187,7 @@ def latest_innovations(
 
 
 def blocks_of(connection: Connection, selected: ResultFilter, kind: str) -> list[Block]:
-    """The blocks of a period without their samples, in order of time."""
+    """List the blocks that overlap a period without their samples, in order of time."""
     c = graded_blocks.c
     query = (
         select(c.day_id, c.position, c.model, c.start_ns, c.end_ns)
@@ -198,7 +199,7 @@ def blocks_of(connection: Connection, selected: ResultFilter, kind: str) -> list
 
 
 def packed_samples(connection: Connection, kind: str, read: Sequence[Block]) -> list[Any]:
-    """The packed samples of some blocks, in their order."""
+    """Read the packed samples of blocks, in the order of the blocks."""
     c = graded_blocks.c
     place = tuple_(c.day_id, c.position)
     query = select(c.day_id, c.position, c.samples, c.packed).where(
@@ -212,7 +213,7 @@ _COUNTED = (Outcome.ACCEPTED, Outcome.REJECTED, Outcome.STARTED)
 
 
 def rejected_samples(connection: Connection, selected: ResultFilter) -> list[Sample]:
-    """The samples that measured attitudes of a period add to the share, in order of time."""
+    """Samples for the rejected share of a period's measured attitudes, in order of time."""
     found: list[Sample] = []
     for part in latest_innovations(connection, selected):
         counted = np.isin(part.outcome, _COUNTED)

@@ -1,4 +1,4 @@
-"""The state of all spacecraft of a run in a few queries, however large the fleet."""
+"""State of all spacecraft in a run, read in a few queries however large the fleet."""
 
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -32,18 +32,18 @@ from service.vectors import Matrix
 Period = Literal["hour", "day", "week"]
 PERIODS_S: Mapping[Period, int] = {"hour": HOUR_S, "day": DAY_S, "week": 7 * DAY_S}
 CELLS_S: Mapping[Period, int] = {"hour": 120, "day": 1800, "week": 4 * HOUR_S}
-"""The width of a cell: each divides a day."""
+"""Width of a chart's time cell in seconds, by period; each divides a day."""
 MOST_SUMMED = 20_000
-"""Batches of a day that are summed up one by one; a day with more is shown by the hour."""
+"""Largest number of a day's batches that are summed one by one; above it, hours are read."""
 
 _TICK_S = 1e-6
 _Sums = Sequence[tuple[Any, ...]]
-"""Rows of spacecraft, POSIX time at which a cell begins, and counts."""
+"""Rows of spacecraft, POSIX time of the start of a cell, and counts."""
 
 
 @dataclass(frozen=True)
 class TrackerCounts:
-    """One tracker's stars of the latest batch, and how many of them are unique."""
+    """Number of stars of a tracker in the latest batch, and number of unique ones."""
 
     tracker: str
     observed: int
@@ -52,18 +52,18 @@ class TrackerCounts:
 
 @dataclass(frozen=True)
 class KnownAttitude:
-    """The newest attitude of a spacecraft: of which result, at what time, how good."""
+    """Newest attitude of a spacecraft: id of its result, time and accuracy."""
 
     id: str
     time: str
     status: str
     sigma_arcsec: tuple[float, float, float]
-    """One standard deviation about each body axis."""
+    """One standard deviation about each body axis, in arcsec."""
 
 
 @dataclass(frozen=True)
 class DayCounts:
-    """Observed and ambiguous stars of the day that ends with the run's latest hour, and before."""
+    """Counts of observed and ambiguous stars in a run's latest 24 hours, and in those before."""
 
     observed: int = 0
     ambiguous: int = 0
@@ -72,7 +72,7 @@ class DayCounts:
 
     @property
     def points(self) -> float | None:
-        """How many percent points the ambiguous share rose; None where a day has no star."""
+        """Rise of the ambiguous share of stars in percentage points; None if a day has no star."""
         if not self.observed or not self.observed_before:
             return None
         before = self.ambiguous_before / self.observed_before
@@ -81,24 +81,24 @@ class DayCounts:
 
 @dataclass(frozen=True)
 class FleetRow:
-    """The state of one spacecraft in a run; None without a batch."""
+    """State of one spacecraft in a run; most fields are None without a batch."""
 
     name: str
     description: str
     retired: bool
-    """True if no mission file describes it any more."""
+    """True if no mission file describes the spacecraft any more."""
     state: str
-    """`good`, `suspect`, `no_attitude` or `no_batches`: that of the latest batch."""
+    """State from the latest batch: `good`, `suspect`, `no_attitude` or `no_batches`."""
     alarms: tuple[Alarm, ...]
-    """The alarms that are not cleared, the one that is worst now first."""
+    """Alarms that are not cleared, the one with the worst present severity first."""
     latest_batch: Summary | None = None
     last_attitude: KnownAttitude | None = None
-    """It can be older than the latest batch."""
+    """Newest attitude of the spacecraft, which can be older than the latest batch."""
     trackers: tuple[TrackerCounts, ...] = ()
     age_s: float | None = None
-    """From its latest batch to the run's latest batch."""
+    """Seconds from the spacecraft's latest batch to the run's latest batch."""
     received_age_s: float | None = None
-    """Since the service received its latest batch."""
+    """Seconds since the service received the spacecraft's latest batch."""
     last_hour: WindowCounts | None = None
     days: DayCounts = DayCounts()
 
@@ -123,10 +123,10 @@ class FleetCells:
     """Counts in cells of equal width in time: a row for each spacecraft, a column for each cell."""
 
     start_s: float
-    """POSIX time at which the first cell begins."""
+    """POSIX time at which the first cell begins, in seconds."""
     width_s: int
     counts: Mapping[str, Matrix]
-    """A rollup's counts, such as `observed`; 0 where there was no batch."""
+    """Counts by the name of a rollup column, such as `observed`; 0 where there was no batch."""
 
     @property
     def columns(self) -> int:
@@ -136,11 +136,11 @@ class FleetCells:
 
 @dataclass(frozen=True)
 class Fleet:
-    """Every spacecraft in a run; the rows of `cells` are those of `rows`."""
+    """State of every spacecraft in a run; `cells` has the same rows as `rows`."""
 
     run: str
     as_of: Utc | None
-    """The time of the run's latest batch."""
+    """Time of the run's latest batch."""
     alarms: AlarmSummary
     rows: tuple[FleetRow, ...]
     cells: FleetCells | None
@@ -155,10 +155,10 @@ def fleet(
     active: Sequence[Alarm],
     spacecraft: Collection[str] | None = None,
 ) -> Fleet:
-    """Every mission in a run; the last hour and the period end with the run's latest batch.
+    """Read the state of every mission in a run; periods end with the run's latest batch.
 
-    `active` are the alarms of the run that are not cleared.  With `spacecraft`, the latest batch
-    is that of these.
+    `active` are the alarms of the run that are not cleared.  With `spacecraft`, only batches of
+    these count.
     """
     named = {mission.name: mission for mission in missions}
     as_of = latest_time_of(connection, run, spacecraft, now=now)
@@ -173,13 +173,13 @@ def fleet(
 
 
 def present_rank(alarm: Alarm) -> tuple[bool, int]:
-    """How bad an alarm is now: unshelved ones by present severity, which is 0 back in limits."""
+    """Sort key for the present severity of an alarm: shelved ones lowest, 0 if back in limits."""
     severity = alarm.current_severity
     return alarm.state != "shelved", 0 if severity is None else Severity[severity.upper()]
 
 
 def summary(found: Sequence[Alarm]) -> AlarmSummary:
-    """How many active alarms there are by state, and the present severity of the worst one."""
+    """Count active alarms by state, with the present severity of the worst one."""
     states = ("open", "acknowledged", "shelved")
     worst = max(found, key=present_rank, default=None)
     return AlarmSummary(
@@ -189,7 +189,7 @@ def summary(found: Sequence[Alarm]) -> AlarmSummary:
 
 
 class _Facts:
-    """The facts of every spacecraft, by name or by the id of its latest result."""
+    """Data for the state of every spacecraft, by name or by the id of its latest result."""
 
     def __init__(
         self, connection: Connection, names: list[str], run: str, as_of: Utc, now: Utc
@@ -228,7 +228,7 @@ def _row(mission: Mission, facts: _Facts | None, now: Utc, active: Sequence[Alar
 
 
 def _of_every_tracker(mission: Mission, counted: Mapping[str, Any]) -> tuple[TrackerCounts, ...]:
-    """The counts of a mission's trackers, in its order; none of one that saw no star."""
+    """Star counts of a mission's trackers in its order; zero for a tracker without a star."""
     names = [each.name for each in mission.trackers]
     return tuple(TrackerCounts(name, *counted.get(name, (0, 0))) for name in names)
 
@@ -236,7 +236,7 @@ def _of_every_tracker(mission: Mission, counted: Mapping[str, Any]) -> tuple[Tra
 def _latest_ids(
     connection: Connection, names: list[str], run: str, now: Utc, solved: bool = False
 ) -> dict[str, str]:
-    """The id of each spacecraft's newest current result, as `pages.newest` has it."""
+    """Id of each spacecraft's newest current result, chosen as `pages.newest` does."""
     found: dict[str, str] = {}
     bounds_ns = [now.tai_ns + AHEAD_NS] if run == LIVE else []
     for bound_ns in (*bounds_ns, (1 << 63) - 1):
@@ -250,7 +250,7 @@ def _latest_ids(
 
 @cache
 def _newest_query(solved: bool) -> Select[Any]:
-    # Every spacecraft of a mission file is noted with its settings when the service starts.
+    # The service notes every spacecraft of a mission file with its settings when it starts.
     known = select(tables.mission_uses.c.spacecraft.label("name")).distinct()
     asked = known.where(
         tables.mission_uses.c.spacecraft.in_(bindparam("names", expanding=True))
@@ -268,7 +268,7 @@ def _newest_query(solved: bool) -> Select[Any]:
 
 
 def latest_inputs(connection: Connection, names: Iterable[str], now: Utc) -> Sequence[str]:
-    """The latest live batch of each named spacecraft, as JSON in the form in which it was sent."""
+    """Latest live batch of each named spacecraft, as JSON in the form in which it was sent."""
     ids = _latest_ids(connection, list(names), LIVE, now)
     query = select(batches.c.input).join_from(results, batches, results.c.batch_id == batches.c.id)
     return connection.scalars(query.where(results.c.id.in_(list(ids.values())))).all()
@@ -283,7 +283,7 @@ def _summaries(connection: Connection, ids: Mapping[str, str]) -> dict[str, Summ
 def _tracker_counts(
     connection: Connection, ids: Iterable[str]
 ) -> dict[str, dict[str, tuple[int, int]]]:
-    """Stars and unique stars of each tracker, by the id of the result."""
+    """Number of stars and of unique stars of each tracker, by the id of the result."""
     columns = tables.star_results.c
     unique = func.sum(case((columns.outcome == "unique", 1), else_=0))
     query = (
@@ -324,8 +324,8 @@ def _root(variance: float) -> float:
 def _last_hours(
     connection: Connection, names: list[str], run: str, as_of: Utc
 ) -> dict[str, WindowCounts]:
-    """The counts of the hour that ends with the run's latest batch."""
-    # The latest batch belongs to the window, one just an hour before it does not.
+    """Counts by spacecraft over the hour that ends with the run's latest batch."""
+    # The window includes the latest batch, and excludes one exactly an hour before it.
     end = shifted(as_of, _TICK_S)
     start = shifted(end, -HOUR_S)
     query = select(results.c.spacecraft, *(SUMMED[name] for name in COUNTS))
@@ -346,7 +346,7 @@ def _cells(
 ) -> FleetCells:
     width_s, span_s = CELLS_S[period], PERIODS_S[period]
     if period == "day":
-        # Hours tell how many batches there are, and serve where those are too many.
+        # Hours show the number of batches, and replace them where there are too many.
         rows = _hours(connection, names, run, as_of, span_s, HOUR_S)
         if sum(row[2] for row in rows) > MOST_SUMMED:
             return _table(names, rows, as_of, span_s, HOUR_S)
@@ -360,7 +360,7 @@ def _cells(
 def _table(
     names: list[str], rows: Iterable[tuple[Any, ...]], as_of: Utc, span_s: int, width_s: int
 ) -> FleetCells:
-    """Sums as a table of spacecraft and time."""
+    """Arrange sums in a table with a row for each spacecraft and a column for each time cell."""
     end_s = float(unix_seconds([as_of.tai_ns])[0])
     start_s = (end_s - span_s) // width_s * width_s + width_s
     place = {name: k for k, name in enumerate(names)}
@@ -378,7 +378,7 @@ def _table(
 def _hours(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums of whole hours, from the rollups."""
+    """Sums by spacecraft and cells of whole hours, from the rollups."""
     table, hours = tables.rollups_hourly.c, width_s // HOUR_S
     first = shifted(as_of, -span_s).bucket(HOUR_S)
     cell = (table.bucket // hours).label("cell")
@@ -399,7 +399,7 @@ def _hours(
 
 
 def _days(connection: Connection, names: list[str], run: str, as_of: Utc) -> dict[str, DayCounts]:
-    """The counts of the latest 24 hours with the run's latest batch, and of the 24 before."""
+    """Counts by spacecraft of the latest 24 hours of a run, and of the 24 hours before."""
     last_s = float(unix_seconds([as_of.tai_ns])[0]) // HOUR_S * HOUR_S
     found: dict[str, DayCounts] = {}
     for name, at_s, *counts in _hours(connection, names, run, as_of, 2 * DAY_S, HOUR_S):
@@ -431,7 +431,7 @@ _STEPS = (
 def _steps(
     connection: Connection, names: list[str], run: str, as_of: Utc, span_s: int, width_s: int
 ) -> _Sums:
-    """Sums of less than an hour, from the batches."""
+    """Sums by spacecraft and cells shorter than an hour, from the batches."""
     end = shifted(as_of, _TICK_S)
     found: list[tuple[Any, ...]] = []
     for midnight, asked in time_buckets.steps_by_day(shifted(end, -span_s), end, width_s):
@@ -446,7 +446,7 @@ def _steps(
 
 
 STEPS = {HOUR_S: 120, DAY_S: 1800}
-"""The buckets of a sparkline: two minutes in an hour, half an hour in a day."""
+"""Width in seconds of a sparkline's buckets by its period: two minutes or half an hour."""
 
 
 def overview(
@@ -457,9 +457,9 @@ def overview(
     active: Sequence[Alarm],
     spacecraft: Collection[str] | None = None,
 ) -> Overview:
-    """Every mission in a run; the last hour and day end with the run's latest batch.
+    """Overview of every mission in a run; the last hour and day end with the run's latest batch.
 
-    With `spacecraft`, runs and batches of others are as if they did not exist.
+    With `spacecraft`, runs and batches of others are ignored.
     """
     if spacecraft is not None:
         missions = [each for each in missions if each.name in spacecraft]
@@ -477,9 +477,9 @@ def overview(
 
 
 def default_run(connection: Connection, spacecraft: Collection[str] | None = None) -> str:
-    """The run to look at first: live, or while that is empty the newest that holds batches.
+    """Run to show first: the live one, or if that is empty the newest that holds batches.
 
-    With `spacecraft`, batches of these.
+    With `spacecraft`, only batches of these count.
     """
     daily, c = tables.rollups_daily.c, tables.runs.c
     filled = select(daily.run).where(daily.run == c.name)
@@ -512,7 +512,7 @@ def _item(
     item["age_s"] = max(0.0, (as_of.tai_ns - recorded_utc(batch.time).tai_ns) * 1e-9)
     item["received_age_s"] = (now.tai_ns - recorded_utc(batch.received).tai_ns) * 1e-9
     for name, width_s in (("hour", HOUR_S), ("day", DAY_S)):
-        # The latest batch is of the window, one just as long before it is not.
+        # The window includes the latest batch, and excludes one exactly its length before.
         end = shifted(as_of, _TICK_S)
         span = BucketFilter(mission.name, run, shifted(end, -width_s), end)
         step_s, buckets = _read(connection, span, width_s)
@@ -523,7 +523,7 @@ def _item(
 
 
 def sigma_arcsec(covariance_arcsec2: list[list[float]]) -> list[float]:
-    """One standard deviation about each body axis."""
+    """One standard deviation in arcsec about each body axis, from a covariance in arcsec^2."""
     return [math.sqrt(max(covariance_arcsec2[axis][axis], 0.0)) for axis in range(3)]
 
 

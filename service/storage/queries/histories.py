@@ -1,4 +1,4 @@
-"""Histories: attitudes, the state of a spacecraft, its settings, and the runs there are."""
+"""Queries for attitude histories, the state of a spacecraft, its settings, and the list of runs."""
 
 import json
 import logging
@@ -36,19 +36,19 @@ log = logging.getLogger(__name__)
 
 
 class RetiredMission(Mission):
-    """The last recorded settings of a spacecraft that has no mission file any more."""
+    """Last recorded settings of a spacecraft that no longer has a mission file."""
 
     retired: ClassVar[bool] = True
 
 
 @dataclass(frozen=True)
 class Retired:
-    """The recorded spacecraft and trackers that no mission file describes any more."""
+    """Recorded spacecraft and trackers that no mission file describes any more."""
 
     missions: dict[str, Mission] = field(default_factory=dict)
-    """The last settings of each spacecraft that has batches."""
+    """Last settings of each retired spacecraft that has batches, by name."""
     trackers: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """By spacecraft, the trackers of its earlier settings that its last ones have not."""
+    """Trackers in earlier settings of a spacecraft but not in its last ones, by spacecraft."""
 
 
 def list_attitudes(
@@ -59,7 +59,7 @@ def list_attitudes(
     limit: int,
     cursor: str | None,
 ) -> Page[AttitudeRow]:
-    """The attitudes of current results, recorded and archived, oldest batch time first."""
+    """List the attitudes of current results, recorded and archived, oldest batch time first."""
     chosen = [*selected.conditions(), results.c.status.is_not(None)]
     query = attitudes().where(*chosen)
     listing = Listing(archive, query, selected, needs=("solution",), most_opened=MOST_OPENED)
@@ -67,11 +67,10 @@ def list_attitudes(
 
 
 def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> SpacecraftRow:
-    """How a spacecraft stands in a run: its newest batch and its newest attitude.
+    """State of a spacecraft in a run: its newest batch and its newest attitude.
 
-    `state` is that of the newest batch: good, suspect, no_attitude, or
-    no_batches.  `attitude` is that batch's own, or None; `last_attitude` is the
-    newest there is, which may be of an older batch.
+    `state` is that of the newest batch: good, suspect, no_attitude, or no_batches.  `attitude` is
+    that batch's own, or None; `last_attitude` is the newest of any batch.
     """
     selected = pages.ResultFilter(run, mission.name)
     batch = pages.newest(connection, summary_query(), selected, now)
@@ -96,9 +95,9 @@ def live_state(connection: Connection, mission: Mission, run: str, now: Utc) -> 
 
 
 def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen]:
-    """The settings that a spacecraft was served with, oldest first.
+    """Settings with which a spacecraft was served, oldest first.
 
-    Who goes back to earlier settings uses them anew.
+    A return to earlier settings is a new entry.
     """
     query = (
         select(missions.c.digest, missions.c.settings, mission_uses.c.since)
@@ -106,7 +105,7 @@ def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen
         .where(mission_uses.c.spacecraft == spacecraft)
         .order_by(mission_uses.c.id)
     )
-    # Two processes that begin together may both have noted one change.
+    # Two processes that start together may both have noted one change.
     uses = groupby(connection.execute(query).mappings(), key=lambda row: row["digest"])
     return [
         MissionThen(digest=digest, since=row["since"], settings=json.loads(row["settings"]))
@@ -115,7 +114,7 @@ def mission_history(connection: Connection, spacecraft: str) -> list[MissionThen
 
 
 def retired(connection: Connection, missions_of_files: Mapping[str, Mission]) -> Retired:
-    """The spacecraft with batches that have no mission file, and the trackers of none."""
+    """Find spacecraft with batches but without a mission file, and trackers in no mission file."""
     found = Retired()
     has_batches = exists().where(rollups_daily.c.spacecraft == mission_uses.c.spacecraft)
     query = (
@@ -140,9 +139,9 @@ def retired(connection: Connection, missions_of_files: Mapping[str, Mission]) ->
 
 
 def list_runs(connection: Connection, spacecraft: Collection[str] | None = None) -> list[Run]:
-    """Every run with its number of batches, its spacecraft and the days it covers.
+    """List all runs, each with its number of batches, its spacecraft and the days it covers.
 
-    With `spacecraft`, those of these alone.
+    With `spacecraft`, only batches of these count.
     """
     daily = rollups_daily.c
     query = select(
@@ -177,7 +176,7 @@ def _day(number: int) -> str:
 
 
 def attitudes() -> Select[Any]:
-    """The query for what `attitude_row` shows."""
+    """SQL query for the columns that `attitude_row` reads."""
     place = [results.c.id, *pages.PLACE, batches.c.batch, batches.c.time]
     return (
         select(*place, *(column for column in solutions.c if column.name != "result_id"))
@@ -187,7 +186,7 @@ def attitudes() -> Select[Any]:
 
 
 def attitude_row(row: Any) -> AttitudeRow:
-    """An attitude in a history: of which batch, at what time, how good."""
+    """Convert a database row to an entry of an attitude history."""
     is_measured = row["method"] == METHOD
     return AttitudeRow(
         id=row["id"],

@@ -1,7 +1,7 @@
-"""Current results in order of their batches' time, a page at a time, recorded and archived ones.
+"""Pages of current results in order of their batches' time, from the record and the archive.
 
-The database knows which parts of the archive reach into a period.  The same query then runs on the
-record and on one row group of the archive after another, until it is certain what comes first.
+The database knows the archive parts that overlap a period.  A query runs on the record and then on
+one row group of the archive after another, until the first rows in order are certain.
 """
 
 import base64
@@ -23,21 +23,21 @@ from service.storage.sql.tables import batches, results
 from service.times import Utc, recorded_utc
 
 Place = tuple[int, str]
-"""The time of a batch, and its id."""
+"""Position in the order of time: the time of a batch in ns of TAI, and its id."""
 
 QUATERNION = ("q1", "q2", "q3", "qc")
 COVARIANCE = ("p11", "p12", "p13", "p22", "p23", "p33")
-"""Columns of `solutions`."""
+"""Columns of `solutions` with the upper triangle of the covariance matrix."""
 
 PLACE = (results.c.time_ns, results.c.batch_id)
-"""The order of a list.  Columns of the batch, not of the result: adopting changes no order."""
+"""Columns that order a list.  Both belong to the batch: an adopted result changes no order."""
 
 
 @dataclass(frozen=True)
 class ResultFilter:
-    """Selects current results of a run and perhaps a spacecraft, from `start` to before `end`.
+    """Filter for current results of a run and a spacecraft, from `start` to before `end`.
 
-    Without a run it selects those of every run.
+    None for the run or the spacecraft selects all.
     """
 
     run: str | None
@@ -46,7 +46,7 @@ class ResultFilter:
     end: Utc | None = None
 
     def conditions(self) -> list[ColumnElement[bool]]:
-        """The filter as SQL over `results`."""
+        """Convert the filter of results to SQL conditions."""
         chosen: list[ColumnElement[bool]] = [results.c.current]
         if self.run is not None:
             chosen.append(results.c.run == self.run)
@@ -60,7 +60,7 @@ class ResultFilter:
 
 
 def covariance_of(upper: Sequence[float]) -> list[list[float]]:
-    """The covariance matrix of what its columns `COVARIANCE` hold."""
+    """Covariance matrix from its upper triangle, in the order of `COVARIANCE`."""
     p11, p12, p13, p22, p23, p33 = upper
     return [[p11, p12, p13], [p12, p22, p23], [p13, p23, p33]]
 
@@ -68,11 +68,10 @@ def covariance_of(upper: Sequence[float]) -> list[list[float]]:
 def newest(
     connection: Connection, query: Select[Any], selected: ResultFilter, now: Utc
 ) -> RowMapping | None:
-    """The newest row of a query over current results.
+    """Newest row of a query over current results.
 
-    A live batch that is dated far in the future is skipped unless there are no
-    others: one wrong date must not hide all later batches.  Times of other runs
-    are not compared with the clock.
+    A live batch that is dated far in the future is skipped unless there are no others: one wrong
+    date must not hide all later batches.  Times of other runs are not compared with the clock.
     """
     chosen = query.where(*selected.conditions())
     if selected.run == LIVE:
@@ -84,25 +83,25 @@ def newest(
 
 
 def newest_first(query: Select[Any]) -> Select[Any]:
-    """The query in descending order of time."""
+    """Sort a query by descending time."""
     return query.order_by(*(column.desc() for column in PLACE))
 
 
 def latest_time(connection: Connection, selected: ResultFilter, now: Utc) -> Utc | None:
-    """The time of the newest batch; None without any."""
+    """Time of the newest selected batch; None without any."""
     query = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
     row = newest(connection, query, selected, now)
     return None if row is None else recorded_utc(row["time"])
 
 
 def cursor_of(place: Place) -> str:
-    """The cursor of a list that goes on beyond a place."""
+    """Encode a position in the order of time as the cursor of a list."""
     text = f"{place[0]}.{place[1]}"
     return base64.urlsafe_b64encode(text.encode()).decode().rstrip("=")
 
 
 def read_cursor(cursor: str) -> Place:
-    """The place of a cursor; raises `BadBatch` for a text that is none."""
+    """Decode the cursor of a list to a position; raises `BadBatch` for an invalid text."""
     try:
         padded = cursor.encode("ascii") + b"=" * (-len(cursor) % 4)
         time_ns, _, batch_id = base64.urlsafe_b64decode(padded).decode("ascii").partition(".")
@@ -119,32 +118,32 @@ T = TypeVar("T")
 Reading = Callable[[], AbstractContextManager[Connection]]
 
 MOST_OPENED = 40
-"""Row groups that a page of a list opens: about a second's work."""
+"""Largest number of row groups opened for a page of a list: about a second's work."""
 FIRST_ID, LAST_ID = "0" * 26, "7" + "Z" * 25
-"""Ids before and after any other."""
+"""Ids that sort before and after all others."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A row, and whether it is of the archive."""
+    """Row of a query, with True if it comes from the archive."""
 
     row: Any
     archived: bool
 
     @property
     def place(self) -> Place:
-        """Its place in the order of time."""
+        """Position of the row in the order of time."""
         return self.row.time_ns, self.row.batch_id
 
     @property
     def shown(self) -> dict[str, Any]:
-        """The row by column, with `archived`."""
+        """Row as values by column name, with `archived` added."""
         return {**self.row._mapping, "archived": self.archived}
 
 
 @dataclass(frozen=True)
 class Merged:
-    """Rows in order; `resume` is the place where the next ones begin if not all were looked for."""
+    """Rows in order; `resume` is the position where the search stopped early, None if complete."""
 
     rows: list[Found]
     resume: Place | None = None
@@ -152,9 +151,10 @@ class Merged:
 
 @dataclass(frozen=True)
 class Listing:
-    """A query over current results, recorded and archived, in order of time.
+    """Query over current results, recorded and archived, in order of time.
 
-    The columns of the query include `PLACE`; it has no order and, of the filter, all conditions.
+    The columns of the query include `PLACE`; the query is unordered and includes all conditions of
+    the filter.
     """
 
     archive: Archive
@@ -162,14 +162,13 @@ class Listing:
     selected: ResultFilter
     newest_first: bool = False
     needs: Collection[str] = ()
-    """What it needs of the archive beside the columns of results and batches: names of
-    `rows.WHOLE`."""
+    """Further archive columns to read, beyond those of results and batches; see `rows.WHOLE`."""
     most_opened: int | None = None
     parts: Collection[int] | None = None
-    """The ids of the only parts to look in."""
+    """Ids of the only archive parts to search; None for all."""
 
     def first_rows(self, connection: Connection, limit: int, beyond: Place | None = None) -> Merged:
-        """The first `limit` rows beyond a place."""
+        """The first `limit` rows of the query after a position."""
         query = self.query
         if beyond is not None:
             place, bound = tuple_(*PLACE), tuple_(*beyond)
@@ -179,7 +178,7 @@ class Listing:
         found = [Found(row, False) for row in connection.execute(query)]
         sign = -1 if self.newest_first else 1
         last_ns = found[limit - 1].place[0] if len(found) >= limit else None
-        # Parts and row groups that are not read yet, by where they begin in the order of the list.
+        # Unread parts and row groups, by their start in the order of the list.
         heap: list[tuple[int, int, PlacedPart | Block]] = []
         numbers = itertools.count()
 
@@ -198,8 +197,7 @@ class Listing:
                 blocks = self.archive.blocks(next_up)
                 read_later(each for each in blocks if self._reaches(each, beyond))
                 continue
-            # Row groups that begin where the page does are all opened: the next page would begin
-            # there.
+            # Open all row groups that begin where the page does: the next page would begin there.
             is_further = beyond is None or sign * beyond[0] < begins
             if self.most_opened is not None and opened >= self.most_opened and is_further:
                 certain = [each for each in found if sign * each.place[0] < begins]
@@ -216,13 +214,13 @@ class Listing:
     def page(
         self, connection: Connection, limit: int, cursor: str | None, shown: Callable[[Any], T]
     ) -> Page[T]:
-        """The first `limit` rows beyond a cursor, each as `shown` makes it of a dictionary.
+        """Page of the first `limit` rows after a cursor, each converted by `shown`.
 
-        The dictionary says by `archived` where the row is from.  A page over many parts of the
-        archive may have fewer rows, or none, and a cursor all the same.
+        `shown` gets the row as a dictionary, where `archived` tells its origin.  A page over many
+        parts of the archive may have fewer rows, or none, and still a cursor.
         """
         beyond = None if cursor is None else read_cursor(cursor)
-        # One row more than asked for tells whether there is another page.
+        # Ask for one row more, which shows if there is another page.
         found = self.first_rows(connection, limit + 1, beyond)
         rows, resume = found.rows, found.resume
         if len(rows) > limit:
@@ -232,9 +230,9 @@ class Listing:
         return Page(items, None if resume is None else cursor_of(resume))
 
     def row_pages(self, reading: Reading, page: int) -> Iterator[list[Any]]:
-        """All rows, `page` of them at a time.
+        """Read all rows of the query in pages of `page` rows.
 
-        Between two pages no connection is held, so that a slow reader keeps none from others.
+        Between two pages no connection is held, so that a slow reader blocks no other.
         """
         beyond: Place | None = None
         while True:
@@ -249,7 +247,7 @@ class Listing:
     def _parts(
         self, connection: Connection, beyond: Place | None, last_ns: int | None
     ) -> list[PlacedPart]:
-        """The parts that may have rows beyond a place and not after `last_ns`."""
+        """Archive parts that may have rows after a position and not after `last_ns`."""
         if self.parts is not None and not self.parts:
             return []
         first_ns, end_ns = bounds_of(self.selected)
@@ -266,7 +264,7 @@ class Listing:
         ]
 
     def _reaches(self, each: PlacedPart | Block, beyond: Place | None) -> bool:
-        """True if it may have rows of the filter beyond a place."""
+        """True if a part or row group may have rows of the filter after a position."""
         start_ns, end_ns = bounds_of(self.selected)
         if start_ns is not None and each.last_ns < start_ns:
             return False
@@ -284,9 +282,9 @@ def all_rows(
     query: Select[Any],
     places: Sequence[Place],
 ) -> list[Any]:
-    """Every row of a query over some results, which stand at these places, in order of time.
+    """Read all rows of a query over results at given positions, in order of time.
 
-    The query has its order within a place.
+    The query itself orders the rows of one position.
     """
     rows = list(connection.execute(query))
     if not places:
@@ -302,7 +300,7 @@ def all_rows(
 
 
 def count(connection: Connection, archive: Archive, selected: ResultFilter, most: int) -> int:
-    """How many current results are selected; no more than `most` are counted."""
+    """Count the selected current results, up to `most`."""
     bounded = select(results.c.batch_id).where(*selected.conditions()).limit(most).subquery()
     query = select(func.count()).select_from(bounded)
     found = int(connection.scalar(query) or 0)
@@ -314,12 +312,12 @@ def count(connection: Connection, archive: Archive, selected: ResultFilter, most
 
 
 def parts_of(connection: Connection, selected: ResultFilter) -> list[PlacedPart]:
-    """The parts of the archive that may have selected results."""
+    """Archive parts that may hold selected results."""
     return parts_between(connection, selected.spacecraft, selected.run, *bounds_of(selected))
 
 
 def count_of_part(archive: Archive, part: PlacedPart, selected: ResultFilter) -> int:
-    """How many batches of a part are selected."""
+    """Count the selected batches of an archive part."""
     start_ns, end_ns = bounds_of(selected)
     if (start_ns is None or part.first_ns >= start_ns) and (
         end_ns is None or part.last_ns < end_ns
@@ -329,7 +327,7 @@ def count_of_part(archive: Archive, part: PlacedPart, selected: ResultFilter) ->
 
 
 def bounds_of(selected: ResultFilter) -> tuple[int | None, int | None]:
-    """Start and end of a filter in nanoseconds; None where it is open."""
+    """Start and end of a filter in ns of TAI; None for an open end."""
     return (
         None if selected.start is None else selected.start.tai_ns,
         None if selected.end is None else selected.end.tai_ns,

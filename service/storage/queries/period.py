@@ -1,8 +1,7 @@
-"""The batches of a period: a bounded sample of them, and the arrays that its charts show.
+"""Batches of a period: a bounded sample of them, and the arrays that its charts show.
 
-Nothing is identified here.  Directions are computed from what was sent, with the
-settings of the mission as they were for each result.  Batches (b) are in order of time.
-Where something is not known an array has NaN.
+Nothing is identified here.  Directions are computed from the batches as sent, with the settings of
+the mission at the time of each result.  Batches (b) are in order of time.  Unknown values are NaN.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ from service.times import HOUR_S, Utc, utc_of_unix
 from service.vectors import Matrix, Vector
 
 MOST_READ = 600
-"""Batches that are read in full: their stars take less than a second."""
+"""Largest number of batches read in full: their stars take less than a second."""
 
 _SHOWN: Select[tuple[str, str, int, str, float | None, str]] = select(
     results.c.answer,
@@ -50,11 +49,11 @@ _FROM_NS = bindparam("from_ns", type_=BigInteger)
 
 @dataclass(frozen=True, eq=False)
 class PeriodAttitudes:
-    """The attitudes of the batches that were read.
+    """Attitudes of the sampled batches of a period.
 
-    `quaternion` (b, 4) is inertial to body, `covariance_arcsec2` (b, 3, 3) of the error
-    rotation about the body axes.  `status` is `good`, `suspect` or `no_attitude`.
-    `follows` (b,) says whether no other batch lies between one and that before it.
+    `quaternion` (b, 4) is inertial to body, `covariance_arcsec2` (b, 3, 3) of the error rotation
+    about the body axes.  `status` is `good`, `suspect` or `no_attitude`.  `follows` (b,) is True if
+    no other batch lies between a batch and the sampled one before it.
     """
 
     time_ns: npt.NDArray[np.int64]
@@ -67,13 +66,13 @@ class PeriodAttitudes:
 
 @dataclass(frozen=True, eq=False)
 class TrackerStarsOfPeriod:
-    """The unique stars (n) of one tracker, and where it looked in each batch.
+    """Unique stars (n) of one tracker, and its boresight in each sampled batch.
 
-    `place_deg` (n, 2) is h and v on the focal plane.  `residual_arcsec` (n, 2) is
-    observed minus predicted along h and along v, and `expected_arcsec` (n, 2) its
-    standard deviation: the star's sigma less the part of the noise that the
-    attitude takes up.  Both are NaN for a star that the attitude does not use.
-    `boresight` (b, 3) is inertial; without an attitude that of the a priori one.
+    `place_deg` (n, 2) is h and v on the focal plane.  `residual_arcsec` (n, 2) is observed minus
+    predicted along h and along v, and `expected_arcsec` (n, 2) its standard deviation: the star's
+    sigma less the part of the noise that the attitude absorbs.  Both are NaN for a star that the
+    attitude does not use.  `boresight` (b, 3) is inertial; without an attitude that of the a priori
+    one.
     """
 
     tracker: str
@@ -86,16 +85,16 @@ class TrackerStarsOfPeriod:
     observed_mag: Vector
     catalog_mag: Vector
     region: SearchRegion | None
-    """The region in which the stars of the latest batch were searched for."""
+    """Region of the sky searched for the stars of the latest batch."""
 
 
 @dataclass(frozen=True, eq=False)
 class PeriodStars:
-    """The stars of the batches read, of `total` in a period: all, or some where there are many.
+    """Stars of the sampled batches out of the `total` in a period: of all batches, or of some.
 
-    `other_catalog` is how many of those read were identified with a star catalog that
-    the service no longer has; they are without stars here.  `sun` (b, 3) are inertial
-    directions to the Sun.
+    `other_catalog` counts the sampled batches that were identified with a star catalog which the
+    service no longer has; their stars are left out.  `sun` (b, 3) are inertial directions to the
+    Sun.
     """
 
     total: int
@@ -108,15 +107,15 @@ class PeriodStars:
 
     @property
     def read(self) -> int:
-        """The number of batches that were read."""
+        """Number of sampled batches."""
         return len(self.attitudes.time)
 
 
 @dataclass(frozen=True)
 class PeriodSample:
-    """Rows of some of `total` batches in order of time, with their missions by digest.
+    """Sample of the `total` batches of a period in order of time, with missions by digest.
 
-    `follows` (b,) says whether no other batch lies between one and that before it.
+    `follows` (b,) is True if no other batch lies between a batch and the sampled one before it.
     """
 
     total: int
@@ -128,11 +127,12 @@ class PeriodSample:
 def sample_period(
     connection: Connection, span: BucketFilter, most: int = MOST_READ
 ) -> PeriodSample:
-    """All batches of a period, or pairs of neighbours spread evenly, at most `most` batches.
+    """Sample a period: all batches, or pairs of neighbours spread evenly, at most `most` batches.
 
-    Where the pairs are is drawn, one from each of equal parts of the batches, so that
-    nothing periodic is met always or never.  The batches of an hour count as spread evenly
-    over it.  Of a long period its hours are read, and no more batches than of a short one.
+    Each pair is drawn at random from one of equal parts of the batches, so that the sample neither
+    hits nor misses every period of a periodic effect.  The batches of an hour count as spread
+    evenly over it.  For a long period the hourly counts are read, and no more batches than for a
+    short one.
     """
     hours = read_buckets(connection, span, "hour", ("batches",))
     total = int(hours["batches"].sum())
@@ -147,7 +147,7 @@ def sample_period(
         # The first hour may begin before the period.
         pairs = _pairs(connection, selected, [max(each, span.start.tai_ns) for each in drawn])
         drawn_ids = {id for pair in pairs for id in pair}
-        # Without the period, through which the ids would be looked for one after another.
+        # Leave out the period, which would make SQLite search it for each id.
         chosen = query.where(results.c.current, results.c.batch_id.in_(drawn_ids))
         rows = tuple(map(dict, connection.execute(chosen).mappings()))
         ids = [row["batch_id"] for row in rows]
@@ -160,7 +160,7 @@ def sample_period(
 def _drawn_times_ns(
     unix_s: npt.NDArray[np.float64], count: npt.NDArray[np.float64], pairs: int
 ) -> list[int]:
-    """A moment in each of so many parts that have equally many of the hours' batches."""
+    """Draw a time in ns of TAI in each of `pairs` parts with equally many of the hours' batches."""
     rng = np.random.default_rng(0)
     rank = (np.arange(pairs) + rng.random(pairs)) * count.sum() / pairs
     before = np.concatenate([[0.0], np.cumsum(count)])
@@ -172,10 +172,10 @@ def _drawn_times_ns(
 def _pairs(
     connection: Connection, selected: ResultFilter, begins_ns: Sequence[int]
 ) -> set[tuple[str, str]]:
-    """The first two batches from each moment on; near the end of the period the last two."""
+    """First two batches after each given time; near the end of the period the last two."""
     forward = (
         select(results.c.batch_id)
-        # With one lower bound alone the index is entered at it.
+        # With a single lower bound the index is entered at that bound.
         .where(*replace(selected, start=None).conditions(), results.c.time_ns >= _FROM_NS)
         .order_by(*PLACE)
         .limit(2)
@@ -191,14 +191,14 @@ def _pairs(
 
 
 LEAST_EXPECTED = 0.1
-"""Share of a star's sigma.  A star that the attitude all but follows says nothing of the noise."""
+"""Least expected residual as a fraction of sigma; below it the attitude follows the star itself."""
 ALIGNED_DEG = 0.01
 _UNKNOWN_DIRECTION = (np.nan, np.nan, np.nan)
 
 
 @dataclass
 class _Collected:
-    """The parts of one tracker's arrays, batch by batch."""
+    """Arrays of one tracker's stars under construction, batch by batch."""
 
     tracker: Tracker
     boresight: list[Vector]
@@ -211,7 +211,7 @@ class _Collected:
 
 
 def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
-    """Attitudes, boresights, residuals and magnitudes of a sample of batches."""
+    """Compute attitudes, boresights, residuals and magnitudes of a sample of batches."""
     rows_of: dict[str, dict[str, int]] = {}
     read = [
         (
@@ -257,7 +257,7 @@ def period_stars(sample: PeriodSample, sky: SkyModel) -> PeriodStars:
 def _boresight(
     tracker: Tracker, answer: Answer, presumed: PriorAttitude | None, mission: Mission
 ) -> Vector:
-    """The direction in which a tracker looked, inertial; NaN where nothing tells it."""
+    """Inertial boresight direction of a tracker in a batch; NaN if not known."""
     if answer.attitude is not None:
         attitude = vectors.matrix_from_quaternion(answer.attitude.quaternion)
     elif presumed is None or not _knows(tracker, presumed, mission):
@@ -268,7 +268,7 @@ def _boresight(
 
 
 def _knows(tracker: Tracker, presumed: PriorAttitude, mission: Mission) -> bool:
-    """True if a priori knowledge tells where a tracker looks: with the roll, or without it."""
+    """True if a priori knowledge gives a tracker's boresight: known roll, or on the axis."""
     off_deg = vectors.angle_between_deg(tracker.boresight_body, mission.axis_body)
     return presumed.roll_known or bool(off_deg <= ALIGNED_DEG)
 
@@ -291,7 +291,7 @@ def _add(
     run_catalog: RunCatalog,
     rows: dict[str, int],
 ) -> None:
-    """Add the unique stars of one tracker of one batch."""
+    """Add the unique stars of one tracker in one batch to the collected arrays."""
     pairs = [(k, rows[each.star.id]) for k, each in enumerate(stars) if each.star is not None]
     if not pairs:
         return
@@ -318,11 +318,11 @@ def _add(
 def _residuals(
     direction: Vector, predicted: Vector, covariance_arcsec2: Matrix, sigma_arcsec: Vector
 ) -> tuple[Vector, Vector]:
-    """Residuals (n, 2) along h and v, and their standard deviations.
+    """Residuals (n, 2) of stars along h and v in arcsec, and their standard deviations.
 
-    All in tracker axes.  An attitude error e moves a direction d by e x d, that is along
-    the tangent h by e . v and along v by -e . h.  The optimal attitude takes up just so
-    much of the star's own noise, so that sigma^2 - v' P v remains along h.
+    All in tracker axes.  An attitude error e moves a direction d by e x d, that is along the
+    tangent h by e . v and along v by -e . h.  The optimal attitude absorbs that much of the star's
+    own noise, so that sigma^2 - v' P v remains along h.
     """
     along_h = vectors.unit(np.array([1.0, 0.0, 0.0]) - direction[:, :1] * direction)
     along_v = np.cross(direction, along_h)

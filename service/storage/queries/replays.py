@@ -1,4 +1,4 @@
-"""The table of replays: how far each is, and the end of those that this process does not run."""
+"""Table of replays: their progress, and the end of those that this process does not run."""
 
 from collections.abc import Collection
 from typing import Any
@@ -16,18 +16,18 @@ MAX_LISTED = 100
 CANCELLED: runs.ReplayStateName = "cancelled"
 UNFINISHED: tuple[runs.ReplayStateName, ...] = ("running", "waiting")
 _NO_GYRO = {"gyro_blocks": 0, "gyro_samples": 0}
-"""The gyro counts of packets that an earlier version counted."""
+"""Gyro counts of packets from an earlier version, which did not count them."""
 _NO_COUNTS = dict.fromkeys(runs.ReplayCounts.__struct_fields__, 0)
 
 
 def find_replay(connection: Connection, id: str) -> runs.Replay | None:
-    """A replay and its progress; None where there is none."""
+    """Find a replay and its progress by id; None if there is none."""
     row = connection.execute(select(replays).where(replays.c.id == id)).mappings().first()
     return None if row is None else _replay(row)
 
 
 def read_replay(connection: Connection, id: str) -> runs.Replay:
-    """A replay and its progress; raises `NotFound`."""
+    """Read a replay and its progress by id; raises `NotFound`."""
     replay = find_replay(connection, id)
     if replay is None:
         raise NotFound(f"there is no replay with the id {shown_value(id)}")
@@ -37,9 +37,9 @@ def read_replay(connection: Connection, id: str) -> runs.Replay:
 def list_replays(
     connection: Connection, spacecraft: Collection[str] | None = None
 ) -> list[runs.Replay]:
-    """The latest replays and their progress, newest first.
+    """List the latest replays and their progress, newest first.
 
-    With `spacecraft`, those into runs that hold batches of these alone.
+    With `spacecraft`, only replays into runs whose batches are all of these.
     """
     query = select(replays).order_by(replays.c.id.desc()).limit(MAX_LISTED)
     if spacecraft is not None:
@@ -73,7 +73,7 @@ def _replay(row: Any) -> runs.Replay:
 
 
 def insert_replay(connection: Connection, replay: runs.Replay) -> None:
-    """Add a replay."""
+    """Insert the row of a new replay."""
     row = {
         "id": replay.id,
         "run": replay.run,
@@ -92,7 +92,7 @@ def update_replay(
     packets: runs.ReplayPackets | None,
     errors: list[runs.RefusedLine] | None,
 ) -> None:
-    """Store the progress of a replay, and the refused lines unless they are None."""
+    """Store the progress of a replay, and its refused lines unless they are None."""
     values = _progress(progress, packets) | ({} if errors is None else _errors(errors))
     connection.execute(update(replays).where(replays.c.id == progress.id).values(values))
 
@@ -115,7 +115,7 @@ def _errors(errors: list[runs.RefusedLine]) -> dict[str, str]:
 
 
 def is_cancelled(connection: Connection, id: str) -> bool:
-    """True if the table says that a replay is cancelled, perhaps by another process.
+    """True if a replay was cancelled, perhaps by another process.
 
     Until the transaction ends no other process changes the replay.
     """
@@ -124,7 +124,7 @@ def is_cancelled(connection: Connection, id: str) -> bool:
 
 
 def unfinished_replays(connection: Connection) -> set[str]:
-    """The ids of the replays that run, or wait to go on."""
+    """Ids of the replays that are running or waiting to continue."""
     return set(connection.scalars(select(replays.c.id).where(replays.c.state.in_(UNFINISHED))))
 
 
@@ -134,12 +134,12 @@ def mark_interrupted(
     stored: Collection[str] = (),
     only: Collection[str] | None = None,
 ) -> None:
-    """Close the replays that a stopped process left unfinished; those that are `stored` wait.
+    """Close the replays that a stopped process left unfinished; those in `stored` wait instead.
 
-    With `only`, of these alone.  If another process still runs one, that process sets its state
-    to `running` again when it next stores its progress.
+    With `only`, just these are closed.  If another process still runs one, that process sets its
+    state to `running` again when it next stores its progress.
     """
-    # A process that stopped in order has written `interrupted` itself.
+    # A process that stopped regularly has written `interrupted` itself.
     waits = replays.c.id.in_(stored), replays.c.state.in_((*UNFINISHED, "interrupted"))
     connection.execute(update(replays).where(*waits).values(state="waiting", finished=None))
     ended = [replays.c.id.not_in(stored), replays.c.state.in_(UNFINISHED)]
@@ -149,13 +149,13 @@ def mark_interrupted(
 
 
 def close_waiting(connection: Connection, id: str, now: str) -> None:
-    """Close a replay that waited and cannot go on."""
+    """Close a waiting replay that cannot continue."""
     waiting = replays.c.id == id, replays.c.state == "waiting"
     connection.execute(update(replays).where(*waiting).values(state="interrupted", finished=now))
 
 
 def mark_cancelled(connection: Connection, id: str, now: str) -> None:
-    """Close a running replay of another process, which ends it when it next stores its progress.
+    """Cancel a running replay of another process, which stops when it next stores its progress.
 
     Raises `NotFound`, and `WrongState` for one that has ended.
     """
@@ -170,6 +170,6 @@ def mark_cancelled(connection: Connection, id: str, now: str) -> None:
 
 
 def require_cancellable(state: str) -> None:
-    """Raise `WrongState` for the state of a replay that has ended otherwise."""
+    """Raise `WrongState` unless a replay in this state can be cancelled."""
     if state not in (*UNFINISHED, CANCELLED):
         raise WrongState(f"the replay has ended already, its state is {state}")

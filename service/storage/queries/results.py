@@ -1,4 +1,4 @@
-"""Reading results: lists of them, one with all that belongs to it, and batches to run again."""
+"""Queries for results: lists, single results with all their data, and batches to run again."""
 
 import json
 from dataclasses import dataclass
@@ -49,11 +49,10 @@ def list_batches(
     limit: int,
     cursor: str | None,
 ) -> Page[answers.Summary]:
-    """Current results, recorded and archived, newest batch time first.
+    """List current results, recorded and archived, newest batch time first.
 
-    `outcome` keeps batches with at least one star of it; `status` those whose
-    attitude is good or suspect, or that have none; `batch` the one with this batch id in each
-    selected run.
+    `outcome` keeps batches with at least one star of it; `status` those whose attitude is good or
+    suspect, or that have none; `batch` the one with this batch id in each selected run.
     """
     chosen = _conditions(selected, batch)
     if outcome is not None:
@@ -75,7 +74,7 @@ def list_batches(
 
 
 def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str | None:
-    """The id of the newest of the selected results; see `pages.newest`."""
+    """Id of the newest selected result; see `pages.newest`."""
     row = newest(connection, select(results.c.id), selected, now)
     return None if row is None else str(row["id"])
 
@@ -83,8 +82,8 @@ def newest_id(connection: Connection, selected: ResultFilter, now: Utc) -> str |
 def _conditions(selected: ResultFilter, batch: str | None) -> list[ColumnElement[bool]]:
     if batch is None:
         return selected.conditions()
-    # The unique index begins with spacecraft and run: neither is left open.  Both are asked of the
-    # batch alone: asked of its result, they lead SQLite through all results of the spacecraft.
+    # The unique index begins with spacecraft and run: give both.  Take them from the batch:
+    # conditions on its result would make SQLite read all results of the spacecraft.
     in_runs = select(tables.runs.c.name) if selected.run is None else [selected.run]
     ids = select(batches.c.id).where(
         batches.c.spacecraft == selected.spacecraft,
@@ -96,7 +95,7 @@ def _conditions(selected: ResultFilter, batch: str | None) -> list[ColumnElement
 
 
 def read_result(connection: Connection, id: str) -> Row:
-    """A result by its id with its batch's input; raises `NotFound`."""
+    """Read a result with its batch's input by id; raises `NotFound`."""
     query = select(results, batches.c.input).join_from(results, batches).where(results.c.id == id)
     row = connection.execute(query).mappings().first()
     if row is None:
@@ -105,10 +104,10 @@ def read_result(connection: Connection, id: str) -> Row:
 
 
 def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) -> Row:
-    """The result that a what-if starts from, as `read_result`.
+    """Read the result that a what-if starts from, in the form of `read_result`.
 
-    `archived` says that the connection is to a batch of the archive; `kept`, that the what-if is
-    to be recorded.  Raises `WrongState` for both at once.
+    `archived` is True if the connection is to a batch of the archive; `kept`, if the what-if is to
+    be recorded.  Raises `WrongState` for both at once.
     """
     row = read_result(connection, id)
     if archived and kept:
@@ -120,14 +119,14 @@ def read_parent(connection: Connection, id: str, *, archived: bool, kept: bool) 
 
 
 def _archived(id: str) -> Select[tuple[str]]:
-    """The query for the spacecraft of an archived result."""
+    """SQL query for the spacecraft of an archived result."""
     what_if = select(tables.archived_what_ifs.c.batch_id).where(tables.archived_what_ifs.c.id == id)
     c = tables.archived_batches.c
     return select(c.spacecraft).where(or_(c.id == id, c.id == what_if.scalar_subquery()))
 
 
 def spacecraft_of(connection: Connection, id: str) -> str | None:
-    """The spacecraft of a result, recorded or archived; None where there is none of that id."""
+    """Spacecraft of a result, recorded or archived; None for an unknown id."""
     for query in (select(results.c.spacecraft).where(results.c.id == id), _archived(id)):
         found = connection.execute(query).scalar()
         if found is not None:
@@ -136,9 +135,9 @@ def spacecraft_of(connection: Connection, id: str) -> str | None:
 
 
 def read_record(connection: Connection, id: str, *, archived: bool = False) -> answers.Result:
-    """A result with its input and the what-ifs of its batch; raises `NotFound`.
+    """Read a result with its input and the what-ifs of its batch; raises `NotFound`.
 
-    `archived` says that the connection is to a batch of the archive.
+    `archived` is True if the connection is to a batch of the archive.
     """
     row = read_result(connection, id)
     what_ifs = (
@@ -167,7 +166,7 @@ def read_record(connection: Connection, id: str, *, archived: bool = False) -> a
 
 
 def answer_from_json(text: str | bytes) -> answers.RecordedAnswer:
-    """A stored answer, which may be of an earlier version of the service."""
+    """Decode a stored answer, which an earlier version of the service may have written."""
     return _ANSWERS.decode(text)
 
 
@@ -180,9 +179,9 @@ def _frame_of(row: Any) -> answers.FrameWithStars:
 
 
 def frame_of_result(connection: Connection, id: str) -> Row:
-    """The data for an overlay of a result; raises `NotFound`, also where there is no frame.
+    """Data for the overlay on a result's frame; raises `NotFound`, also without a frame.
 
-    The `settings` are those of the mission as they were for that result.
+    The `settings` are those of the mission at the time of the result.
     """
     read_result(connection, id)
     query = (
@@ -209,19 +208,19 @@ def frame_of_result(connection: Connection, id: str) -> Row:
 
 
 def summary_query() -> Select[Any]:
-    """The query for what `summary_of` shows."""
+    """SQL query for the columns that `summary_of` reads."""
     kept = [column for column in results.c if column.name not in ("answer", "spacecraft", "run")]
     named = [batches.c[name] for name in ("spacecraft", "run", "batch", "time", "received")]
     return select(*kept, *named).join_from(results, batches)
 
 
 def summary_of(row: Any) -> answers.Summary:
-    """A result in a list, without its stars and its attitude."""
+    """Convert a database row to an entry of a list of results, without stars and attitude."""
     return answers.Summary(**summary_fields(row))
 
 
 def summary_fields(row: Any) -> Row:
-    """The fields of a `Summary`."""
+    """Convert a database row to the fields of a `Summary`."""
     taken = ("id", "spacecraft", "batch", "run", "time", "received", "created", "identifier")
     return {
         **{name: row[name] for name in taken},
@@ -243,9 +242,9 @@ def measured(row: Any) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class ResultPlace:
-    """A result: its spacecraft, run and time, and the id of the current one of its batch.
+    """Position of a result: its spacecraft, run and time, and the current result of its batch.
 
-    Without a spacecraft the place is one among the results of all.
+    Without a spacecraft the position is among the results of all spacecraft.
     """
 
     spacecraft: str | None
@@ -255,14 +254,14 @@ class ResultPlace:
 
 
 def place_of(connection: Connection, id: str) -> ResultPlace:
-    """The spacecraft, run and time of a result."""
+    """Find the spacecraft, run and time of a result."""
     row = connection.execute(select(results).where(results.c.id == id)).one()
     standing = select(results.c.id).where(results.c.batch_id == row.batch_id, results.c.current)
     return ResultPlace(row.spacecraft, row.run, row.time_ns, connection.scalar(standing))
 
 
 def neighbours(connection: Connection, archive: Archive, place: ResultPlace) -> answers.Neighbours:
-    """The results before and after one in time, of its spacecraft and run."""
+    """Results before and after a result in time, of the same spacecraft and run."""
     sides = (_next(connection, archive, place, newest_first=side) for side in (True, False))
     return answers.Neighbours(place.current, *sides)
 
@@ -277,7 +276,7 @@ def _next(
     try:
         found = listing.first_rows(connection, 1, beyond)
     except Busy:
-        # Without the archive the page of a recorded batch is shown all the same.
+        # Without the archive the page of a recorded batch is still shown.
         return None
     return next((summary_of(each.shown) for each in found.rows), None)
 
@@ -289,26 +288,26 @@ _READ_AT_ONCE = 1_000
 
 @dataclass(frozen=True)
 class BatchSample:
-    """Some of the batches of a period, in random order; `total` is how many there are.
+    """Random sample of a period's batches; `total` is the number of batches in the period.
 
-    `first` and `last` are the times of the earliest and the latest batch of the
-    sample, None where there are none.
+    `first` and `last` are the times of the earliest and the latest batch of the sample, None for an
+    empty sample.
     """
 
     total: int
     first: str | None
     last: str | None
     rows: tuple[Row, ...]
-    """Rows of the batches: result id, input and options as they are stored."""
+    """Rows of the batches: result id, and input and options as stored."""
 
     @cached_property
     def batches(self) -> tuple[ObservationBatch, ...]:
-        """The batches with the options of their results, in the order of the rows."""
+        """Decoded batches with the options of their results, in the order of the rows."""
         return tuple(batch_with_options(row["input"], row["options"]) for row in self.rows)
 
 
 def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, Answer]:
-    """The batch that a result was made of, with the result's own options, and the answer."""
+    """Read the batch of a result, with the result's own options, and its answer."""
     row = read_result(connection, id)
     options = OptionsIn.model_validate_json(row["options"]).to_options()
     batch = submission_from_json(row["input"]).batch
@@ -316,7 +315,7 @@ def recorded_batch(connection: Connection, id: str) -> tuple[ObservationBatch, A
 
 
 def recorded_mission(connection: Connection, digest: str) -> Mission:
-    """A mission as its settings were when their digest was recorded."""
+    """Read a mission's recorded settings by their digest."""
     mission = _MISSIONS.get(digest)
     if mission is None:
         query = select(missions.c.settings).where(missions.c.digest == digest)
@@ -327,16 +326,16 @@ def recorded_mission(connection: Connection, digest: str) -> Mission:
     return mission
 
 
-# What a digest stands for never changes.
+# The content for a digest never changes.
 _MISSIONS: dict[str, Mission] = {}
 _MOST_MISSIONS = 64
 
 
 def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -> ObservationBatch:
-    """A recorded batch with the options of its result; `options` replace what they name of those.
+    """Decode a recorded batch with its result's options, some replaced by `options`.
 
-    `input` and `own` are the JSON texts that are stored.  Raises `BadBatch` for options of a
-    batch that holds a measured attitude.
+    `input` and `own` are the stored JSON texts.  Raises `BadBatch` for options of a batch that
+    holds a measured attitude.
     """
     batch = submission_from_json(input).batch
     if batch.measurement is not None and options is not None and options.model_fields_set:
@@ -348,7 +347,7 @@ def batch_with_options(input: str, own: str, options: OptionsIn | None = None) -
 
 
 def merged_options(own: Row, options: OptionsIn) -> OptionsIn:
-    """A result's own options with others in place of what they name."""
+    """Merge a result's own options with others, which take precedence."""
     merged = dict(own)
     for name, value in options.model_dump(exclude_none=True).items():
         merged[name] = merged.get(name, {}) | value if isinstance(value, dict) else value
@@ -358,10 +357,10 @@ def merged_options(own: Row, options: OptionsIn) -> OptionsIn:
 def sample_batches(
     connection: Connection, archive: Archive, selected: ResultFilter, size: int, seed: int = 0
 ) -> BatchSample:
-    """All batches of a period, or `size` of them: one drawn from each of as many parts.
+    """Sample a period: all batches, or `size` of them, one from each of as many equal parts.
 
-    Drawn and not every n-th, so that nothing periodic in the telemetry is met
-    always or never; the same seed draws the same.  The archived ones count as the earlier.
+    They are drawn at random, so that the sample neither hits nor misses every period of a periodic
+    effect; equal seeds draw equal samples.  Archived batches count as earlier than recorded ones.
     """
     conditions = selected.conditions()
     parts = sorted(parts_of(connection, selected), key=lambda each: each.first_ns)
@@ -372,7 +371,7 @@ def sample_batches(
     count = min(size, total)
     ranks = np.arange(1, count + 1)
     if count < total:
-        # Whole parts, so that none is drawn twice.
+        # Integer edges, so that no batch is drawn twice.
         edges = np.arange(count + 1) * total // count
         ranks = 1 + edges[:-1] + np.floor(rng.random(count) * np.diff(edges)).astype(int)
     rows: list[Row] = []
@@ -396,15 +395,15 @@ def sample_batches(
 def _of_part(
     archive: Archive, part: PlacedPart, selected: ResultFilter, at: list[int]
 ) -> list[Row]:
-    """The batches of a part at these places, from 0, among those that are selected."""
+    """Selected batches of an archive part at given positions, counted from 0."""
     ids = archive.current_ids(part, *bounds_of(selected)).take(at).to_pylist()
     read = archive.read(part.path, ["id", "options", *_SENT], [("id", "in", ids)])
     return [dict(row) for row in read.to_pylist()]
 
 
 def _at_ranks(connection: Connection, selected: ResultFilter, ranks: list[int]) -> list[Row]:
-    """The batches at these places, from 1, in the period's order of time."""
-    # The index holds all that the ranking needs; inputs are read of the chosen alone.
+    """Selected batches at given positions in the period's order of time, counted from 1."""
+    # The index holds all columns for the ranking; inputs are read of the chosen batches only.
     rank = func.row_number().over(order_by=PLACE).label("rank")
     ranked = select(results.c.batch_id, rank).where(*selected.conditions()).subquery()
     chosen = select(ranked.c.batch_id).where(ranked.c.rank.in_(bindparam("ranks", expanding=True)))

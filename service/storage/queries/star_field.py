@@ -1,8 +1,8 @@
-"""The stars of a batch in each tracker's field of view, and its trackers side by side.
+"""Star charts of a batch in the field of view of each tracker, and its trackers compared.
 
-Nothing is identified here: the outcomes are those of the answer that is shown, so
-that the chart of an old result shows that result.  Directions are given as `h_deg`, `v_deg`:
-that of (tan h, tan v, 1) in the tracker's axes.
+Nothing is identified here: the outcomes are those of the shown answer, so that the chart of an old
+result shows that result.  Directions are given as `h_deg`, `v_deg`: that of (tan h, tan v, 1) in
+the tracker's axes.
 """
 
 import math
@@ -28,21 +28,21 @@ from service.trends.measures import BatchStars
 from service.vectors import Matrix, Vector, read_only
 
 MARGIN = 1.25
-"""How far beyond the field of view stars are given, in fields of view."""
+"""Radius of a star chart, as a multiple of the radius of the field of view."""
 WIDEST_DEG = 15.0
 """Largest extent of the picture, which grows if stars of the answer lie far outside."""
 EDGE_STEP_DEG = 0.5
 
 
 class Boresight(Struct, frozen=True, kw_only=True):
-    """The boresight in the inertial frame."""
+    """Direction of a tracker's boresight in the inertial frame."""
 
     ra_deg: float
     dec_deg: float
 
 
 class CatalogStarPlace(Struct, frozen=True, kw_only=True):
-    """A catalog star in the field of view."""
+    """Position of a catalog star in a star chart."""
 
     id: str
     magnitude: float
@@ -51,9 +51,10 @@ class CatalogStarPlace(Struct, frozen=True, kw_only=True):
 
 
 class ObservedStarPlace(Struct, frozen=True, kw_only=True):
-    """An observed star with its outcome; `residual_arcsec` is observed minus predicted.
+    """Position of an observed star in a star chart, with its outcome and residual.
 
-    The residual is along h and along v, None if the attitude does not use the star.
+    The residual is observed minus predicted along h and along v, None if the attitude does not use
+    the star.
     """
 
     outcome: str
@@ -66,7 +67,7 @@ class ObservedStarPlace(Struct, frozen=True, kw_only=True):
 
 
 class TrackerField(Struct, frozen=True, kw_only=True):
-    """The view of one tracker; `zone_edges` are lines of [h, v] in degrees."""
+    """Star chart of one tracker; `zone_edges` are lines of [h, v] in degrees."""
 
     tracker: str
     boresight: Boresight
@@ -79,10 +80,10 @@ class TrackerField(Struct, frozen=True, kw_only=True):
 
 
 class StarField(Struct, frozen=True, kw_only=True):
-    """The views of all trackers of a batch.
+    """Star charts of all trackers of a batch.
 
     `through` is "quest", "triad" or "a_priori": the attitude by which catalog stars are drawn.
-    `same_catalog` says whether the run catalog is the one of the answer.
+    `same_catalog` is True if the run catalog is the one of the answer.
     """
 
     through: str
@@ -93,11 +94,11 @@ class StarField(Struct, frozen=True, kw_only=True):
 def star_field_of(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
 ) -> StarField:
-    """The view of every tracker of a batch, as an answer to it has identified the stars.
+    """Build the star charts of a batch's trackers, with the identifications of an answer.
 
-    The answer's attitude carries catalog stars into the tracker's axes.  Without one the
-    a priori attitude does, and the stars are displaced by its error.  Raises `BadInput`
-    for a batch that does not fit the mission.
+    The answer's attitude transforms catalog stars into the tracker's axes.  Without one the a
+    priori attitude does, and the stars are displaced by its error.  Raises `BadInput` for a batch
+    that does not fit the mission.
     """
     solved = answer.attitude
     presumed = presumed_attitude(batch, answer, mission)
@@ -123,10 +124,10 @@ def star_field_of(
 def presumed_attitude(
     batch: ObservationBatch, answer: Answer, mission: Mission
 ) -> PriorAttitude | None:
-    """The attitude about which stars were searched for; None where nothing gave one."""
+    """Attitude about which the stars were searched for; None if there was none."""
     prior = batch.a_priori
     if answer.attitude is not None and answer.path != "zone":
-        # The whole sky gave it.
+        # The whole sky was searched, and gave the attitude.
         prior = QuaternionPrior(read_only(np.array(answer.attitude.quaternion)))
     return None if prior is None else prior_attitude(prior, batch.time, mission, batch.position_km)
 
@@ -189,7 +190,7 @@ def _names(star: Star) -> list[str]:
 
 
 def _radius_deg(tracker: Tracker, seen: Vector, named: Vector, to_tracker: Matrix) -> float:
-    """How far from the boresight the picture reaches: all that the answer speaks of, if it can."""
+    """Radius of a star chart in degrees: all stars of the answer, within the largest extent."""
     boresight = np.array([0.0, 0.0, 1.0])
     spoken_of = np.concatenate([seen, named @ to_tracker.T])
     farthest = float(np.max(vectors.angle_between_deg(spoken_of, boresight), initial=0.0))
@@ -200,7 +201,7 @@ def _radius_deg(tracker: Tracker, seen: Vector, named: Vector, to_tracker: Matri
 def _near(
     run_catalog: RunCatalog, region: SearchRegion, boresight: Vector, radius_deg: float
 ) -> Vector:
-    """Rows of the stars of the zone within the picture, its corners included."""
+    """Rows of the run catalog's zone stars that lie within a star chart, its corners included."""
     most = min(90.0, radius_deg * math.sqrt(2.0))
     near = np.flatnonzero(run_catalog.direction @ boresight >= math.cos(math.radians(most)))
     angle = vectors.angle_between_deg(run_catalog.direction[near], region.axis)
@@ -210,7 +211,7 @@ def _near(
 def _zone_edges(
     region: SearchRegion, to_tracker: Matrix, radius_deg: float
 ) -> list[list[list[float]]]:
-    """The bounds of the zone where they cross the picture, as lines of [h, v] in degrees."""
+    """Boundaries of the search zone inside a star chart, as lines of [h, v] in degrees."""
     axis = to_tracker @ region.axis
     first = vectors.unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
@@ -253,9 +254,9 @@ def _number(value: float | Vector) -> float | None:
 def tracker_comparison(
     batch: ObservationBatch, mission: Mission, sky: SkyModel, answer: Answer
 ) -> list[Row]:
-    """A row of `tracker_values` for each tracker, with its sigma as the mission has it.
+    """Rows of `tracker_values` for each tracker of a batch, with the mission's sigma.
 
-    Offsets from the catalog are not known where the answer's run catalog is no longer there.
+    Offsets from the catalog are unknown if the answer's run catalog no longer exists.
     """
     run_catalog = sky.run_catalog(mission, batch.time)
     place: dict[str, int] = {}

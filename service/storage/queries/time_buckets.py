@@ -1,8 +1,8 @@
 """Sums and extremes over a period, read as coarsely as requested and exact at both ends.
 
-A bucket is a day, an hour or a part of one, with the columns of a rollup.  Whole
-days and hours come from the rollups; smaller buckets, and what a period cuts
-off at its ends, are summed up by the database from the batches themselves.
+A bucket is a day, an hour or a part of one, with the columns of a rollup.  Whole days and hours
+come from the rollups; smaller buckets, and the parts of buckets at the ends of a period, are summed
+up by the database from the batches themselves.
 """
 
 from collections.abc import Iterator, Sequence
@@ -34,20 +34,20 @@ from service.vectors import Vector
 
 Bucket = Literal["hour", "day"]
 Columns = dict[str, Vector]
-"""`unix_s`, at which each bucket begins, and columns of a rollup."""
+"""Arrays by name: `unix_s`, at which each bucket begins, and columns of a rollup."""
 Names = tuple[str, ...]
-"""Names of columns of a rollup."""
+"""Names of rollup columns."""
 MAX_BATCHES_SUMMED = 10_000
-"""The most batches of a period of hours in one answer; a longer one is shown by the hour."""
+"""Largest number of batches summed for an answer over hours; above it, rollups are read."""
 
 
 MAX_RATES = 20_000
-"""The most buckets of one answer: two years of hours, or half a century of days."""
+"""Largest number of buckets in an answer: two years of hours, or half a century of days."""
 
 
 @dataclass(frozen=True)
 class Trend:
-    """The rollups of one width: of spacecraft, and of their trackers."""
+    """Rollup tables of one bucket width: of spacecraft, and of their trackers."""
 
     table: Table
     tracker_table: Table
@@ -62,9 +62,9 @@ TRENDS: dict[Bucket, Trend] = {
 
 @dataclass(frozen=True)
 class BucketFilter:
-    """A spacecraft's current results in a run, from `start` to before `end`.
+    """Filter for a spacecraft's current results in a run, from `start` to before `end`.
 
-    Or those of one of its trackers, if it has several.
+    With a tracker, its values only.
     """
 
     spacecraft: str
@@ -75,7 +75,7 @@ class BucketFilter:
 
 
 def batches_about(connection: Connection, span: BucketFilter) -> int:
-    """The batches of all hours that a span touches: at least as many as it holds."""
+    """Count the batches of all hours that a span overlaps: an upper bound for the span."""
     table = tables.rollups_hourly.c
     query = select(func.sum(table.batches)).where(
         table.spacecraft == span.spacecraft,
@@ -101,7 +101,7 @@ def has_archived(connection: Connection, span: BucketFilter) -> bool:
 def read_buckets(
     connection: Connection, span: BucketFilter, level: Bucket, names: Names = tables.ROLLED_UP
 ) -> Columns:
-    """The buckets of a span, in order of time; those without a batch are left out."""
+    """Buckets of a span in order of time; those without a batch are left out."""
     width_s = TRENDS[level].width_s
     first = span.start.bucket(width_s)
     first += bucket_start(first, width_s).tai_ns < span.start.tai_ns
@@ -119,7 +119,7 @@ def read_buckets(
 
 
 def _finer(connection: Connection, span: BucketFilter, level: Bucket, names: Names) -> Columns:
-    """Buckets of less than an hour or day, which the span does not fill or leave."""
+    """Buckets for a span without a whole day or hour: from hourly rollups, or from batches."""
     if level == "day":
         return read_buckets(connection, span, "hour", names)
     return read_steps(connection, span, HOUR_S, names)
@@ -128,10 +128,10 @@ def _finer(connection: Connection, span: BucketFilter, level: Bucket, names: Nam
 def read_steps(
     connection: Connection, span: BucketFilter, width_s: int, names: Names = tables.ROLLED_UP
 ) -> Columns:
-    """Buckets of so much of a UTC day each, summed up by the database from the batches.
+    """Buckets of `width_s` seconds of a UTC day, summed up by the database from the batches.
 
-    The width divides a day.  However many batches there are, no more is held
-    of them than a row for each bucket.
+    The width divides a day.  However many batches there are, only one row for each bucket is held
+    in memory.
     """
     parts = [_steps_of([], span.start, width_s, names)]
     query = _steps_query(names, span.tracker is not None)
@@ -142,9 +142,9 @@ def read_steps(
 
 
 def steps_by_day(start: Utc, end: Utc, width_s: int) -> Iterator[tuple[Utc, Row]]:
-    """The midnight of each day of a period, and the values of `STEP` and `IN_PERIOD` for it.
+    """Midnight of each day in a period, with the values for the queries of `STEP` and `IN_PERIOD`.
 
-    Each day is read by itself: between two of them there may be a leap second.
+    Each day is read by itself: between two days there may be a leap second.
     """
     day, begin_ns = start.bucket(DAY_S), start.tai_ns
     while begin_ns < end.tai_ns:
@@ -167,20 +167,20 @@ def steps_by_day(start: Utc, end: Utc, width_s: int) -> Iterator[tuple[Utc, Row]
 def _step() -> ColumnElement[int]:
     since_ns = results.c.time_ns - bindparam("midnight_ns", type_=BigInteger)
     number = since_ns // bindparam("width_ns", type_=BigInteger)
-    # A leap second is of the step that it ends, as of its hour and day.
+    # A leap second belongs to the step that it ends, as with its hour and day.
     last = bindparam("last", type_=BigInteger)
     return case((number > last, last), else_=number).label("step")
 
 
 STEP = _step()
-"""The number of the step of its day that a result is in, as SQL."""
+"""SQL for the number of a result's bucket within its day."""
 IN_PERIOD = (
     results.c.current,
     results.c.run == bindparam("run"),
     results.c.time_ns >= bindparam("start_ns"),
     results.c.time_ns < bindparam("end_ns"),
 )
-"""The current results of a run and a period, as SQL."""
+"""SQL conditions for the current results of a run in a period."""
 
 
 @cache
@@ -205,20 +205,20 @@ def _joined(parts: Sequence[Columns]) -> Columns:
 
 
 def _columns(rows: Sequence[Any], names: Names) -> Columns:
-    """Rows as columns; `unix_s` is the first, the number of the bucket."""
-    # As tuples: numpy would ask each of SQLAlchemy's rows for more than its values.
+    """Convert rows to columns; the first, `unix_s`, holds the number of the bucket."""
+    # Convert to tuples: numpy would ask SQLAlchemy's rows for more than their values.
     table = np.array([tuple(row) for row in rows], dtype=float).reshape(-1, 1 + len(names))
     return dict(zip(("unix_s", *names), table.T, strict=True))
 
 
 def totals(buckets: Columns) -> Row:
-    """The counts of all buckets together."""
+    """Sum the counts of all buckets."""
     return {name: int(buckets[name].sum()) for name in tables.COUNTS}
 
 
 @cache
 def _whole_query(table: Table, names: Names) -> Select[Any]:
-    """The rows of a rollup in a period; made once, for to make it takes longer than to run it."""
+    """Query for the rows of a rollup in a period; cached, since building it is slow."""
     columns = table.c
     query = (
         select(columns.bucket, *(columns[name] for name in names))
@@ -252,13 +252,13 @@ def _owner(span: BucketFilter) -> Row:
 def buckets_between(
     bucket: ColumnElement[int], start: Utc | None, end: Utc | None, width_s: int
 ) -> list[ColumnElement[bool]]:
-    """The buckets of a width that a period from `start` to before `end` touches, as SQL."""
+    """SQL conditions for the buckets that a period from `start` to before `end` overlaps."""
     chosen = []
     if start is not None:
         chosen.append(bucket >= start.bucket(width_s))
     if end is not None:
         last = end.bucket(width_s)
-        # A bucket that begins just where the period ends lies outside it.
+        # A bucket that begins exactly at the end of the period lies outside it.
         last -= bucket_start(last, width_s).tai_ns == end.tai_ns
         chosen.append(bucket <= last)
     return chosen
@@ -273,9 +273,10 @@ def rates(
     end: Utc | None,
     bucket: Bucket,
 ) -> list[Rates]:
-    """The buckets that begin at or after `start`'s own and before `end`, oldest first.
+    """Counts of stars and batches in the hours or days of a period, oldest first.
 
-    Raises `BadInput` where there are more than `MAX_RATES`.
+    The first bucket is that of `start`; the last begins before `end`.  Raises `BadInput` where
+    there are more than `MAX_RATES`.
     """
     trend = TRENDS[bucket]
     table = trend.table

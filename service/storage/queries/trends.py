@@ -1,4 +1,4 @@
-"""Histories of quantities, thinned to what can be drawn, extremes kept; and the worst batches."""
+"""Histories of quantities, reduced to a chart's points with extremes kept; and worst batches."""
 
 import math
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -38,11 +38,11 @@ Strategy = Literal["minmax", "latest"]
 Source = Literal["batch", "hour", "day"]
 MAX_SIZE = 1_500
 PAGE = 1_000
-"""Batches that are read together where all of a period are given."""
+"""Number of batches read at a time where all batches of a period are requested."""
 LEAST_OF_CUT = 10
-"""Batches of a bucket that the span cuts, from which on it has a rate."""
+"""Least number of batches that give a rate for a bucket cut by the end of a span."""
 MAX_HOURS_READ = 1_500
-"""The most hours of one answer; a longer period is drawn from days at the finest."""
+"""Largest number of hours read for an answer; a longer period is read from days."""
 
 WIDTHS_S = (
     *(1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800),
@@ -53,10 +53,10 @@ WIDTHS_S = (
 
 @dataclass(frozen=True)
 class HistoryRequest:
-    """The wanted history: of what, which quantities, and how they are thinned out.
+    """Request for a history: spacecraft, run, quantities, and method of reduction.
 
-    Without an end it ends just after the latest batch, without a start it begins a day before
-    its end.
+    Without an end it ends just after the latest batch, without a start it begins a day before its
+    end.
     """
 
     spacecraft: str
@@ -66,13 +66,13 @@ class HistoryRequest:
     quantities: Sequence[QuantityName]
     strategy: Strategy = "latest"
     size: int = PAGE
-    """The most points."""
+    """Largest number of points in the history."""
     tracker: str | None = None
-    """The tracker whose values they are, of a spacecraft with several."""
+    """Tracker whose values are requested, for a spacecraft with several; None: the whole."""
 
 
 def history(connection: Connection, request: HistoryRequest) -> History:
-    """A history, its buckets or batches in columns, oldest first."""
+    """Read a history of quantities by buckets or batches, in columns, oldest first."""
     span = _span(connection, request)
     if span is None:
         return _empty(request)
@@ -89,7 +89,7 @@ def history(connection: Connection, request: HistoryRequest) -> History:
 def latest_time_of(
     connection: Connection, run: str, spacecraft: Collection[str] | None, *, now: Utc
 ) -> Utc | None:
-    """The time of the latest batch of some spacecraft in a run; None: of any."""
+    """Time of the latest batch in a run of the given spacecraft, or of any for None."""
     names = [None] if spacecraft is None else spacecraft
     found = (latest_time(connection, ResultFilter(run, name), now) for name in names)
     return max(filter(None, found), key=lambda moment: moment.tai_ns, default=None)
@@ -109,11 +109,11 @@ def _span(connection: Connection, request: HistoryRequest) -> BucketFilter | Non
 
 
 def _resolution(connection: Connection, span: BucketFilter, size: int) -> tuple[int, Source]:
-    """The narrowest buckets that are no more than requested, and what they are read from."""
+    """Narrowest bucket width that gives at most `size` points, and the source to read."""
     first_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns]).tolist()
     width_s = next((w for w in WIDTHS_S if _buckets(first_s, end_s, w) <= size), 0)
     if not width_s:
-        # Longer than the widest of them: as many months of thirty days as it takes.
+        # The period is longer than the widest steps allow: use multiples of thirty days.
         width_s = WIDTHS_S[-1] * (1 + int((end_s - first_s) / (WIDTHS_S[-1] * max(size - 1, 0.5))))
     if width_s < HOUR_S:
         are_few = (
@@ -154,9 +154,9 @@ def _thinned(
 
 
 def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter, counts: Vector) -> Vector:
-    """The hours of each bucket that lie within the span; NaN of one that has no rate.
+    """Hours of each bucket within the span; NaN for a bucket without a rate.
 
-    A batch more or less at the cut of a span would double the rate of a few.
+    At the ends of a span, one batch more or less would double the rate of a few.
     """
     begin_s, end_s = unix_seconds([span.start.tai_ns, span.end.tai_ns])
     covered_s = np.minimum(unix_s + width_s, end_s) - np.maximum(unix_s, begin_s)
@@ -165,7 +165,7 @@ def _covered_h(unix_s: Vector, width_s: int, span: BucketFilter, counts: Vector)
 
 
 class _Reduced:
-    """Narrow buckets drawn together into buckets, of which each begins at a row of `first`."""
+    """Narrow buckets merged into wider ones, each of which begins at a row in `first`."""
 
     def __init__(self, cells: Columns, first: Integers, covered_h: Vector) -> None:
         self._cells, self._first, self._covered_h = cells, first, covered_h
@@ -174,9 +174,9 @@ class _Reduced:
         return self._reduce(np.add, self._cells[name])
 
     def series(self, name: QuantityName) -> Series:
-        """One quantity: unit, how many batches have it, mean, least and greatest of a batch.
+        """History of one quantity: unit, number of batches with a value, mean, least and greatest.
 
-        What the rollups have no columns of is not known.
+        Columns that the rollups lack are NaN.
         """
         cells, quantity = self._cells, QUANTITIES[name]
         count = self.sum("batches")
@@ -189,7 +189,7 @@ class _Reduced:
             case BatchShare(part):
                 hit = part(cells)
                 mean = _over(self._reduce(np.add, hit), count)
-                # A batch is one or is none: all of a bucket's, some, or none at all.
+                # Each batch is either counted or not: a bucket has all, some, or none.
                 low, high = (hit == cells["batches"]).astype(float), (hit > 0).astype(float)
             case Rate():
                 mean = _over(count, self._covered_h)
@@ -244,7 +244,7 @@ _OF_TRACKERS = (
 
 
 def _values_query(span: BucketFilter) -> Select[Any]:
-    """The values of each batch of a span, or of its tracker in each."""
+    """Query for the values of each batch in a span, or of one tracker in each batch."""
     chosen = ResultFilter(span.run, span.spacecraft, span.start, span.end).conditions()
     if span.tracker is None:
         return _OF_BATCHES.where(*chosen)
@@ -254,10 +254,10 @@ def _values_query(span: BucketFilter) -> Select[Any]:
 def every_batch(
     reading: Callable[[], AbstractContextManager[Connection]], request: HistoryRequest
 ) -> Iterator[History]:
-    """The batches of a period as `history` gives the latest, oldest first, in pages.
+    """All batches of a period in columns as `history` returns them, oldest first, in pages.
 
-    At least one page is given, which may hold none.  Between two pages no
-    connection is held, so that a slow reader keeps none from others.
+    At least one page is given, which may be empty.  Between two pages no connection is held, so
+    that a slow reader blocks no other.
     """
     with reading() as connection:
         span = _span(connection, request)
@@ -278,7 +278,7 @@ def every_batch(
 
 
 def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest) -> History:
-    # One more than requested tells whether there are more.
+    # Ask for one more than requested, which shows if there are more.
     query = newest_first(_values_query(span)).limit(request.size + 1)
     rows = list(connection.execute(query).mappings())
     thinned = len(rows) > request.size
@@ -286,7 +286,7 @@ def _latest(connection: Connection, span: BucketFilter, request: HistoryRequest)
 
 
 def _about(span: BucketFilter) -> Row:
-    """The fields of a history that tell what it is of."""
+    """Fields of a history that name its spacecraft, run and period."""
     return {
         "spacecraft": span.spacecraft,
         "run": span.run,
@@ -318,7 +318,7 @@ def _of_batches(
 
 
 def _empty(request: HistoryRequest) -> History:
-    """The history, without an end, of a run without batches of the spacecraft."""
+    """History without points, for a run that has no batches of the spacecraft."""
     start = None if request.start is None else request.start.text
     about: Row = {"spacecraft": request.spacecraft, "run": request.run, "start": start, "end": None}
     if request.strategy == "latest":
@@ -340,11 +340,11 @@ def _empty(request: HistoryRequest) -> History:
 
 # The worst batches of a period by a quantity, found without reading all batches.
 #
-# The rollups have the greatest value of every hour.  Hours are read in descending
-# order of it until no batch of the remaining hours can be worse than those found.
+# The rollups have the greatest value of every hour.  Hours are read in descending order of that
+# value until no batch of the remaining hours can be worse than those found.
 
 RankedRow = tuple[float, int, str, str]
-"""(how bad, time_ns, batch_id, result id): in this order one batch is worse than another."""
+"""Sort key of a batch among the worst: (badness, time_ns, batch_id, result id)."""
 
 
 def worst_batches(
@@ -354,10 +354,10 @@ def worst_batches(
     limit: int,
     tracker: str | None = None,
 ) -> list[RankedBatch]:
-    """The `limit` batches with the greatest value, the worst first, of equals the newest.
+    """The `limit` batches with the greatest value, the worst first, newest first among equals.
 
-    Of an offset its size counts, whichever its sign.  With a tracker, of a spacecraft with
-    several, the values are the tracker's.
+    An offset counts by its absolute value.  With a tracker, of a spacecraft with several, the
+    values are the tracker's.
     """
     badness = _badness(by, results if tracker is None else tracker_values)
     found: list[RankedRow] = []
@@ -384,7 +384,7 @@ def worst_batches(
 
 
 def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
-    """The query over `results` with the values of a tracker beside them, if there is one."""
+    """Add the values of a tracker, if any, to a query over `results`."""
     if tracker is None:
         return query
     return query.select_from(OF_TRACKERS).where(tracker_values.c.tracker == tracker)
@@ -393,7 +393,7 @@ def _of_tracker(query: Select[Any], tracker: str | None) -> Select[Any]:
 def _hours(
     connection: Connection, selected: ResultFilter, by: RankedName, limit: int, tracker: str | None
 ) -> Iterator[tuple[int, int, float]]:
-    """The hours of a period as (begin, end, the greatest value in it), the greatest first.
+    """Hours of a period as (begin, end, greatest value), in descending order of that value.
 
     An hour that the period cuts is narrowed; its greatest value may lie outside.
     """
@@ -408,8 +408,8 @@ def _hours(
     )
     if tracker is not None:
         query = query.where(table.tracker == tracker)
-    # Of `limit` whole hours each holds a batch at least as bad as any in the hours beyond them;
-    # two more, because the ends of the period may cut away what made an hour one of the worst.
+    # Each of `limit` whole hours holds a batch at least as bad as any in later hours; two more,
+    # since the ends of the period may cut off the worst batch of an hour.
     query = query.order_by(most.desc(), table.bucket.desc()).limit(limit + 2)
     for bucket, greatest in connection.execute(query).all():
         begin, over = (bucket_start(bucket + ahead, HOUR_S).tai_ns for ahead in (0, 1))
@@ -451,9 +451,9 @@ def _shown(
 def latest_prior_errors(
     connection: Connection, selected: ResultFilter, limit: int
 ) -> tuple[list[float], list[float]]:
-    """The angles in deg from a priori to found attitudes, and the sigmas in deg of these.
+    """Angles in deg from a priori to found attitudes of the latest batches, and their sigmas.
 
-    They are those of the latest batches, newest first; a batch without either has none.
+    They are in order from the newest batch; batches without either are left out.
     """
     angle_deg, columns = results.c.a_priori_angle_deg, solutions.c
     variance_arcsec2 = columns.p11 + columns.p22 + columns.p33
@@ -469,7 +469,7 @@ def latest_prior_errors(
 def latest_samples(
     connection: Connection, selected: ResultFilter, subject: Subject, limit: int
 ) -> tuple[list[int], list[Sample]]:
-    """The times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
+    """Times in TAI ns of the latest batches, and their samples of a subject, oldest first."""
     _, tracker = quantity_and_tracker(subject)
     values = tracker_values if tracker else results
     columns = [values.c[name] for name in (*tables.COUNTED, "status", *tables.MEASURED)]

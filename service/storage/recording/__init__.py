@@ -1,1 +1,1 @@
-"""Writing results with their stars, and the events that tell of them."""
+"""Recording of results with their stars, of events, and of the signed chain over the record."""

@@ -1,4 +1,4 @@
-"""The answer to a batch, as the interface shows it and as it is recorded."""
+"""Answer to a batch: its form in the interface and its rows in the database."""
 
 import math
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ _AMBIGUOUS = int(Outcome.AMBIGUOUS)
 
 
 class StarRow(NamedTuple):
-    """One observed star and its identification."""
+    """Row of one observed star and its identification."""
 
     tracker: str
     position: int
@@ -39,10 +39,10 @@ def answer_of(
     frame: answers.FrameSummary | UnsetType = UNSET,
     warnings: Sequence[str] = (),
 ) -> answers.Answer:
-    """The answer to a batch; `id` is None for what is not recorded.
+    """Build the answer to a batch; `id` is None if nothing is recorded.
 
-    `warnings` follow those of the acquisition.  The time of recording stays None: it
-    is known when the rows are handed over.
+    `warnings` follow those of the acquisition.  The time that recording takes stays None until the
+    result is handed to the writer.
     """
     batch, run_catalog = acquisition.batch, acquisition.run_catalog
     return answers.Answer(
@@ -68,7 +68,7 @@ def answer_of(
 
 
 def star_rows(acquisition: Acquisition) -> list[StarRow]:
-    """Every star of every tracker, in the order observed."""
+    """Rows of all stars of every tracker, in the order observed."""
     return [
         StarRow(
             tracker=each.corrected.tracker.name,
@@ -83,7 +83,7 @@ def star_rows(acquisition: Acquisition) -> list[StarRow]:
 
 
 def rows_of_stars(answer: answers.Answer) -> list[dict[str, Any]]:
-    """Every star of an answer as a row of the table."""
+    """Convert every star of an answer to a row of the table `star_results`."""
     return [
         {
             "result_id": answer.id,
@@ -119,7 +119,7 @@ def _tracker_answer(result: TrackerResult, run_catalog: RunCatalog) -> answers.T
 
 def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[answers.Star]:
     found, seen = result.identification, result.corrected
-    # Plain numbers: taking single ones out of arrays costs more than all the rest.
+    # Convert arrays to plain numbers at once: taking single elements out costs more than the rest.
     rows = found.star.tolist()
     columns = zip(
         found.outcome.tolist(),
@@ -142,7 +142,7 @@ def _stars(result: TrackerResult, run_catalog: RunCatalog) -> list[answers.Star]
             if found.rival_probability:
                 rival_probabilities = list(found.rival_probability[k])
         flags = ["outside_field_of_view"] if outside else []
-        # NaN is not equal to itself, and is no number of JSON.
+        # NaN does not equal itself, and is no JSON number.
         if mag != mag:
             flags.append("no_magnitude")
         if row >= 0 and rows.count(row) > 1:
@@ -241,7 +241,7 @@ class _State(Struct):
 
 
 class _Tracked(Struct):
-    """As much of an answer as tells the state of tracking."""
+    """The part of an answer that gives the state of tracking."""
 
     tracking: _State | None = None
 
@@ -250,6 +250,6 @@ _TRACKED = msgspec.json.Decoder(_Tracked)
 
 
 def state_in(answer: str | bytes) -> str | None:
-    """The state that an answer tells; None of a batch that did not ask for the last attitude."""
+    """Tracking state in an answer; None if the batch did not ask for the last attitude."""
     tracking = _TRACKED.decode(answer).tracking
     return None if tracking is None else tracking.state

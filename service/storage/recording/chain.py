@@ -1,8 +1,8 @@
-"""The chain of the record: what a leaf, a fact and a head are, and how they are hashed.
+"""Chain of the record: definition and hashing of its leaves, facts and heads.
 
 Every result has a leaf, a hash over all that is kept of it.  Rows of other tables have facts.  A
-head is a statement over the leaves and facts since the head before it: their number, the root of
-a Merkle tree over them (RFC 6962, section 2.1, with SHA-256), and the hash of the head before.
+head is a statement over the leaves and facts since the head before it: their number, the root of a
+Merkle tree over them (RFC 6962, section 2.1, with SHA-256), and the hash of the head before.
 """
 
 import hashlib
@@ -20,11 +20,11 @@ from service.storage.sql.migrations import all_tables
 from service.storage.sql.statements import rows_of
 
 LEAF_BYTES = 16
-"""The size of a leaf: to find another record with the same leaf takes 2^128 trials."""
+"""Length of a leaf in bytes: to find another record with the same leaf takes 2^128 trials."""
 HELD_BYTES, LARGE_BYTES = 2_047, 65_536
-"""Python lets other threads run while it hashes more than the former at a time.
+"""Largest input that Python hashes without releasing the interpreter's lock; largest hashed so.
 
-To get its turn back takes the writer longer than the hash, unless that is of more than the latter.
+Taking the lock back takes the writer longer than a hash of fewer than `LARGE_BYTES`.
 """
 
 _encode = msgspec.json.Encoder(order="sorted").encode
@@ -36,30 +36,30 @@ class Statement(msgspec.Struct, frozen=True, kw_only=True):
     version: int = 1
     number: int
     previous: str
-    """SHA-256 of the statement before; of the first one empty."""
+    """SHA-256 of the preceding statement in hexadecimal digits; empty in the first one."""
     made: str
-    """UTC."""
+    """UTC at which the head was made."""
     first: int
-    """The lowest place of a result that has a leaf; negative: of before the chain."""
+    """Lowest place of a result with a leaf; negative: recorded before there was a chain."""
     last: int
-    """The highest place."""
+    """Highest place of a result with a leaf."""
     counts: dict[str, int]
-    """Leaves and facts since the head before, by kind."""
+    """Number of leaves and facts since the preceding head, by kind."""
     root: str
-    """The root of the Merkle tree over them."""
+    """Root of the Merkle tree over the leaves and facts, in hexadecimal digits."""
 
     def encoded(self) -> bytes:
-        """The bytes that are hashed and signed."""
+        """Bytes of the statement that are hashed and signed."""
         return _encode(self)
 
 
 def sha256_of(statement: Statement) -> str:
-    """The hash of a statement, by which the next one and everybody outside name it."""
+    """SHA-256 of a statement, by which the next statement and outside parties refer to it."""
     return hashlib.sha256(statement.encoded()).hexdigest()
 
 
 def leaf_of(id: str, answer: str, content: bytes, adopted: bool) -> bytes:
-    """The leaf of a result: its id, its answer as sent, and the encoding of all of its rows.
+    """Leaf of a result, a hash over its id, its answer as sent, and the encoding of all its rows.
 
     `adopted` is True if the result was current when it was recorded.
     """
@@ -68,12 +68,12 @@ def leaf_of(id: str, answer: str, content: bytes, adopted: bool) -> bytes:
 
 
 def digest_of_content(content: bytes) -> bytes:
-    """The BLAKE2b (32 bytes) of the encoding of all rows of a result."""
+    """BLAKE2b hash (32 bytes) of the encoding of all rows of a result."""
     return _hashed(hashlib.blake2b(digest_size=32), content)
 
 
 def _hashed(state: Any, content: bytes) -> bytes:
-    """The digest of some kilobytes, without giving the interpreter's lock away."""
+    """Hash some kilobytes without releasing the interpreter's lock."""
     view = memoryview(content)
     step = HELD_BYTES if len(content) <= LARGE_BYTES else len(content)
     for first in range(0, len(content), step):
@@ -83,14 +83,14 @@ def _hashed(state: Any, content: bytes) -> bytes:
 
 
 def leaf_of_hashes(id: str, answer_sha256: bytes, content: bytes, adopted: bool) -> bytes:
-    """`leaf_of` with the SHA-256 of the answer and the digest of the content in their place."""
+    """Leaf of a result from the hashes of its answer and of its content; see `leaf_of`."""
     mark = b"\x01" if adopted else b"\x00"
     whole = b"result\x00" + id.encode() + b"\x00" + mark + answer_sha256 + content
     return hashlib.sha256(whole).digest()[:LEAF_BYTES]
 
 
 def leaf_of_fact(kind: str, key: str, sha256: str) -> bytes:
-    """The leaf of a fact."""
+    """Leaf of a fact: a hash over the table and action, the row's key, and the row's SHA-256."""
     whole = f"fact\x00{kind}\x00{key}\x00{sha256}".encode()
     return hashlib.sha256(whole).digest()[:LEAF_BYTES]
 
@@ -99,7 +99,7 @@ def leaf_of_fact(kind: str, key: str, sha256: str) -> bytes:
 
 
 def root_of(leaves: Sequence[bytes]) -> bytes:
-    """The root over leaves in order; of none the hash of nothing."""
+    """Root of the Merkle tree over leaves in order; the hash of the empty string without leaves."""
     if not leaves:
         return hashlib.sha256(b"").digest()
     level = [_of_leaf(each) for each in leaves]
@@ -109,7 +109,7 @@ def root_of(leaves: Sequence[bytes]) -> bytes:
 
 
 def path_to(leaves: Sequence[bytes], index: int) -> list[bytes]:
-    """The audit path of a leaf: the hashes that lead from it to the root, from below."""
+    """Audit path of a leaf: the sibling hashes from the leaf up to the root of the Merkle tree."""
     level, path = [_of_leaf(each) for each in leaves], []
     while len(level) > 1:
         beside = index ^ 1
@@ -120,7 +120,7 @@ def path_to(leaves: Sequence[bytes], index: int) -> list[bytes]:
 
 
 def root_from(leaf: bytes, index: int, size: int, path: Iterable[bytes]) -> bytes | None:
-    """The root that an audit path leads to (RFC 9162, section 2.1.3.2); None for a wrong path."""
+    """Root of a Merkle tree from a leaf and an audit path (RFC 9162, 2.1.3.2); None if invalid."""
     if not 0 <= index < size:
         return None
     last, found = size - 1, _of_leaf(leaf)
@@ -146,7 +146,7 @@ def _of_pair(left: bytes, right: bytes) -> bytes:
 
 
 def _above(level: Sequence[bytes]) -> list[bytes]:
-    """The level above; a hash without a neighbour goes up as it is."""
+    """Next level of a Merkle tree; an unpaired hash moves up unchanged."""
     pairs = zip(level[::2], level[1::2], strict=False)
     found = [_of_pair(left, right) for left, right in pairs]
     return [*found, level[-1]] if len(level) % 2 else found
@@ -173,11 +173,11 @@ _OWN: Mapping[Table, Bound] = {
 
 @cache
 def bound_tables() -> Mapping[Table, Bound]:
-    """The tables whose rows are facts when they are added, and when `closed_by` is set.
+    """Tables whose rows get a fact in the chain when added, and when their `closed_by` is set.
 
-    Those of features say so themselves, in their `info`.  What changes or removes such a row
-    otherwise calls `note_changed` or `note_removed`.  Texts and numbers are in a fact; binary
-    columns are not, since another column has their digest.
+    Tables of features declare this in their `info`.  Code that otherwise changes or removes such a
+    row calls `note_changed` or `note_removed`.  A fact covers texts and numbers; it leaves out
+    binary columns, since another column has their digest.
     """
     declared = {each: each.info.get(BOUND) for each in all_tables()}
     for table, bound in declared.items():
@@ -190,12 +190,12 @@ RESULTS, REMOVED = "results", "results.removed"
 
 
 def key_of(table: Table, row: Row) -> str:
-    """The key of a row in its facts."""
+    """Key that names a row in its facts."""
     return " ".join(str(row[column.name]) for column in table.primary_key)
 
 
 def content_of(table: Table, row: Row, *, closed: bool = False) -> str:
-    """The SHA-256 of what a fact has of a row, in hexadecimal digits."""
+    """SHA-256 of the columns of a row that its fact covers, in hexadecimal digits."""
     bound = bound_tables()[table]
     left_out = bound.free if closed else bound.free | bound.open_free | {bound.closed_by}
     content = {
@@ -209,19 +209,19 @@ def content_of(table: Table, row: Row, *, closed: bool = False) -> str:
 
 
 def note_changed(connection: Connection, table: Table, id: str) -> None:
-    """Add a fact: the row of this id has another content from now on."""
+    """Add a fact to the chain for a row whose content has changed."""
     (key,) = table.primary_key
     for row in rows_of(connection, select(table).where(key == id)):
         _note(connection, [(table.name, key_of(table, row), content_of(table, row))])
 
 
 def note_removed(connection: Connection, table: Table, ids: Sequence[object]) -> None:
-    """Add a fact for each of these rows: it is to be deleted."""
+    """Add a fact to the chain for each row that is about to be deleted."""
     _note(connection, [(table.name, str(id), "") for id in ids])
 
 
 def note_results_removed(connection: Connection, batch_ids: Sequence[str]) -> None:
-    """Add a fact with the places of the results of these batches, which are to be deleted."""
+    """Add a fact with the places of all results of batches that are about to be deleted."""
     query = select(tables.results.c.seq).where(tables.results.c.batch_id.in_(batch_ids))
     ranges: list[list[int]] = []
     for place in sorted(set(connection.scalars(query)) - {0}):

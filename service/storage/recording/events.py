@@ -1,8 +1,8 @@
 """Annotations, and recent events in order of commit, for clients that reconnect.
 
-An event is noted in the transaction of the change that it reports.  Its number
-comes from one row whose lock is held until the commit: in no process does an
-event become visible after one with a higher number, and no number is left out.
+An event is noted in the transaction of the change that it reports.  Its number comes from one row
+whose lock is held until the commit: in every process events become visible in the order of their
+numbers, without a gap.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ EventKind = Literal[
 ]
 EVENT_KINDS: tuple[EventKind, ...] = get_args(EventKind)
 KEPT = 20_000
-"""Events that are kept; a client that missed more starts anew."""
+"""Number of events kept; a client that missed more starts anew."""
 PRUNED_EVERY = 500
 
 _OUTBOX = "events"
@@ -62,7 +62,7 @@ class Event:
     spacecraft: str | None
     data: str
     at: str | None
-    """The time of the event; None: an earlier version recorded it."""
+    """Time of the event; None if an earlier version recorded it."""
 
     def concerns(self, run: str | None, spacecraft: Collection[str] | None) -> bool:
         """True if the event passes a filter by run and spacecraft; None: every one passes.
@@ -85,7 +85,7 @@ def add_event(
     run: str | None = None,
     spacecraft: str | None = None,
 ) -> None:
-    """Add an event to the transaction; it gets its number at the end of the transaction."""
+    """Add an event to a transaction; it is numbered at the end of the transaction."""
     text = msgspec.json.encode(data).decode()
     row = {"kind": kind, "run": run, "spacecraft": spacecraft, "data": text}
     connection.info.setdefault(_OUTBOX, []).append(row)
@@ -93,9 +93,9 @@ def add_event(
 
 @contextmanager
 def numbered(connection: Connection) -> Iterator[None]:
-    """Number the events of a transaction when everything else in it is done.
+    """Number the events of a transaction after everything else in it is done.
 
-    The later the lock on the numbers is taken, the less others wait for it.
+    The later the lock on the numbers is taken, the less other transactions wait for it.
     """
     outbox: list[Row] = []
     connection.info[_OUTBOX] = outbox
@@ -113,12 +113,12 @@ def numbered(connection: Connection) -> Iterator[None]:
 
 
 def undone(connection: Connection, length: int) -> None:
-    """Drop the events noted since the outbox had that length: their changes were rolled back."""
+    """Drop all but the first `length` noted events: the others' changes were rolled back."""
     del connection.info.get(_OUTBOX, [])[length:]
 
 
 def noted(connection: Connection) -> int:
-    """How many events wait for their numbers."""
+    """Count the events of a transaction that have no number yet."""
     return len(connection.info.get(_OUTBOX, []))
 
 
@@ -128,15 +128,15 @@ def last_event(connection: Connection) -> int:
 
 
 def last_event_about(connection: Connection, spacecraft: Collection[str]) -> int:
-    """The number of the latest event about one of these; none before those that are kept."""
+    """Number of the latest event about any given spacecraft, else one before the oldest kept."""
     found = select(func.max(events.c.id)).where(events.c.spacecraft.in_(spacecraft))
     return max(connection.scalar(found) or 0, (first_event(connection) or 1) - 1)
 
 
 def events_after(connection: Connection, last: int, limit: int) -> Sequence[Event] | None:
-    """The events after a number, oldest first; None if some of them are no longer kept.
+    """Events after a number, oldest first; None if some of them are no longer kept.
 
-    None too for a number that was never assigned: it is another database's.
+    None too for a number that was never assigned, which comes from another database.
     """
     query = select(events).where(events.c.id > last).order_by(events.c.id).limit(limit)
     found = [Event(**row) for row in rows_of(connection, query)]
@@ -146,39 +146,39 @@ def events_after(connection: Connection, last: int, limit: int) -> Sequence[Even
 
 
 def first_event(connection: Connection) -> int | None:
-    """The number of the oldest event that is kept."""
+    """Number of the oldest event kept; None without events."""
     first: int | None = connection.scalar(select(func.min(events.c.id)))
     return first
 
 
 def events_between(connection: Connection, since: Utc, until: Utc) -> Sequence[Event]:
-    """The kept events that were recorded from `since` to before `until`, oldest first."""
+    """Events recorded from `since` to before `until` and still kept, oldest first."""
     recorded = events.c.at >= since.text, events.c.at < until.text
     query = select(events).where(*recorded).order_by(events.c.id)
     return [Event(**row) for row in rows_of(connection, query)]
 
 
 class Bell:
-    """Wakes those in event loops who wait for events; rung from any thread after a commit."""
+    """Notifier that wakes event loops waiting for events; rung from any thread after a commit."""
 
     def __init__(self) -> None:
         self._subscribed: dict[asyncio.Event, asyncio.AbstractEventLoop] = {}
         self._lock = threading.Lock()
 
     def subscribe(self) -> asyncio.Event:
-        """An event of the running loop that is set after each commit with recorded events."""
+        """Create an asyncio event in the running loop, set after each commit of events."""
         news = asyncio.Event()
         with self._lock:
             self._subscribed[news] = asyncio.get_running_loop()
         return news
 
     def unsubscribe(self, news: asyncio.Event) -> None:
-        """Stop setting an event."""
+        """Stop setting an asyncio event of a subscriber."""
         with self._lock:
             self._subscribed.pop(news, None)
 
     def ring(self) -> None:
-        """Set the events of all subscribers."""
+        """Wake all subscribers."""
         with self._lock:
             subscribed = list(self._subscribed.items())
         for news, loop in subscribed:
@@ -207,7 +207,7 @@ def list_annotations(
     limit: int,
     cursor: str | None,
 ) -> Page[Annotation]:
-    """Annotations that touch the period from `start` to before `end`, the latest written first.
+    """List annotations that overlap the period from `start` to before `end`, newest first.
 
     Those of a spacecraft include those about every spacecraft.
     """
@@ -257,27 +257,27 @@ def _add_annotation_event(connection: Connection, shown: Annotation, *, deleted:
 
 CHANNEL = "acquire_events"
 WAIT_S = 0.5
-"""The time between two looks at whether the thread is to end."""
+"""Seconds between two checks whether the listening thread should end."""
 RECONNECT_S = 1.0
 
 
 class HeardEvents:
-    """A thread that wakes a service when another one has recorded events on PostgreSQL.
+    """Thread that wakes this service when another one has recorded events on PostgreSQL.
 
-    It listens with a connection of its own until it is closed.  The table of events is the truth;
-    a notification says only that it is worth reading.  A service whose connection is cut meanwhile
-    reads the table each second all the same.
+    It listens on a connection of its own until it is closed.  A notification only says that the
+    table of events is worth reading.  A service whose connection is cut still reads the table each
+    second.
     """
 
     def __init__(self, url: URL, bell: Bell) -> None:
-        """The `bell` is rung after commits with events, also those of this service."""
+        """Start listening; the `bell` rings after commits with events, also this service's own."""
         self._url, self._bell = url, bell
         self._closed = threading.Event()
         self._thread = threading.Thread(target=self._run, name="heard-events", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread."""
+        """End the listening thread."""
         self._closed.set()
         self._thread.join()
 
@@ -288,7 +288,7 @@ class HeardEvents:
             self._url,
             poolclass=NullPool,
             isolation_level="AUTOCOMMIT",
-            # One that was cut cannot be reset.
+            # A connection that was cut cannot be reset.
             pool_reset_on_return=None,
         )
         while not self._closed.is_set():

@@ -1,9 +1,8 @@
-"""Recorded batches and Idempotency-Keys; and digests of what the record keeps.
+"""Identities of recorded batches, Idempotency-Keys, and digests over recorded rows.
 
-`verify` computes the digests again, of each result and of each row of settings that it names:
-a digit that changed later, in an answer, an input, a column or a star, does not pass.  A digest
-leaves null columns out, so that a column which a later version adds changes no digest that was
-made before it.
+`verify` computes the digests again, of each result and of each row of settings that it names, and
+finds any digit changed later in an answer, an input, a column or a star.  A digest leaves null
+columns out, so that a column added by a later version changes no earlier digest.
 """
 
 from collections.abc import Callable, Collection, Sequence
@@ -25,30 +24,30 @@ from service.storage.sql.dialects import Dialect, dialect_of
 from service.storage.sql.statements import execute
 
 Identity = tuple[str, str, str]
-"""(spacecraft, run, batch): unique among submissions."""
+"""Identity of a batch, unique among submissions: (spacecraft, run, batch)."""
 
 OwnKey = tuple[str, str]
-"""The id of a token and an Idempotency-Key: keys of different tokens are different keys.
+"""Id of a token and an Idempotency-Key: the same key of another token is a different key.
 
-The id is empty where a key came without a token.
+The id is empty for a key that came without a token.
 """
 
 
 class ExistingResult(Struct, frozen=True):
-    """The result that holds an identity or a key, and the fingerprint of its body."""
+    """Recorded result for an identity or a key, with the fingerprint of its body."""
 
     result_id: str
     fingerprint: str
     archived: bool = False
-    """True if its batch is in the archive."""
+    """True if the result's batch is in the archive."""
 
 
 class PredictionOutdated(Busy):
-    """Another service recorded an attitude after the one that a batch was predicted from."""
+    """Error: another service recorded a later attitude than the one a batch was predicted from."""
 
 
 class ArchivedMeanwhile(Exception):
-    """A batch that was to be new is one that another process has just archived."""
+    """Error: another process archived, just now, a batch that was to be recorded as new."""
 
 
 def identity_of(batch: ObservationBatch) -> Identity:
@@ -58,7 +57,7 @@ def identity_of(batch: ObservationBatch) -> Identity:
 
 @dataclass
 class Registry:
-    """The recorded ones of some identities and keys."""
+    """Recorded results found for a set of identities and keys."""
 
     identities: dict[Identity, ExistingResult] = field(default_factory=dict)
     keys: dict[OwnKey, ExistingResult] = field(default_factory=dict)
@@ -66,10 +65,10 @@ class Registry:
     def holder(
         self, identity: Identity, key: OwnKey | None, fingerprint: str
     ) -> ExistingResult | KeyReused | Conflict | None:
-        """The recorded result of this body, or None; the error where it is of another body.
+        """Find the recorded result with this body; None if new, an error if its name is taken.
 
-        That is `KeyReused` where the key belongs to another body, which is
-        looked at first, and `Conflict` where the identity does.
+        The error is `KeyReused` where the key belongs to another body, which is checked first, and
+        `Conflict` where the identity does.
         """
         by_key = None if key is None else self.keys.get(key)
         if key is not None and by_key is not None:
@@ -87,7 +86,7 @@ class Registry:
         return by_identity
 
     def enter(self, identity: Identity, key: OwnKey | None, taken: ExistingResult) -> None:
-        """Note a new holder, so that later submissions find it."""
+        """Note a new result for its identity and key, so that later submissions find it."""
         self.identities[identity] = taken
         if key is not None:
             self.keys[key] = taken
@@ -96,7 +95,7 @@ class Registry:
 def look_up(
     connection: Connection, identities: Collection[Identity], keys: Collection[OwnKey] = ()
 ) -> Registry:
-    """The recorded results of these identities and keys."""
+    """Look up the recorded results of identities and keys."""
     registry = Registry()
     dialect = dialect_of(connection)
     if identities:
@@ -114,9 +113,10 @@ def look_up(
 
 
 def require_not_archived(connection: Connection, identities: Collection[Identity]) -> None:
-    """Raise `ArchivedMeanwhile` if one of the batches that were just inserted is archived.
+    """Raise `ArchivedMeanwhile` if one of the batches just inserted is archived.
 
-    The insert waits for a transaction that archives the same batch, and this sees its end.
+    The insert waits for a transaction that archives the same batch, and the check then sees its
+    outcome.
     """
     if identities and _rows(connection, _archived(dialect_of(connection)), identities):
         raise ArchivedMeanwhile
@@ -129,7 +129,7 @@ def _rows(connection: Connection, sql: str, wanted: Collection[object]) -> Seque
 def remember_keys(
     connection: Connection, keys: Sequence[tuple[Identity, OwnKey, ExistingResult]]
 ) -> list[AcquisitionError | None]:
-    """Give keys to bodies that are recorded without them; the error of each that another has."""
+    """Assign keys to bodies recorded without one; an error for each key of another body."""
     outcomes: list[AcquisitionError | None] = []
     for identity, key, taken in keys:
         holder = look_up(connection, (), [key]).holder(identity, key, taken.fingerprint)
@@ -140,7 +140,7 @@ def remember_keys(
 
 
 def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
-    """A row of the table of keys."""
+    """Database row that assigns an Idempotency-Key to a result."""
     token_id, name = key
     return {
         "token_id": token_id,
@@ -151,7 +151,7 @@ def key_row(key: OwnKey, taken: ExistingResult) -> dict[str, str]:
 
 
 def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, bytes]:
-    """The answers of recorded results, byte for byte as first sent."""
+    """Answers of recorded results by id, byte for byte as first sent."""
     sql = f"SELECT id, answer FROM results WHERE id IN ({dialect_of(connection).wanted_texts})"
     rows = _rows(connection, sql, ids) if ids else ()
     return {id: unpack(answer).encode() for id, answer in rows}
@@ -163,7 +163,8 @@ def stored_answers(connection: Connection, ids: Collection[str]) -> dict[str, by
 
 @cache
 def _known_by_identity(dialect: Dialect) -> str:
-    # One statement sees one moment: a batch that is being archived is found in one of the two.
+    # A single statement sees a single moment: a batch being archived is found in one of both
+    # tables.
     return f"{_by_identity(dialect, 'batches', archived=0)} UNION ALL {_archived(dialect)}"
 
 
@@ -194,9 +195,9 @@ def _by_key(dialect: Dialect) -> str:
 
 BYTES = 8
 SETTINGS = (tables.missions, tables.catalogs, tables.mission_uses)
-"""The tables whose rows have a digest each, `row_digest`."""
+"""Tables of settings, with a digest (`row_digest`) in each row."""
 _NO_CONTENT = ("results.current", "results.seq", "results.digest", "mission_uses.id")
-"""Columns without content: the mark of the current result, places in an order, digests."""
+"""Columns left out of digests: the mark of the current result, places in an order, digests."""
 
 _encode = msgspec.json.Encoder().encode
 _in_order = itemgetter("tracker", "position")
@@ -209,12 +210,12 @@ def digest_of(
     batch: Row | None = None,
     frame: Row | None = None,
 ) -> int:
-    """The digest of the rows of a result, 63 bits of BLAKE2b; see `encoded_rows`."""
+    """Digest over all rows of a result, 63 bits of BLAKE2b; see `encoded_rows`."""
     return digest_of_encoded(encoded_rows(result, stars, solution, batch, frame))
 
 
 def digest_of_encoded(encoded: bytes) -> int:
-    """`digest_of` of rows that are encoded already."""
+    """Digest of the encoded rows of a result, 63 bits of BLAKE2b."""
     return int.from_bytes(blake2b(encoded, digest_size=BYTES).digest(), "big") >> 1
 
 
@@ -225,7 +226,7 @@ def encoded_rows(
     batch: Row | None = None,
     frame: Row | None = None,
 ) -> bytes:
-    """The rows of a result as bytes, the same from any database.
+    """Encode the rows of a result as bytes, the same from any database.
 
     `batch` and `frame` are given for the first result of a batch, and not for a what-if.
     """
@@ -243,23 +244,23 @@ def encoded_rows(
 
 
 def digest_of_row(table: Table, row: Row) -> int:
-    """The digest of a row of `SETTINGS` or `tracker_values`."""
+    """Digest over a row of `SETTINGS` or `tracker_values`."""
     return digest_of_encoded(_encode(_content(table)(row)))
 
 
 def made_later(digest: int) -> int:
-    """The digest as it is kept where it was made after the result: at an upgrade."""
+    """Stored form of a digest computed later than its result was recorded, at an upgrade."""
     return ~digest
 
 
 def agrees(stored: int | None, digest: int) -> bool:
-    """True if a digest that is kept, if any, is this one, whenever it was made."""
+    """True if no digest is stored, or the stored one equals `digest`, in either stored form."""
     return stored in (None, digest, made_later(digest))
 
 
 @cache
 def _content(table: Table) -> Callable[[Row], dict[str, object]]:
-    """A function that gives the content of a row as it comes back from any database."""
+    """Build a function that converts a row to its content, the same from any database."""
     columns = [
         (each.name, isinstance(each.type, Double))
         for each in table.columns

@@ -8,14 +8,14 @@ import time
 _ALPHABET = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"  # Crockford's: no I, L, O, U
 _RANDOM_BITS = 80
 _AT_ONCE = 64
-"""Identifiers whose random bits are requested together: a system call is slow."""
+"""Number of identifiers whose random bits are requested together: a system call is slow."""
 LENGTH = 26
 _SHIFTS = range(10 * (LENGTH // 2 - 1), -1, -10)
 _PAIRS = [first + second for first in _ALPHABET for second in _ALPHABET]
 
 
 class Ulids:
-    """Makes identifiers that rise strictly within one process, also within a millisecond."""
+    """Generator of identifiers that increase strictly within a process and a millisecond."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
@@ -23,7 +23,7 @@ class Ulids:
         self._random = b""
 
     def new(self) -> str:
-        """The next identifier: 48 bits of Unix milliseconds, 80 random ones."""
+        """Generate the next identifier: 48 bits of Unix milliseconds and 80 random bits."""
         now = time.time_ns() // 1_000_000 << _RANDOM_BITS
         with self._lock:
             if not self._random:
@@ -39,7 +39,7 @@ class Ulids:
 
 
 def following_ulid(id: str) -> str:
-    """The identifier that follows another one."""
+    """Identifier that directly follows another one in order."""
     value = 0
     for letter in id:
         value = value << 5 | _ALPHABET.index(letter)
@@ -51,7 +51,7 @@ def _text_of(value: int) -> str:
 
 
 def derived_ulid(id: str, *of: str) -> str:
-    """An identifier of the same millisecond as another; the same again for the same texts."""
+    """Identifier of the same millisecond as another one; equal texts give an equal identifier."""
     digest = hashlib.sha256("\0".join((id, *of)).encode()).digest()
     value = int.from_bytes(digest[: _RANDOM_BITS // 8], "big")
     shifts = range(_RANDOM_BITS - 10, -1, -10)
@@ -59,10 +59,10 @@ def derived_ulid(id: str, *of: str) -> str:
 
 
 def unguessable_ulid() -> str:
-    """An identifier that cannot be guessed from another one."""
+    """Generate an identifier that cannot be guessed from another one."""
     return Ulids().new()
 
 
 def is_ulid(text: str) -> bool:
-    """True if a text has the form of an identifier made here."""
+    """True if a text has the form of an identifier made by this module."""
     return len(text) == LENGTH and all(letter in _ALPHABET for letter in text)

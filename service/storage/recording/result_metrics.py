@@ -1,6 +1,6 @@
-"""The metrics of results and of their trackers, and rollups of them in memory or by SQL.
+"""Metrics of results and of their trackers, and rollups of metrics in memory or by SQL.
 
-Rows of `tracker_values` exist where the spacecraft has several trackers: of one alone the
+Rows of `tracker_values` exist only for spacecraft with several trackers: with one tracker the
 result itself has the same values.
 """
 
@@ -44,9 +44,9 @@ from service.vectors import Vector
 
 
 def metrics_of(acquisition: Acquisition, stars: MeasuredStars | None = None) -> Row:
-    """The measured quantities of an acquisition by name, None where it has none.
+    """Measured quantities of an acquisition by name; None for a quantity without a value.
 
-    `stars` are those of all its trackers, where they are at hand.
+    `stars` are those of all its trackers, if already computed.
     """
     stars = stars or MeasuredStars.of_all(acquisition)
     of_batch = {
@@ -58,7 +58,7 @@ def metrics_of(acquisition: Acquisition, stars: MeasuredStars | None = None) -> 
 
 
 def _measures(stars: MeasuredStars) -> Row:
-    """The values, by name, that are measured alike in the stars of a batch and of one tracker."""
+    """Quantities measured in stars by name, alike for a whole batch and for one tracker."""
     return {
         name: source.measure(stars)
         for name, source in STORED.items()
@@ -71,7 +71,7 @@ _VALUES_OF = [QUANTITIES[name].value_of for name in tables.VALUES]
 
 
 def rolled_up(current: Sequence[Row]) -> Row:
-    """The columns of a rollup of current results."""
+    """Sum up current results as the columns of a rollup."""
     observed = [row["observed"] for row in current]
     status = [row["status"] for row in current]
     counts = (
@@ -89,12 +89,12 @@ def rolled_up(current: Sequence[Row]) -> Row:
     extremes = shares + values
     least = [min(present, default=None) for present in extremes]
     most = [max(present, default=None) for present in extremes]
-    # In the order of the columns: to put their names together takes longer than all of this.
+    # Values in the order of the columns: building the names takes longer than all of this.
     return dict(zip(tables.ROLLED_UP, (*counts, *sums, *least, *most), strict=True))
 
 
 def merge(into: Row, row: Row) -> None:
-    """Add one rollup to another: sums add up, of the extremes the outer ones stay."""
+    """Merge one rollup into another: sums are added, extremes widened."""
     for name in (*tables.COUNTS, *tables.SUMS):
         into[name] += row[name]
     for name in tables.MINIMA:
@@ -107,18 +107,18 @@ def merge(into: Row, row: Row) -> None:
 
 # The columns of a rollup as SQL over current results, for sums that the database computes.
 #
-# `result_metrics.rolled_up` makes the same of results in memory.  The index of
-# current results has every column that is read here.
+# `result_metrics.rolled_up` does the same for results in memory.  The index of current results has
+# every column that is read here.
 
 
 def _counts(of: Table) -> Mapping[str, ColumnElement[Any]]:
     stars = {name: of.c[name] for name in tables.COUNTED if name != "observed"}
-    # The sum of the others, which the index has.
+    # Observed stars as the sum of the other counts, which the index has.
     return {"observed": stars["unique"] + stars["ambiguous"] + stars["unmatched"], **stars}
 
 
 def value_sql(quantity: Quantity, of: Table = tables.results) -> ColumnElement[Any]:
-    """The value of one result, or of one tracker in it; null where it has none."""
+    """SQL for a quantity of one result, or of one tracker in it; null without a value."""
     match quantity.source:
         case StarShare(part):
             counts = _counts(of)
@@ -156,13 +156,13 @@ def _summed(of: Table) -> Mapping[str, ColumnElement[Any]]:
 
 
 SUMMED = _summed(tables.results)
-"""Each column as SQL over `results`, for a query that groups them or sums up all."""
+"""SQL expressions over `results` for each column of a rollup."""
 SUMMED_OF_TRACKERS = _summed(tables.tracker_values)
-"""Each column as SQL over `tracker_values`, for a query that groups or sums all rows."""
+"""SQL expressions over `tracker_values` for each column of a rollup."""
 OF_TRACKERS = tables.results.join(
     tables.tracker_values, tables.tracker_values.c.batch_id == tables.results.c.batch_id
 )
-"""The source of a query over `tracker_values`, so that it can choose current results."""
+"""Join of `tracker_values` with `results`, so that a query can choose current results."""
 
 
 # ---- the trackers of a batch: stars by outcome, residuals, magnitudes -------------------------
@@ -171,14 +171,14 @@ OF_TRACKERS = tables.results.join(
 def values_of_trackers(
     acquisition: Acquisition, answer: Answer, batch_id: str, stars: BatchStars
 ) -> list[Row]:
-    """The rows of an acquisition; none where its mission has one tracker."""
+    """Rows of `tracker_values` for an acquisition; none where its mission has one tracker."""
     return [] if len(acquisition.mission.trackers) == 1 else tracker_rows(batch_id, answer, stars)
 
 
 def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
-    """The rows of the run catalog (n,) of the stars of every tracker, -1 for others.
+    """Indices in the run catalog (n,) of the stars of every tracker, -1 for unidentified stars.
 
-    `place` gives the row of a star's id; empty where the catalog is no longer there.
+    `place` gives the index of a star's id; empty where the catalog no longer exists.
     """
     return [
         np.array([place.get(star.star.id, -1) if star.star else -1 for star in each.stars], int)
@@ -187,7 +187,7 @@ def catalog_rows(answer: Answer, place: Mapping[str, int]) -> list[Integers]:
 
 
 def tracker_rows(batch_id: str, answer: Answer, stars: BatchStars) -> list[Row]:
-    """The rows of an answer, one a tracker, in the order of its observations."""
+    """Rows of `tracker_values` for an answer, one for each tracker in its order."""
     expected = [_expected_squares(answer, each) for each in stars.corrected]
     scale = _scale(answer, expected)
     rows = []
@@ -214,24 +214,24 @@ def tracker_rows(batch_id: str, answer: Answer, stars: BatchStars) -> list[Row]:
 
 
 def _residuals(stars: Sequence[Star]) -> Iterator[tuple[int, float]]:
-    """The place and the residual of each star that the attitude uses."""
+    """Index and residual of each star that the attitude uses."""
     for place, star in enumerate(stars):
         if star.residual_arcsec is not None:
             yield place, star.residual_arcsec
 
 
 def _status(answer: Answer, tracker: str) -> str | None:
-    """`suspect` for the tracker that disagrees with the others; None without an attitude."""
+    """Status of a tracker: `suspect` if it disagrees with the others; None without an attitude."""
     if answer.attitude is None:
         return None
     return "suspect" if answer.attitude.outlier == tracker else "good"
 
 
 def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
-    """The squared residual (n,) in arcsec^2 that is expected of each star.
+    """Expected squared residual (n,) in arcsec^2 of each star.
 
-    Of the best attitude it is the noise along both tangent axes less what the
-    attitude, of covariance P, takes up of it: 2 sigma^2 - (trace P - d' P d).
+    For the best attitude it is the noise along both tangent axes, less the part that the attitude,
+    of covariance P, absorbs: 2 sigma^2 - (trace P - d' P d).
     """
     if answer.attitude is None:
         return np.zeros(len(seen.sigma_arcsec))
@@ -242,9 +242,10 @@ def _expected_squares(answer: Answer, seen: CorrectedObservations) -> Vector:
 
 
 def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
-    """The factor that brings the expected squares to the sum that the answer predicts; 1 for QUEST.
+    """Factor that scales the expected squared residuals to the sum that the answer predicts.
 
-    TRIAD's attitude takes its own part of the noise, which its answer says of all stars only.
+    It is 1 for QUEST. TRIAD's attitude absorbs a different part of the noise, which its answer
+    gives for all stars together only.
     """
     if answer.attitude is None or answer.attitude.predicted_rms_arcsec is None:
         return 0.0
@@ -258,12 +259,12 @@ def _scale(answer: Answer, expected: Sequence[Vector]) -> float:
 
 
 def _rms(squares: float, count: int) -> float | None:
-    """The rms of so many squares; None where it is not known."""
+    """Root mean square from a sum of squares and a count; None if not known."""
     return math.sqrt(squares / count) if count and squares > 0.0 else None
 
 
 def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
-    """True if batches of a spacecraft's run are still to be split."""
+    """True if some batches of a spacecraft's run are not yet split by tracker."""
     query = select(tables.tracker_splits.c.run).where(
         tables.tracker_splits.c.spacecraft == spacecraft, tables.tracker_splits.c.run == run
     )
@@ -271,7 +272,7 @@ def is_waiting(connection: Connection, spacecraft: str, run: str) -> bool:
 
 
 def split_anew(connection: Connection, spacecraft: str) -> None:
-    """Have all batches of a spacecraft looked at: from now on it has several trackers."""
+    """Mark all batches of a spacecraft for splitting by tracker: it now has several."""
     connection.execute(
         delete(tables.tracker_splits).where(tables.tracker_splits.c.spacecraft == spacecraft)
     )
@@ -279,6 +280,6 @@ def split_anew(connection: Connection, spacecraft: str) -> None:
         select(table.c.spacecraft, table.c.run).where(table.c.spacecraft == spacecraft)
         for table in (tables.results, tables.rollups_daily)
     )
-    # Archived batches are in the trends alone, and the latest ones in the record alone.
+    # Archived batches appear in the trends only, and the latest batches in the record only.
     runs = recorded.union(trends)
     connection.execute(insert(tables.tracker_splits).from_select(["spacecraft", "run"], runs))

@@ -1,4 +1,4 @@
-"""Writing results: every row of a result in one transaction; trends follow (`projections`)."""
+"""Recording of results: all rows of a result in one transaction; trends follow (`projections`)."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -51,13 +51,13 @@ _LAST_GOOD = prepared(
     .limit(2)
 )
 _RUNS = "runs"
-"""The key under which a connection remembers the runs that it has inserted, or found there."""
+"""Key of a connection's `info` for the set of runs known to be in the database."""
 _REMEMBERED = 1_000
-"""Runs: their names are the clients' own."""
+"""Number of run names above which a connection forgets them: clients choose the names freely."""
 
 
 def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: Row) -> None:
-    """Note the settings and the catalog that results will name, unless they are known already."""
+    """Store the settings and the catalog that results will refer to, unless already known."""
     for table, rows in ((tables.missions, mission_rows), (tables.catalogs, [catalog_row])):
         digested = [row | {"row_digest": digest_of_row(table, row)} for row in rows]
         insert_missing(connection, table, digested)
@@ -77,18 +77,18 @@ def register(connection: Connection, mission_rows: Sequence[Row], catalog_row: R
 
 
 def _trackers(settings: str) -> int:
-    """The number of a mission's trackers."""
+    """Number of trackers in a mission's settings."""
     return len(json.loads(settings)["trackers"])
 
 
 def set_run_alarms(connection: Connection, run: str, watched: bool, now: str) -> None:
-    """Let limits be held against a run, or no longer; the run is made where there is none."""
+    """Switch the evaluation of limits for a run on or off; creates the run if there is none."""
     insert_runs(connection, {run: now}, alarms=watched)
     connection.execute(update(tables.runs).where(tables.runs.c.name == run).values(alarms=watched))
 
 
 def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
-    """The runs whose limits are evaluated: the live one, and others that ask for it."""
+    """Runs, out of `names`, whose limits are evaluated: the live one, and those switched on."""
     others = names - {LIVE}
     if not others:
         return names
@@ -100,20 +100,19 @@ def runs_with_alarms(connection: Connection, names: set[str]) -> set[str]:
 def record(
     connection: Connection, unsaved_results: Sequence[UnsavedResult], assume_new: bool = False
 ) -> list[RecordOutcome]:
-    """Record those results that are new; one outcome each, in order.
+    """Record the results that are new; one outcome each, in order.
 
-    Look, then insert: a submission that is already there, in the tables or
-    earlier among the unsaved results, gets the stored answer, and one whose identity or
-    key is taken by another body gets the error.  On PostgreSQL another process
-    may still insert between the two: then an `IntegrityError` is raised, and
-    to call again is to look again.
+    The database is searched first, then rows are inserted: a submission that is already in the
+    tables, or earlier among the unsaved results, gets the stored answer, and one whose identity or
+    key belongs to another body gets the error.  On PostgreSQL another process may insert a row
+    between search and insert: an `IntegrityError` is raised then, and another call searches again.
 
-    One that was predicted from an attitude that is not the last one any more gets the error
+    A result predicted from an attitude that is no longer the last one gets the error
     `PredictionOutdated`.
 
-    With `assume_new` the tables are not searched first: the caller has done so and
-    found none of them.  If one is there after all, the same error is raised, since
-    identities and keys are unique.
+    With `assume_new` the tables are not searched first: the caller has done so and found none of
+    the results.  If one is in the tables after all, the same error is raised, since identities and
+    keys are unique.
     """
     registry = Registry()
     if not assume_new:
@@ -152,10 +151,10 @@ def record(
 def _outdated(
     connection: Connection, unsaved_results: Sequence[UnsavedResult]
 ) -> Mapping[str, PredictionOutdated]:
-    """Errors by id, one for each result whose prediction is not from the last attitude any more.
+    """Errors by id for results whose prediction no longer starts from the last attitude.
 
-    Until the transaction ends no other service records one that asks for the last attitude of
-    the same spacecraft and run.  All locks are taken first, and in order.
+    Until the transaction ends no other service records one that asks for the last attitude of the
+    same spacecraft and run.  All locks are taken first, and in order.
     """
     asked = [
         (unsaved, unsaved.predicted_from)
@@ -174,7 +173,7 @@ def _outdated(
 
 
 def last_good_results(connection: Connection, period: PredictedFrom) -> tuple[str, ...]:
-    """The two last good results of a period, latest first."""
+    """Ids of the two last good results of a period, latest first."""
     asked = {name: getattr(period, name) for name in ("spacecraft", "run", "since_ns", "until_ns")}
     return tuple(row["id"] for row in _LAST_GOOD.read(connection, asked))
 
@@ -187,13 +186,13 @@ def _outcome(
     if not isinstance(holder, ExistingResult):
         return holder
     if holder.archived:
-        # Between looking it up and recording it.  Sent again, it gets the archived answer.
+        # The batch was archived after it was looked up.  Sent again, it gets the archived answer.
         return Busy("the batch was just archived")
     return Answered(holder.result_id, answers[holder.result_id], holder.result_id != unsaved.id)
 
 
 def _holder(unsaved: UnsavedResult, registry: Registry) -> ExistingResult | AcquisitionError:
-    """The holder of an identity and key: an earlier result, or from now on the unsaved one."""
+    """Find the result that holds an unsaved one's identity and key; enters it if none does."""
     if unsaved.batch is None:
         return ExistingResult(unsaved.id, "")
     fingerprint = unsaved.batch["fingerprint"]
@@ -211,14 +210,14 @@ def _insert(
     answers: Mapping[str, bytes],
     assume_new: bool,
 ) -> None:
-    # Sorted, so that two processes that insert the same batches do not wait in a circle.
+    # Sort, so that two processes that insert the same batches cannot deadlock.
     firsts = sorted(
         (unsaved for unsaved in fresh if unsaved.batch is not None), key=lambda each: each.identity
     )
     rows = [unsaved.batch for unsaved in firsts if unsaved.batch is not None]
     names = {row["run"]: row["received"] for row in rows}
-    # Also those of a transaction that was taken back.  The foreign key then refuses their batches,
-    # and `transact`, to which nothing is `assume_new`, inserts the run.
+    # May hold runs of a transaction that was rolled back.  The foreign key then refuses their
+    # batches, and `transact`, to which nothing is `assume_new`, inserts the run.
     known: set[str] = connection.info.setdefault(_RUNS, set())
     if len(known) > _REMEMBERED:
         known.clear()
@@ -232,7 +231,7 @@ def _insert(
     _insert_results(connection, firsts, answers)
     trackers = [row for unsaved in firsts for row in unsaved.trackers]
     insert_all(connection, tables.tracker_values, trackers)
-    # What-ifs go one by one: of two that are adopted, the second supersedes the first.
+    # Insert what-ifs one by one: the second of two adopted ones supersedes the first.
     for unsaved in fresh:
         if unsaved.batch is None:
             if unsaved.result["current"]:
@@ -244,7 +243,7 @@ def _insert(
 def _insert_results(
     connection: Connection, unsaved_results: Sequence[UnsavedResult], answers: Mapping[str, bytes]
 ) -> None:
-    # In order of their ids, which rise: each goes to the end of its table.
+    # Insert by rising id, so that each row goes to the end of its table.
     in_order = sorted(unsaved_results, key=lambda each: each.id)
     places = zip(in_order, next_seqs(connection, len(in_order)), strict=True)
     rows = [unsaved.rows(answers[unsaved.id], seq) for unsaved, seq in places]
@@ -257,9 +256,9 @@ def _insert_results(
 
 
 def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
-    """Mark the current result of a batch as superseded by an unsaved one, tracker by tracker."""
+    """Mark the current result of a batch as superseded, and replace its tracker values."""
     batch_id, batch = unsaved.result["batch_id"], tables.batches.c
-    # The lock on the batch orders the adoptions of several processes.
+    # Lock the batch: the lock orders the adoptions of several processes.
     connection.execute(select(batch.id).where(batch.id == batch_id).with_for_update())
     current = and_(tables.results.c.batch_id == batch_id, tables.results.c.current)
     connection.execute(update(tables.results).where(current).values(current=False))
@@ -272,11 +271,11 @@ def _supersede(connection: Connection, unsaved: UnsavedResult) -> None:
 
 
 def next_seqs(connection: Connection, count: int) -> list[int]:
-    """The next places in the record's order, for so many results of this transaction.
+    """Take the next `count` places in the record's order for results of this transaction.
 
-    On PostgreSQL a transaction may commit after one with later places.  It has its number before
-    it takes places: whoever sees a later place, and finds that no transaction of that moment is
-    left, knows that the missing ones will not come.
+    On PostgreSQL a transaction may commit after one with later places.  It has its number before it
+    takes places: a reader that sees a later place, after all transactions of that moment have
+    ended, knows that missing places stay empty.
     """
     rows = execute(connection, dialect_of(connection).next_seqs, {"count": count})
     return [int(place) for *_, place in rows]

@@ -10,7 +10,7 @@ from service.contract.answers import Signature
 from service.storage.sql.tables import audit
 
 REASONS = ("comment", "note", "text")
-"""Fields of requests that say why something is done."""
+"""Fields of requests that give the reason of a change."""
 
 
 def signed_in(body: str | None) -> tuple[str | None, str | None]:
@@ -25,7 +25,7 @@ def signed_in(body: str | None) -> tuple[str | None, str | None]:
 
 
 def naming_result(body: str | None, id: str) -> str:
-    """The body of a what-if with the id of its result and its signature in front.
+    """Put the id of the result and the signature at the start of a what-if's stored request body.
 
     A long body is stored without its end.
     """
@@ -35,7 +35,7 @@ def naming_result(body: str | None, id: str) -> str:
 
 
 def signature_of(connection: Connection, parent: str, id: str) -> Signature | None:
-    """The author of a recorded what-if of the result `parent`; None if no audit entry names it."""
+    """Signature on a recorded what-if of the result `parent`; None if no audit entry names it."""
     start = json.dumps({"result": id}).removesuffix("}")
     query = select(audit).where(
         audit.c.about == f"/api/v1/batches/{parent}/what-if",

@@ -9,7 +9,7 @@ from service.errors import BadConfiguration
 from service.extras import require_extra
 
 if TYPE_CHECKING:
-    # It comes with an extra.
+    # The library comes with an extra.
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 SETTING = "ACQUIRE_RECORD_KEY"
@@ -17,15 +17,15 @@ _BEGIN = "-----BEGIN"
 
 
 class Signer:
-    """Signs with a private key: a PEM file that nobody else may read, or the PEM text itself."""
+    """Ed25519 private key that signs: a PEM file that only its owner may read, or the PEM text."""
 
     def __init__(self, key: str) -> None:
-        """Raises `BadConfiguration` for an unusable key, `NotAvailable` without the extra."""
+        """Load the private key; raises `BadConfiguration`, or `NotAvailable` without the extra."""
         require_extra("sign", "cryptography", SETTING, "a key")
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
 
-        # The text is a secret, and not shown.
+        # The text is a secret: it must not appear in messages.
         text = key if key.startswith(_BEGIN) else _private_text(Path(key))
         try:
             loaded = serialization.load_pem_private_key(text.encode(), None)
@@ -38,15 +38,15 @@ class Signer:
         self._key: Ed25519PrivateKey = loaded
 
     def sign(self, statement: bytes) -> str:
-        """The signature, in hexadecimal digits."""
+        """Ed25519 signature of a statement, in hexadecimal digits."""
         return self._key.sign(statement).hex()
 
 
 class PublicKey:
-    """Checks signatures with a public key."""
+    """Ed25519 public key that checks signatures."""
 
     def __init__(self, file: Path) -> None:
-        """Reads a PEM file; raises `BadConfiguration` for another file."""
+        """Read a public key from a PEM file; raises `BadConfiguration` for any other file."""
         require_extra("sign", "cryptography", "--public-key", str(file))
         from cryptography.hazmat.primitives import serialization
         from cryptography.hazmat.primitives.asymmetric import ed25519
@@ -62,7 +62,7 @@ class PublicKey:
         self._key = loaded
 
     def has_signed(self, statement: bytes, signature: str | None) -> bool:
-        """True if the signature is that of the statement."""
+        """True if a statement has the given signature by this key."""
         from cryptography.exceptions import InvalidSignature
 
         try:

@@ -1,9 +1,8 @@
-"""A result that is computed but not recorded: complete but for `timings_us.record`.
+"""A computed result that is not recorded yet: complete but for `timings_us.record`.
 
-The rows are taken from the answer itself, so that what a list or a trend says
-cannot differ from what the client gets.  The answer is put into JSON where it
-is computed: a worker sends it to the writer as one text instead of a hundred small
-objects.
+The rows are taken from the answer itself, so that lists and trends cannot differ from the client's
+answer.  The answer is converted to JSON where it is computed: a worker sends it to the writer as
+one text instead of a hundred small objects.
 """
 
 import json
@@ -26,28 +25,28 @@ from service.times import Utc
 from service.trends.measures import MeasuredStars
 
 LIVE = "live"
-"""The run of batches that pipelines send."""
+"""Name of the run of batches sent by live pipelines."""
 AHEAD_NS = 3600 * 10**9
-"""A live batch dated further in the future than this is never the latest."""
+"""Nanoseconds: a live batch dated further in the future is never shown as the latest."""
 STARS = ("observed", "unique", "ambiguous", "unmatched")
-"""The counts of a result's stars."""
+"""Names of the counts of a result's stars, by outcome."""
 
 _RECORD = b'"record":'
 _NOT_RECORDED = _RECORD + b"null"
-"""Marker of an unrecorded answer in `timings_us`; in a client's text its quotes are escaped."""
+"""JSON of `timings_us` before recording; unique, since quotes in a client's text are escaped."""
 
 
 class Answered(Struct, frozen=True):
-    """An answer as it is stored and sent; `replayed` where it was stored before this request."""
+    """Stored answer as sent; `replayed` is True if it was stored before this request."""
 
     id: str | None
-    """The id, or None for a what-if that was not to be recorded."""
+    """Id of the result; None for a what-if that was not to be recorded."""
     body: bytes
     replayed: bool
 
 
 class PredictedFrom(Struct, frozen=True):
-    """The results whose attitudes a prediction begins with: the last good ones of a period."""
+    """Results from whose attitudes a prediction starts: the last good ones of a period."""
 
     spacecraft: str
     run: str
@@ -64,7 +63,7 @@ class UnsavedResult(Struct, eq=False):
     """
 
     identity: tuple[str, str, str]
-    """(spacecraft, run, batch): what is unique among submissions."""
+    """Identity of the batch, unique among submissions: (spacecraft, run, batch)."""
     answer: bytes
     batch: Row | None
     result: Row
@@ -73,17 +72,17 @@ class UnsavedResult(Struct, eq=False):
     key: tuple[str, str] | None
     frame: Row | None = None
     handed_over_ns: int | None = None
-    """Time at which the result was handed to the writer (`time.perf_counter_ns`)."""
+    """Time when the writer got the result (`time.perf_counter_ns`)."""
     trackers: Sequence[Row] = ()
-    """The values of each tracker, of a mission with several (`tracker_values`)."""
+    """Rows of `tracker_values`, one for each tracker of a mission with several."""
     audit: Row | None = None
-    """The entry of the audit list that is stored with a recorded what-if."""
+    """Audit entry that is stored with a recorded what-if."""
     predicted_from: "PredictedFrom | None" = None
-    """The results that a prediction began with, where other services record attitudes, too."""
+    """Results that a prediction started from, given if other services record attitudes as well."""
 
     @property
     def id(self) -> str:
-        """The result's id."""
+        """Id of the result."""
         return str(self.result["id"])
 
     @property
@@ -92,10 +91,10 @@ class UnsavedResult(Struct, eq=False):
         return {name: self.result[name] for name in STARS}
 
     def to_json(self, together: int) -> bytes:
-        """The answer's JSON; `timings_us.record` is its share of the time since it was handed over.
+        """JSON of the answer, with the result's share of the recording time in `timings_us.record`.
 
-        Of so many results in one transaction none is recorded before the last: the whole time
-        would be counted once for each.
+        The time since the writer got the result is divided by `together`, the number of results in
+        its transaction: none is recorded before the last.
         """
         if self.handed_over_ns is None:
             return self.answer
@@ -105,11 +104,11 @@ class UnsavedResult(Struct, eq=False):
         return b"%b%b%d%b" % (head, _RECORD, waited_ns // (1000 * together), tail)
 
     def result_row(self, body: bytes, seq: int = 0) -> Row:
-        """The row of `results`, with the answer, its place in the record and its digest."""
+        """Row of `results`, with the answer, its place in the record and its digest."""
         return self.rows(body, seq)[0]
 
     def rows(self, body: bytes, seq: int) -> tuple[Row, Row]:
-        """The rows of `results` and `record_leaves`."""
+        """Rows of a result in `results` and `record_leaves`."""
         row = self.result | {"answer": body.decode(), "seq": seq}
         content = encoded_rows(row, self.stars, self.solution, self.batch, self.frame)
         row["digest"] = digest_of_encoded(content)
@@ -125,7 +124,7 @@ def unsaved_submission(
     received: Utc,
     key: tuple[str, str] | None = None,
 ) -> UnsavedResult:
-    """The first result of a batch, which is current and gives the batch its id."""
+    """Build the first result of a batch, which is current and gives the batch its id."""
     batch = acquisition.batch
     row = {
         "id": id,
@@ -167,7 +166,7 @@ def unsaved_what_if(
     adopt: bool,
     created: Utc,
 ) -> UnsavedResult:
-    """A further result of a batch, current if it is to be adopted."""
+    """Build a further result of a batch, current if it is adopted."""
     answer = answer_of(acquisition, id=id, parent=parent, recorded=True)
     return _unsaved_result(
         acquisition, answer, batch_id=batch_id, parent=parent, current=adopt, created=created
@@ -196,7 +195,7 @@ def _unsaved_result(
         "run": batch.run,
         "time_ns": batch.time.tai_ns,
         "identifier": answer.identifier,
-        # Only the options that the batch named are stored.
+        # Store only the options that the batch named.
         "options": json.dumps({k: value for k, value in named.items() if value not in (None, {})}),
         "mission_digest": answer.provenance.mission,
         "catalog_digest": answer.provenance.catalog,
@@ -218,7 +217,7 @@ def _unsaved_result(
 
 
 def _frame_of(frame: FrameRecord) -> FrameSummary:
-    """The summary of the frame in the answer."""
+    """Summary of a frame for the answer."""
     summary = frame.summary()
     return FrameSummary(**(summary | {"timings_us": FrameTimings(**summary["timings_us"])}))
 
@@ -241,7 +240,7 @@ def _solution_row(attitude: Attitude, result_id: str | None) -> Row:
         **dict(zip(("q1", "q2", "q3", "qc"), attitude.quaternion, strict=True)),
         "frame": attitude.frame,
         **{f"p{i + 1}{k + 1}": covariance[i][k] for i in range(3) for k in range(i, 3)},
-        # Of a measured attitude they are unknown; the columns take no null.
+        # Unknown for a measured attitude; the columns allow no null.
         "residual_rms_arcsec": attitude.residual_rms_arcsec or 0.0,
         "predicted_rms_arcsec": attitude.predicted_rms_arcsec or 0.0,
         "taste": attitude.taste or 0.0,

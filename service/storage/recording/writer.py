@@ -1,9 +1,9 @@
-"""The one connection that writes.  Threads take turns with it; each has a transaction a turn.
+"""Writer: the one connection that writes; threads take turns, each with one transaction.
 
-    caller's thread ──► its turn ──► one transaction, committed ──► what it returns
+    caller's thread ──► its turn ──► one transaction, committed ──► return value
 
-Chunks of a bulk load and turns of the projector let other callers go first, but wait for one
-transaction of theirs at most.
+Chunks of a bulk load and turns of the projector let other callers go first, but wait for at most
+one transaction of theirs.
 """
 
 import logging
@@ -43,29 +43,29 @@ MAX_ATTEMPTS = 5
 MAX_LOOKS = 5
 RETRY_AFTER_S = 5
 
-# PostgreSQL's codes for two writers that crossed; it stopped one, which begins again.
+# PostgreSQL's codes for two transactions in conflict; the one that it stopped starts again.
 _CROSSED = ("40001", "40P01")
 
 
 class Crossed(Busy):
-    """PostgreSQL stopped a transaction, since another one wrote the same rows."""
+    """Error: PostgreSQL stopped a transaction, since another one wrote the same rows."""
 
 
 @dataclass(frozen=True)
 class WriterState:
-    """Records that wait to be written, the age of the oldest, and how writing goes."""
+    """State of the writer: waiting records, age of the oldest in seconds, and failures."""
 
     queued: int
     oldest_s: float
     succeeded: bool
-    """True if the last write did."""
+    """True if the last write succeeded."""
     failed: int
-    """Batches and changes that could not be written since the start."""
+    """Number of batches and changes that could not be written since the start."""
 
 
 @dataclass(eq=False, frozen=True)
 class _Ticket:
-    """A thread's place among those that wait for their turn, with the records that it brings."""
+    """Place of a thread in the queue for the writer, with the number of its records."""
 
     records: int
     low_priority: bool
@@ -73,9 +73,9 @@ class _Ticket:
 
 
 class _Turns:
-    """Lets one thread at a time write, in the order in which they came.
+    """Queue that lets one thread at a time write, in the order of arrival.
 
-    Tickets of low priority wait for the others, but for one turn only.
+    Tickets of low priority let the others go first, but for one turn only.
     """
 
     def __init__(self) -> None:
@@ -88,9 +88,9 @@ class _Turns:
 
     @contextmanager
     def turn(self, ticket: _Ticket, wait_s: float | None) -> Iterator[None]:
-        """Wait for the ticket's turn, which lasts as long as the block.
+        """Wait for the ticket's turn, which lasts as long as the `with` block.
 
-        Raises `Busy` after `wait_s`, and `Stopping` where `close` was called before.
+        Raises `Busy` after `wait_s`, and `Stopping` after a call of `close`.
         """
         queue = self._last if ticket.low_priority else self._first
         with self._changed:
@@ -118,21 +118,21 @@ class _Turns:
         return queue[0] is ticket
 
     def waiting(self) -> tuple[int, float]:
-        """The records that wait, and for how many seconds the oldest has waited."""
+        """Number of records in the queue, and the waiting time of the oldest in seconds."""
         with self._changed:
             tickets = [*self._first, *self._last]
         oldest_s = min((each.since_s for each in tickets), default=time.monotonic())
         return sum(each.records for each in tickets), time.monotonic() - oldest_s
 
     def close(self) -> None:
-        """Refuse more tickets, and wait until no ticket is left."""
+        """Refuse further tickets, and wait until all threads have had their turn."""
         with self._changed:
             self.is_closing = True
             self._changed.wait_for(lambda: not (self._is_taken or self._first or self._last))
 
 
 class Writer:
-    """Writes what threads bring, one transaction after another."""
+    """Writer of all threads' records and changes, one transaction after another."""
 
     def __init__(
         self,
@@ -143,11 +143,11 @@ class Writer:
         lock: ProjectorLock | None = None,
         file_lock: FileLock | None = None,
     ) -> None:
-        """`file` is that of SQLite; `wait_s` bounds how long results wait for their turn.
+        """Prepare the writer; `file` is SQLite's, `wait_s` bounds the wait of results for a turn.
 
-        Those of a bulk load, and other changes, wait as long as it takes.  With a `lock` the
-        session that holds it projects, and no other one; see `take_lock`.  `file_lock` is taken
-        before the first write.
+        Results of a bulk load, and other changes, wait as long as it takes.  With a `lock` only the
+        session that holds it projects; see `take_lock`.  `file_lock` is taken before the first
+        write.
         """
         self._lock, self._file_lock = lock, file_lock
         self._connection = PersistentConnection(engine, TO_WRITE, file)
@@ -158,18 +158,17 @@ class Writer:
         self._is_failing = False
         self._behind = ThreadPoolExecutor(1, "write-behind")
         self.commits = 0
-        """Transactions that were committed, without those of the projector."""
+        """Number of committed transactions, without those of the projector."""
         self.bell = Bell()
-        """Rings after each transaction that recorded events."""
+        """Notifier that is rung after each transaction that recorded events."""
 
     def record(
         self, unsaved_results: Sequence[UnsavedResult], low_priority: bool = False
     ) -> WriteOutcomes:
         """Record results in one transaction; one outcome for each, in order.
 
-        An outcome is an answer, stored, or the error that kept this result, and no other, from
-        being recorded.  Raises `Busy` where the database itself fails, or other transactions
-        take too long.
+        An outcome is a stored answer, or the error that kept this result alone from being recorded.
+        Raises `Busy` where the database itself fails, or other transactions take too long.
         """
         if not unsaved_results:
             return []
@@ -182,15 +181,15 @@ class Writer:
                 return list(record(connection, unsaved_results, assume_new=True))
 
         outcomes = self._attempted(write, len(unsaved_results))
-        # Read first: the lock is for the rare case that something changes.  A small change that
-        # succeeds says nothing of room for a batch.
+        # Check before locking: the flag rarely changes.  A successful small change does not show
+        # that there is room for a batch.
         if self._is_failing:
             with self._noting:
                 self._is_failing = False
         return outcomes
 
     def change(self, change: Callable[[Connection], T]) -> T:
-        """Make another change, which is kept whole or not at all, and may be made twice over."""
+        """Make a change in one transaction; after a conflict `change` is called again."""
 
         def write(_: bool) -> T:
             with self._transaction() as connection:
@@ -200,7 +199,7 @@ class Writer:
 
     @contextmanager
     def projection(self) -> Iterator[Connection]:
-        """A transaction of the projector, which lets other callers go first.
+        """Run a transaction of the projector, which lets other callers go first.
 
         Raises `NotProjecting` where another service that shares the database projects.
         """
@@ -219,9 +218,9 @@ class Writer:
             return self._lock.take(connection)
 
     def later(self, write: Callable[[], T]) -> "Future[T]":
-        """Call a function that writes from another thread, after those of earlier calls.
+        """Call a writing function in a background thread, after those of earlier calls.
 
-        The caller computes what is to be written next meanwhile.
+        Meanwhile the caller can compute the next results.
         """
         try:
             return self._behind.submit(write)
@@ -229,21 +228,21 @@ class Writer:
             raise Stopping("the service is stopping") from None
 
     def require(self) -> None:
-        """Raise `Stopping` where nothing is written any more."""
+        """Raise `Stopping` if the writer is closed."""
         if self._turns.is_closing:
             raise Stopping("nothing is recorded any more: restart the service")
 
     def note_failure(self, count: int) -> None:
-        """Count work that could not be written, or not even be looked up before that."""
+        """Count records that could not be written, or not even be looked up beforehand."""
         with self._noting:
             self._failures += count
             self._is_failing = True
 
     def require_written(self) -> None:
-        """Raise `Busy` where the last write failed, and one of a batch's size fails now, too.
+        """Raise `Busy` if the last write failed and a trial write of a batch's size fails too.
 
-        Otherwise only the next client's batch could show that the database can be
-        written again.
+        Without the trial, only the next client's batch could show that the database accepts writes
+        again.
         """
         if not self._is_failing:
             return
@@ -254,20 +253,20 @@ class Writer:
             self._is_failing = self._failures != before
 
     def state(self) -> WriterState:
-        """The state of the writes, and of those that wait."""
+        """Present state of the writer and its queue."""
         queued, oldest_s = self._turns.waiting()
         return WriterState(queued, oldest_s, not self._is_failing, self._failures)
 
     def close(self) -> None:
-        """Refuse more work, and return when all that was brought is written."""
+        """Refuse further work, and return when all queued work is written."""
         self._behind.shutdown()
         self._turns.close()
         self._connection.close()
 
     def _attempted(self, write: Callable[[bool], T], records: int) -> T:
-        """Call a function that writes; after an error that another process may have caused, again.
+        """Call a writing function, again after an error that another process may have caused.
 
-        The function is told whether an attempt failed, so that care is needed.
+        `write` gets True if an attempt has failed before, so that care is needed.
         """
         attempt = 1
         while True:
@@ -291,11 +290,11 @@ class Writer:
         wait_s: float | None = None,
         is_projection: bool = False,
     ) -> Iterator[Connection]:
-        """A transaction in this thread's turn, committed at the end of the block.
+        """Run a transaction in this thread's turn, committed at the end of the `with` block.
 
-        An error of the block's own rolls the transaction back, and is raised.  Raises `Busy`
-        where the database fails or the turn does not come within `wait_s`, and `Crossed` where
-        PostgreSQL stopped the transaction for another one.
+        An error raised by the block rolls the transaction back.  Raises `Busy` where the database
+        fails or the turn does not come within `wait_s`, and `Crossed` where PostgreSQL stopped the
+        transaction for another one.
         """
         if self._file_lock is not None:
             self._file_lock.take()
@@ -326,7 +325,7 @@ class Writer:
                 raise
             if not is_projection:
                 self.note_failure(records)
-            # Its words name files and hosts, which are for the log alone.
+            # The error names files and hosts, which belong in the log only.
             raise Busy("the database cannot be written now", RETRY_AFTER_S) from error
         except Busy:
             if not is_projection:
@@ -339,14 +338,14 @@ class Writer:
 
 
 def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) -> WriteOutcomes:
-    """Record all together; if that fails, each by itself, so that one fails no other."""
+    """Record all results together; after an error one by one, so that one fails no other."""
     failure: Exception
     for _ in range(MAX_LOOKS):
         try:
             with _savepoint(connection):
                 return list(record(connection, unsaved_results))
         except (exc.IntegrityError, ArchivedMeanwhile) as error:
-            failure = error  # perhaps another process was faster: look again
+            failure = error  # Another process may have inserted the row first: search again.
         except Exception as error:
             if is_of_the_database(error):
                 raise
@@ -359,10 +358,10 @@ def _record(connection: Connection, unsaved_results: Sequence[UnsavedResult]) ->
 
 @contextmanager
 def _savepoint(connection: Connection) -> Iterator[None]:
-    """Keep what the block does whole, or none of it.
+    """Keep the changes of a `with` block whole, or none of them.
 
-    Trouble of the database itself ends the whole transaction: SQLite, its disk
-    full, may have rolled it back already, and what came before would be lost.
+    A fault of the database itself ends the whole transaction: SQLite, its disk full, may have
+    rolled it back already, and earlier changes would be lost.
     """
     noted = events.noted(connection)
     execute(connection, "SAVEPOINT block")
@@ -378,22 +377,22 @@ def _savepoint(connection: Connection) -> Iterator[None]:
 
 
 def is_of_the_database(error: BaseException) -> bool:
-    """True if an error is the database's, its disk's or its connection's, and no single row's."""
+    """True if an error concerns the database, its disk or its connection, and not a single row."""
     about_a_row = (exc.IntegrityError, exc.DataError, exc.ProgrammingError)
     return isinstance(error, exc.DBAPIError) and not isinstance(error, about_a_row)
 
 
 def is_of_the_statement(error: BaseException) -> bool:
-    """True if SQLite's operational error is a fault of the statement, such as a missing table."""
+    """True for SQLite's operational error in a statement itself, such as a missing table."""
     code = getattr(getattr(error, "orig", None), "sqlite_errorcode", None)
     return code is not None and code & 0xFF == sqlite3.SQLITE_ERROR
 
 
 def may_pass(error: exc.DBAPIError) -> bool:
-    """True if the trouble is with the database's disk or connection, and not with what was asked.
+    """True for a passing fault of the database's disk or connection, not of the statement.
 
-    SQLite says of a table that is missing, and of a write through a connection
-    for readers, that they are operational errors too.
+    SQLite also reports as operational errors a missing table, and a write through a reading
+    connection.
     """
     code = getattr(error.orig, "sqlite_errorcode", None)
     ours = code is not None and code & 0xFF in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_READONLY)
@@ -401,14 +400,14 @@ def may_pass(error: exc.DBAPIError) -> bool:
 
 
 def _write_as_a_batch(connection: Connection) -> None:
-    """Take the locks that a post takes, and write as much as a large batch does."""
+    """Take the locks of a post, and write as much as a large batch does."""
     names = [table.name for table in WRITTEN_BY_POSTS]
     dialect_of(connection).write_probe(connection, names)
-    # There and back: of a row that gets the value it has SQLite writes nothing.
+    # Change the value and restore it: SQLite writes nothing for a row that keeps its value.
     for step in (1, -1):
         connection.execute(update(event_counter).values(last=event_counter.c.last + step))
 
 
 def remove_probe(connection: Connection) -> None:
-    """Give back what a probe wrote, also one of a process that was killed."""
+    """Remove the trial write, including one left by a process that was killed."""
     dialect_of(connection).remove_probe(connection)

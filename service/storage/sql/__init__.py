@@ -1,1 +1,1 @@
-"""Connections, tables, migrations, and the one writer."""
+"""Database layer: connections, tables, migrations, and the connection that writes."""

@@ -12,14 +12,15 @@ from service.storage.sql.columns import Moment, metadata
 record_leaves = sa.Table(
     "record_leaves",
     metadata,
-    # The place of the result, `results.seq`; negative: recorded before there was a chain.
+    # Order of the result in the record (`results.seq`); negative: recorded before there was a
+    # chain.
     sa.Column(
         "seq",
         sa.BigInteger().with_variant(sa.Integer, "sqlite"),
         primary_key=True,
         autoincrement=False,
     ),
-    # See `recording.chain.leaf_of`.
+    # SHA-256 digest of the result's rows, see `recording.chain.leaf_of`.
     sa.Column("leaf", sa.LargeBinary, nullable=False),
 )
 
@@ -27,12 +28,12 @@ record_facts = sa.Table(
     "record_facts",
     metadata,
     sa.Column("id", sa.BigInteger().with_variant(sa.Integer, "sqlite"), primary_key=True),
-    # The table, and what happened: added, closed, changed, removed.
+    # The table and the action on the row: added, closed, changed or removed.
     sa.Column("kind", sa.String(64), nullable=False),
     sa.Column("key", sa.Text, nullable=False),
-    # SHA-256 of the content, in hexadecimal digits; empty: removed.
+    # SHA-256 of the row's content, in hexadecimal digits; empty for a removed row.
     sa.Column("sha256", sa.String(64), nullable=False),
-    # Null: no head has it yet.
+    # Number of the head that covers the fact; null until a head is made.
     sa.Column("head", sa.BigInteger),
     sa.Index("ix_record_facts_kind", "kind", "key"),
     sa.Index("ix_record_facts_head", "head"),
@@ -41,7 +42,7 @@ record_facts = sa.Table(
 record_heads = sa.Table(
     "record_heads",
     metadata,
-    # From 1, without a gap.
+    # Consecutive number of the head, from 1.
     sa.Column(
         "number",
         sa.BigInteger().with_variant(sa.Integer, "sqlite"),
@@ -49,9 +50,9 @@ record_heads = sa.Table(
         autoincrement=False,
     ),
     sa.Column("made", Moment, nullable=False),
-    # JSON: what is signed, byte for byte.
+    # JSON text of the head, byte for byte as signed.
     sa.Column("statement", sa.Text, nullable=False),
     sa.Column("sha256", sa.String(64), nullable=False),
-    # Ed25519, in hexadecimal digits; null: without a key.
+    # Ed25519 signature in hexadecimal digits; null if the service has no key.
     sa.Column("signature", sa.String(128)),
 )

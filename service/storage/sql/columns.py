@@ -1,4 +1,4 @@
-"""The metadata of all tables, the types of shared columns, compressed texts among them."""
+"""Metadata of all tables and the types of shared columns, with the type of compressed texts."""
 
 import threading
 from functools import cache
@@ -11,7 +11,7 @@ from sqlalchemy import Dialect, MetaData, String, Text, text
 from sqlalchemy.types import TypeDecorator
 
 Row = dict[str, Any]
-"""The values of a row by column name."""
+"""A database row: values by column name."""
 
 metadata = MetaData(
     naming_convention={
@@ -22,23 +22,23 @@ metadata = MetaData(
     }
 )
 HAS_FIRST_ROW = "has_first_row"
-"""The key in the `info` of a table that has a row in a new database."""
+"""Key in a table's `info`: the table has a row in a new database."""
 
 BOUND = "bound"
-"""The key in the `info` of a table of a feature: its `Bound`, or why no rows of it are facts."""
+"""Key in the `info` of a feature's table: its `Bound`, or why its rows are not chained."""
 
 
 class Bound(msgspec.Struct, frozen=True):
     """How the rows of a table are facts of the record's chain."""
 
     free: frozenset[str] = frozenset()
-    """Columns that no fact has, because the service changes them."""
+    """Columns left out of the chain's facts, because the service changes them."""
     closed_by: str | None = None
-    """The column that is set once; a further fact then has all columns that are not `free`."""
+    """Column that is set once to close a row; a further fact then covers all columns but `free`."""
     open_free: frozenset[str] = frozenset()
-    """Columns that may change until then."""
+    """Columns that may change until a row is closed."""
     rises: bool = True
-    """True if new keys are greater than old ones."""
+    """True if the keys of new rows are greater than those of older rows."""
 
 
 Id = String(26)
@@ -61,36 +61,36 @@ CURRENT = rows_where("current = 1", "current")
 
 # Long texts of the record, compressed on SQLite; PostgreSQL compresses such texts itself.
 #
-# A batch and its answer are JSON with names that are always the same.  The dictionary knows
-# them: an answer of 2,600 bytes takes 450, and 7 microseconds.  Whatever was packed with a
-# dictionary can be read with that one alone: one that takes its place must stand beside it.
-# `python -m benchmarks.train_dictionary` made it.
+# A batch and its answer are JSON with the same names every time.  The dictionary holds these names:
+# an answer of 2,600 bytes takes 450, and 7 microseconds.  A text packed with a dictionary can be
+# read with the same dictionary only: a new dictionary must be added beside the old one.  `python -m
+# benchmarks.train_dictionary` made the present one.
 
 DICTIONARY = Path(__file__).with_name("answers.dictionary")
 LEVEL = 3
 MOST_BYTES = 1 << 30
-"""More than any text has; a damaged one may claim it."""
+"""Largest length of a decompressed text in bytes; a damaged text may claim more."""
 
 _own = threading.local()
 
 
 class PackedText(TypeDecorator[str]):
-    """A text that is packed where the database does not compress it; texts as they are are read."""
+    """Column type of long texts: compressed on SQLite only; uncompressed texts can be read too."""
 
     impl = Text
     cache_ok = True
 
     def process_bind_param(self, value: str | None, dialect: Dialect) -> str | bytes | None:
-        """The text as it is stored."""
+        """Convert a text to its stored form, compressed on SQLite."""
         return value if value is None or dialect.name != "sqlite" else pack(value)
 
     def process_result_value(self, value: str | bytes | None, dialect: Dialect) -> str | None:
-        """The text that was stored."""
+        """Convert a stored value back to its text."""
         return None if value is None else unpack(value)
 
 
 def pack(text: str) -> bytes:
-    """The text, compressed."""
+    """Compress a text with the record's dictionary."""
     if not hasattr(_own, "compressor"):
         _own.compressor = zstandard.ZstdCompressor(level=LEVEL, dict_data=_dictionary())
     packed: bytes = _own.compressor.compress(text.encode())
@@ -98,7 +98,7 @@ def pack(text: str) -> bytes:
 
 
 def unpack(stored: str | bytes) -> str:
-    """The text of what is stored, which an earlier version left as it was.
+    """Decompress a stored text; an earlier version stored texts uncompressed.
 
     Damaged bytes give another text: its reader finds that it is no JSON, and `verify` that its
     digest is wrong.

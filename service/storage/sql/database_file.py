@@ -1,4 +1,4 @@
-"""The file of a SQLite database: it stays the one that was opened, and one process writes.
+"""File of a SQLite database, which must stay the file that was opened, with one writing process.
 
 A file that was moved, replaced or deleted still accepts writes through an open connection,
 and these would be lost.
@@ -16,17 +16,17 @@ from pathlib import Path
 from service.errors import BadConfiguration, Busy
 
 FileIdentity = tuple[int, int]
-"""Device and inode."""
+"""Identity of a file: device and inode."""
 
 RETRY_S = 5
 PRIVATE_FILE, PRIVATE_FOLDER = 0o600, 0o700
-"""The modes of what holds secrets: those of webhooks, digests of tokens, telemetry."""
+"""Access modes of files and folders with secrets: of webhooks, digests of tokens, telemetry."""
 
 log = logging.getLogger(__name__)
 
 
 class DatabaseFile:
-    """A path, and which file was there when it was opened."""
+    """Path of a SQLite database, with the identity of the file that was opened there."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -35,7 +35,7 @@ class DatabaseFile:
         self._is_loss_logged = False
 
     def create(self) -> int:
-        """Open the file; one that is missing is made so that its owner alone can read it.
+        """Open the database file; a missing file is created, readable by its owner only.
 
         Returns the descriptor.  SQLite gives the files beside it the same mode.
         Raises `BadConfiguration`.
@@ -49,7 +49,7 @@ class DatabaseFile:
 
     @property
     def is_read_only(self) -> bool:
-        """True if this process cannot write to the file, or make SQLite's log beside it."""
+        """True if this process cannot write to the file, or create SQLite's log beside it."""
         exists = self.path.exists()
         return exists and not (
             os.access(self.path, os.W_OK) and os.access(self.path.parent, os.W_OK)
@@ -57,21 +57,21 @@ class DatabaseFile:
 
     @property
     def uri(self) -> str:
-        """How SQLite opens the file, which it never creates.
+        """URI by which SQLite opens the existing file.
 
-        One that is read-only and has no log is opened as it is: without a log nobody else has
-        it open, and SQLite need not make one.
+        A read-only file without a log is opened as immutable: without a log no other process has it
+        open, and SQLite need not make one.
         """
         is_fixed = self.is_read_only and not Path(self._log_path).exists()
         return f"{self.path.as_uri()}?{'mode=ro&immutable=1' if is_fixed else 'mode=rw'}"
 
     def remember(self) -> None:
-        """Note which file is there, unless that is known."""
+        """Note the identity of the file at the path, unless one is noted already."""
         if self.identity is None:
             self.identity = _identity(self.path)
 
     def require_there(self) -> None:
-        """Raise `BadConfiguration` unless there is a file."""
+        """Raise `BadConfiguration` unless the path leads to a file."""
         if _identity(self.path) is None:
             raise BadConfiguration(f"ACQUIRE_DATABASE: {self.path}: there is no such file")
 
@@ -90,11 +90,11 @@ class DatabaseFile:
         )
 
     def log_identity(self) -> FileIdentity | None:
-        """The identity of SQLite's write-ahead log: it is constant while a connection is open."""
+        """Identity of SQLite's write-ahead log, which is constant while a connection is open."""
         return _identity(self._log_path)
 
     def require_log(self, opened: FileIdentity | None) -> None:
-        """Raise `Busy` unless file and log are those that a transaction began with."""
+        """Raise `Busy` unless file and log are the same as at the beginning of a transaction."""
         self.require()
         if self.log_identity() != opened:
             log.error("%s was moved, replaced or deleted while in use", self._log_path)
@@ -110,7 +110,7 @@ def _identity(path: Path | str) -> FileIdentity | None:
 
 
 def warn_of_readers(path: Path) -> None:
-    """Log that other users of the machine may read or write a file or a folder with secrets."""
+    """Log a warning if other users may access a file or folder that holds secrets."""
     try:
         mode = stat.S_IMODE(path.stat().st_mode)
     except OSError:
@@ -127,7 +127,7 @@ def warn_of_readers(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make the names of a folder's files outlast a power cut."""
+    """Flush a folder to disk, so that the names of its files survive a power cut."""
     handle = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -137,18 +137,18 @@ def sync_folder(folder: Path) -> None:
 
 # The lock of the one process that writes to a SQLite file.
 #
-# It is the operating system's, on the file itself whatever name it was opened by, and ends with the
-# process that holds it, however that ends.
+# The operating system holds the lock on the file itself, whatever name it was opened by, and
+# releases it when the process ends, for any reason.
 
 _HELD = Path("/proc/locks")
 MAX_SHOWN = 120
 
 
 class FileLock:
-    """Takes the lock of a file at the first write, and keeps it until it is released.
+    """Lock on a SQLite file that is taken at the first write and held until released.
 
-    To close any descriptor of the file ends SQLite's own locks of this process on it: `release`
-    is called when every connection is closed.
+    Closing any descriptor of the file ends SQLite's own locks of this process on it: call `release`
+    after every connection is closed.
     """
 
     def __init__(self, file: DatabaseFile) -> None:
@@ -158,9 +158,10 @@ class FileLock:
         self._taking = threading.Lock()
 
     def take(self) -> None:
-        """Take the lock, unless it is held; creates a file that is missing.
+        """Take the lock on the database file, unless it is held; creates a missing file.
 
-        Raises `BadConfiguration` that names the process that has it, and for a read-only file.
+        Raises `BadConfiguration`, which names the process that holds the lock, and for a read-only
+        file.
         """
         if self._is_held:
             return
@@ -183,7 +184,7 @@ class FileLock:
             self._is_held = True
 
     def release(self) -> None:
-        """Let another process write."""
+        """Release the lock on the database file, so that another process may write."""
         with self._taking:
             if self._descriptor is not None:
                 os.close(self._descriptor)
@@ -192,7 +193,7 @@ class FileLock:
 
 @contextmanager
 def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
-    """Hold the lock of a file, for changes without a `Store`; None: a database server."""
+    """Hold the lock of a SQLite file during changes without a `Store`; None: a database server."""
     if file is None:
         yield
         return
@@ -205,7 +206,7 @@ def writing_alone(file: DatabaseFile | None) -> Iterator[None]:
 
 
 def is_written(file: DatabaseFile) -> bool:
-    """True if a process holds the lock of a file that exists; this one must have it not open."""
+    """True if another process holds the lock of an existing file, which must not be open here."""
     file.require_there()
     try:
         with writing_alone(file):
@@ -215,11 +216,11 @@ def is_written(file: DatabaseFile) -> bool:
 
 
 def _holder(descriptor: int) -> str:
-    """The process that holds the lock of a file, as far as this machine tells it."""
+    """Description of the process that holds the lock of a file, as far as the system names one."""
     inode = os.fstat(descriptor).st_ino
     with suppress(OSError, ValueError):
         for line in _HELD.read_text(encoding="ascii").splitlines():
-            # 3: FLOCK  ADVISORY  WRITE 8537 fe:00:2154497 0 EOF
+            # Example line: 3: FLOCK ADVISORY WRITE 8537 fe:00:2154497 0 EOF
             fields = line.split()
             if fields[1] == "FLOCK" and fields[5].endswith(f":{inode}") and int(fields[4]) > 0:
                 return f"process {fields[4]}{_command(fields[4])}"
@@ -227,7 +228,7 @@ def _holder(descriptor: int) -> str:
 
 
 def _command(process: str) -> str:
-    """The command of a process in parentheses, without the path of the interpreter."""
+    """Command line of a process in parentheses, without the path of the interpreter."""
     with suppress(OSError):
         words = Path("/proc", process, "cmdline").read_text(errors="replace").split("\0")
         if Path(words[0]).name.startswith("python"):

@@ -10,7 +10,7 @@ from service.storage.sql.columns import CURRENT, Digest, Id, Moment, Name, RunNa
 from service.storage.sql.tables import runs
 
 INNOVATIONS = "innovations"
-"""The value stored instead of a grade: the block has measurements, as they met the filter."""
+"""Stored in place of a grade for a block of measurements, with their innovations in the filter."""
 
 graded_days = sa.Table(
     "graded_days",
@@ -18,19 +18,19 @@ graded_days = sa.Table(
     sa.Column("id", Id, primary_key=True),
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
-    # The UTC day, counted as `Utc.bucket`, and its bounds.
+    # The UTC day, counted as `Utc.bucket`, and its bounds in nanoseconds.
     sa.Column("day", sa.Integer, nullable=False),
     sa.Column("start_ns", sa.BigInteger, nullable=False),
     sa.Column("end_ns", sa.BigInteger, nullable=False),
     sa.Column("revision", sa.Integer, nullable=False),
     sa.Column("current", sa.Boolean, nullable=False),
     sa.Column("created", Moment, nullable=False),
-    # Of all that it was computed from, and of what was computed.
+    # Digests of all inputs, and of the computed samples.
     sa.Column("inputs", Digest, nullable=False),
     sa.Column("digest", Digest, nullable=False),
-    # Of one grade.
+    # Number of samples of one grade.
     sa.Column("samples", sa.Integer, nullable=False),
-    # JSON: what became of the measurements and of the gyro.
+    # JSON: the use of the measurements and of the gyro data.
     sa.Column("summary", sa.Text, nullable=False),
     sa.UniqueConstraint("spacecraft", "run", "day", "revision"),
     sa.Index("uq_graded_days_current", "spacecraft", "run", "day", unique=True, **CURRENT),
@@ -41,15 +41,15 @@ graded_blocks = sa.Table(
     "graded_blocks",
     metadata,
     sa.Column("day_id", Id, sa.ForeignKey(graded_days.c.id), primary_key=True),
-    # filtered, smoothed, or innovations.
+    # Values: filtered, smoothed, or innovations.
     sa.Column("grade", sa.String(16), primary_key=True),
     sa.Column("position", sa.SmallInteger, primary_key=True),
-    # gyro or constant_rate.
+    # Values: gyro or constant_rate.
     sa.Column("model", sa.String(16), nullable=False),
-    # Of the first sample and of the last.
+    # Times of the first and of the last sample.
     sa.Column("start_ns", sa.BigInteger, nullable=False),
     sa.Column("end_ns", sa.BigInteger, nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
-    # See service/attitude/definitive.py.
+    # Layout of the packed samples: see service/attitude/definitive.py.
     sa.Column("packed", sa.LargeBinary, nullable=False),
 )

@@ -1,4 +1,4 @@
-"""What SQLite and PostgreSQL do differently, in one place: the rest names neither of them.
+"""Differences between SQLite and PostgreSQL, in one place: no other module names either of them.
 
 A SQLite file belongs to one process.  A PostgreSQL database may be shared by several services:
 they number results together, wake each other, and take locks that a single writer needs not.
@@ -12,32 +12,32 @@ from sqlalchemy import Connection, Engine
 from sqlalchemy.dialects import postgresql, sqlite
 
 PROBE_BYTES = 1 << 20
-"""Written, and taken back, to see if there is room."""
+"""Size of the trial write, later undone, that shows whether the disk has room, in bytes."""
 PROBE_TABLE = "probe_of_room"
 
 
 class Dialect(ABC):
-    """Fragments of SQL and small actions of one kind of database."""
+    """SQL fragments and small actions that differ between kinds of database."""
 
     is_shared: bool
-    """True where several services may work on one database at once."""
+    """True if several services may work on one database at once."""
     module: ModuleType
-    """SQLAlchemy's, whose `insert` knows of conflicts."""
+    """SQLAlchemy module of the dialect, whose `insert` handles conflicts."""
     paramstyle: str
     wanted: str
-    """The elements of the JSON array `wanted`, as the table `w`."""
+    """SQL source `w` with one row for each element of the JSON array `wanted`."""
     wanted_texts: str
-    """The texts of the JSON array `wanted`, as a query."""
+    """SQL query for the texts in the JSON array `wanted`."""
     next_seqs: str
-    """The next `count` places in the record's order; the last column has them."""
+    """SQL query for the next `count` places in the record's order, given in its last column."""
 
     @abstractmethod
     def item(self, place: int) -> str:
-        """One text of the array that is an element of `wanted`."""
+        """SQL for one text of an array, by its place; the array is an element of `wanted`."""
 
     @abstractmethod
     def wake_listeners(self, connection: Connection, channel: str) -> None:
-        """Wake the other services at the commit."""
+        """Notify the other services on the database when the transaction commits."""
 
     @abstractmethod
     def lock_table(self, connection: Connection, table: str) -> None:
@@ -45,15 +45,15 @@ class Dialect(ABC):
 
     @abstractmethod
     def oldest_transaction(self, connection: Connection) -> int | None:
-        """The number of the oldest transaction not ended; None where one process writes."""
+        """Number of the oldest running transaction; None where only one process writes."""
 
     @abstractmethod
     def write_probe(self, connection: Connection, tables: Iterable[str]) -> None:
-        """Write to the tables' database as much as a large batch does, to be rolled back."""
+        """Write as much to the tables' database as a large batch does, to be rolled back."""
 
     @abstractmethod
     def remove_probe(self, connection: Connection) -> None:
-        """Give back what a probe wrote, also one of a process that was killed."""
+        """Remove the trial write, including one left by a process that was killed."""
 
 
 class _Sqlite(Dialect):
@@ -62,7 +62,7 @@ class _Sqlite(Dialect):
     paramstyle = "qmark"
     wanted = "json_each(:wanted) AS w"
     wanted_texts = "SELECT value FROM json_each(:wanted)"
-    # Of results that were deleted before they were projected nothing is left to tell.
+    # Places of deleted results are not reused: leaves and the projector's position outlive them.
     next_seqs = """
         WITH RECURSIVE next(seq, n) AS (
             SELECT max(
@@ -77,16 +77,16 @@ class _Sqlite(Dialect):
         return f"json_extract(w.value, '$[{place}]')"
 
     def wake_listeners(self, connection: Connection, channel: str) -> None:
-        """Nothing: there are no others."""
+        """Do nothing: a SQLite database has no other services to notify."""
 
     def lock_table(self, connection: Connection, table: str) -> None:
-        """Nothing: a transaction that writes has the whole file."""
+        """Do nothing: a transaction that writes locks the whole SQLite file."""
 
     def oldest_transaction(self, connection: Connection) -> int | None:
         return None
 
     def write_probe(self, connection: Connection, tables: Iterable[str]) -> None:
-        # Of what is written and freed in one transaction SQLite writes nothing.
+        # SQLite writes nothing to disk for content that one transaction both writes and frees.
         connection.exec_driver_sql(f"CREATE TABLE IF NOT EXISTS {PROBE_TABLE} (content BLOB)")
         connection.exec_driver_sql(f"INSERT INTO {PROBE_TABLE} VALUES (zeroblob({PROBE_BYTES}))")
 
@@ -100,7 +100,7 @@ class _Postgresql(Dialect):
     paramstyle = "pyformat"
     wanted = "json_array_elements(CAST(%(wanted)s AS json)) AS w"
     wanted_texts = "SELECT json_array_elements_text(CAST(%(wanted)s AS json))"
-    # The transaction has its number before it takes places: see `next_seqs` of the record.
+    # Assign the transaction's number before it takes places: see `next_seqs` of the record.
     next_seqs = """
         SELECT pg_current_xact_id()::text, nextval('results_seq')
         FROM generate_series(1, %(count)s)
@@ -126,11 +126,11 @@ class _Postgresql(Dialect):
         )
 
     def remove_probe(self, connection: Connection) -> None:
-        """Nothing: the log alone was written to."""
+        """Do nothing: the trial wrote to PostgreSQL's log only."""
 
 
 def next_transaction(connection: Connection) -> int:
-    """The number of the next transaction to come, where a database is shared."""
+    """Number of the next transaction, on a shared database."""
     return _snapshot(connection, "xmax")
 
 
@@ -143,5 +143,5 @@ _DIALECTS: dict[str, Dialect] = {"sqlite": _Sqlite(), "postgresql": _Postgresql(
 
 
 def dialect_of(database: Connection | Engine) -> Dialect:
-    """The dialect that a connection or an engine speaks."""
+    """Dialect of the database behind a connection or an engine."""
     return _DIALECTS[database.dialect.name]

@@ -1,9 +1,8 @@
-"""Connections to the database: one that writes, readers that cannot, and SQLite's driver below.
+"""Database connections: one that writes, readers that cannot, and SQLite's driver below them.
 
-On SQLite a transaction is begun by name.  The driver's own habit, to begin
-before the first write only, turns a read that precedes it into one of another
-moment, and a deferred transaction that turns from reading to writing is
-refused at once, whatever the busy timeout.
+On SQLite every transaction begins with an explicit statement.  By default the driver begins before
+the first write only: an earlier read would then see another moment.  A deferred transaction that
+turns from reading to writing is refused at once, whatever the busy timeout.
 """
 
 import os
@@ -28,14 +27,14 @@ if TYPE_CHECKING:
 
 
 def driver_of(connection: Connection) -> sqlite3.Connection:
-    """The driver's connection to SQLite."""
+    """The SQLite driver's own connection behind a connection of SQLAlchemy."""
     driver = connection.connection.driver_connection
     assert isinstance(driver, sqlite3.Connection)
     return driver
 
 
 class TranslatedErrors:
-    """Raises errors of SQLite's driver as SQLAlchemy does.
+    """Context manager that raises errors of SQLite's driver as SQLAlchemy does.
 
     A class, since every statement enters one, and `contextmanager` takes longer.
     """
@@ -58,22 +57,22 @@ class TranslatedErrors:
 
 
 def run_by_driver(connection: Connection, sql: str) -> None:
-    """Run a statement of SQLite without a transaction of SQLAlchemy's."""
+    """Run an SQL statement on SQLite outside of SQLAlchemy's transactions."""
     with TranslatedErrors(connection, sql) as driver:
         driver.execute(sql)
 
 
 class RolledBack(Exception):
-    """Rolls a transaction back on purpose; the connection stays usable."""
+    """Exception that rolls a transaction back on purpose; the connection stays usable."""
 
 
 class PersistentConnection:
-    """A connection to SQLite that stays open between transactions, which take turns.
+    """Connection that stays open between SQLite transactions, which take turns.
 
-    Checking a connection out of a pool takes as long as looking a batch up, and so
-    do SQLAlchemy's own steps at the start and end of a transaction: those go to
-    SQLite's driver directly.  A connection to a server comes from the pool each
-    time, which checks that it is still alive.
+    Checking a connection out of a pool takes as long as looking a batch up, and so do SQLAlchemy's
+    own steps at the start and end of a transaction: SQLite's driver runs these statements directly.
+    A connection to a server comes from the pool each time, which checks that the connection is
+    still alive.
     """
 
     def __init__(
@@ -83,9 +82,10 @@ class PersistentConnection:
         file: DatabaseFile | None = None,
         turn_s: float | None = None,
     ) -> None:
-        """`begin` is SQLite's statement that begins a transaction; `file` must stay the same.
+        """Prepare a connection; `begin` is SQLite's statement that begins a transaction.
 
-        A caller that waits longer than `turn_s` for its turn gets `Busy`.
+        `file` must stay the same.  A caller that waits longer than `turn_s` for its turn gets
+        `Busy`.
         """
         self._engine = engine
         self._begin = begin
@@ -98,9 +98,9 @@ class PersistentConnection:
 
     @contextmanager
     def transaction(self) -> Iterator[Connection]:
-        """A transaction, committed at the end; after an error the connection is given up.
+        """Run a transaction that commits at the end; an error closes the connection.
 
-        After `RolledBack` it is not: nothing is wrong with it.
+        `RolledBack` is no such error: the connection stays open.
         """
         with self._exclusive() as connection:
             self._start(connection)
@@ -112,22 +112,22 @@ class PersistentConnection:
                 self._end(connection, keep=False)
                 raise
             except BaseException:
-                # Closed while an answer is half read, a connection would keep its lock.
+                # Close the connection: with an answer half read it would keep its lock.
                 with suppress(SQLAlchemyError):
                     self._end(connection, keep=False)
                 raise
-        # Do not acknowledge what was written to a file that has been removed since.
+        # A write to a file that was removed meanwhile must not be acknowledged.
         if self._file is not None:
             self._file.require_log(log)
 
     @contextmanager
     def lookup(self) -> Iterator[Connection]:
-        """A connection for look-ups; on SQLite each prepared statement sees its own snapshot."""
+        """Provide a connection for look-ups; on SQLite each prepared query has its own snapshot."""
         with self._exclusive() as connection:
             if self._is_shared:
                 connection.begin()
             yield connection
-            # SQLAlchemy has begun one if it ran a statement itself.
+            # SQLAlchemy has begun a transaction if it ran a statement itself.
             if connection.in_transaction():
                 connection.rollback()
 
@@ -156,9 +156,9 @@ class PersistentConnection:
             self._lock.release()
 
     def _is_idle(self, connection: Connection) -> bool:
-        """True if a server says that its session is outside of any transaction, after an error.
+        """True if a server reports, after an error, that its session is outside of any transaction.
 
-        The session may hold a lock, which would be lost with it.
+        Such a session is kept: it may hold a lock, which would be lost with it.
         """
         if not self._is_shared or connection.invalidated or connection.in_transaction():
             return False
@@ -189,7 +189,7 @@ class PersistentConnection:
             connection.rollback()
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection, or return it to its pool."""
         with self._lock:
             if self._open is not None:
                 self._open.close()
@@ -200,52 +200,52 @@ RV = TypeVar("RV")
 
 BUSY_TIMEOUT_MS = 10_000
 WRITER_CACHE_KIB = 32_768
-"""The size of the cache of pages: the inner ones of every index are read with each batch."""
+"""Page cache of the writing connection in KiB: each batch reads the inner pages of every index."""
 TO_WRITE, TO_READ = "BEGIN IMMEDIATE", "BEGIN"
-"""How SQLite begins a transaction of the one connection that writes, and of a reader."""
+"""SQLite statements that begin a transaction of the writing connection, and of a reader."""
 MAX_READERS = 16
-"""Readers at once in a process; others wait for a free one.
+"""Largest number of reading connections of a process; further readers wait for a free one.
 
-PostgreSQL allows a hundred connections by default; each of SQLite's keeps two megabytes
-of pages, and its reader a page of answers.
+PostgreSQL allows a hundred connections by default; each of SQLite's keeps two megabytes of pages,
+and its reader a page of answers.
 """
 
 
 @dataclass(frozen=True)
 class Timeouts:
-    """How long a connection waits while a client waits for the answer.
+    """Database timeouts while a client waits for an answer.
 
-    `lock_s` for a lock that another holds, `statement_s` for a statement; for the
-    server's answer to it `MORE_S` longer.
+    `lock_s` bounds the wait for a lock, `statement_s` a statement; the server's reply to a
+    statement may take `MORE_S` longer.
     """
 
     lock_s: float
     statement_s: float
     idle_s: float = 0.0
-    """The idle time after which a server ends an open transaction, and frees its locks."""
+    """Idle time in seconds after which a server ends an open transaction and frees its locks."""
     lost_s: int = 0
-    """The time without a sign of life from a client after which a server ends its session."""
+    """Seconds without a sign of life from a client after which a server ends its session."""
 
 
-# A post waits at most 5 s for its turn, then for one look-up, for the turn to write and for one
-# transaction, of which one ends with a time-out: 15 s in all.
+# A post waits at most 5 s for its turn, then for one look-up, the turn to write and one
+# transaction; one of these ends with a timeout: 15 s in all.
 TO_LOOK_UP = Timeouts(lock_s=2.0, statement_s=3.0)
 TO_COMMIT = Timeouts(lock_s=2.0, statement_s=4.0, idle_s=30.0, lost_s=6)
 TO_SHOW = Timeouts(lock_s=2.0, statement_s=12.0)
-"""Timeouts for pages and lists, some of which read much."""
+"""Timeouts for pages and lists, which may read many rows."""
 PATIENT_S = 60.0
-"""The timeout of a statement of a bulk load, which has time: posts do not wait for it."""
+"""Timeout in seconds for a statement of a bulk load, which no post waits for."""
 MORE_S = 1.0
 PING_S = 2.0
-"""The timeout of the question whether a pooled connection is still there."""
+"""Timeout in seconds of the check that a pooled connection is still alive."""
 CONNECT_S, TCP_USER_TIMEOUT_S = 2, 8
 FREE_S = 10.0
-"""The longest wait for a reader's connection that is free."""
+"""Longest wait for a free reading connection, in seconds."""
 LONGEST_WAIT_S = 2.0
-"""The longest wait of a look-up, or of what is to be written, before it begins."""
+"""Longest wait in seconds before a look-up or a write begins."""
 
 SECRETS = ("password", "sslpassword")
-"""Secrets in the query part of a URL of PostgreSQL."""
+"""Names of secrets in the query part of a PostgreSQL URL."""
 
 _DRIVERS = {
     "sqlite": "sqlite",
@@ -256,17 +256,17 @@ _DRIVERS = {
 
 
 def database_url(text: str) -> URL:
-    """The URL of a database that the service can use; raises `BadConfiguration` for any other."""
+    """Parse the URL of a supported database; raises `BadConfiguration` for any other text."""
     try:
         url = make_url(text)
         driver = _DRIVERS[url.drivername]
     except (ArgumentError, KeyError, ValueError):
-        # The text may hold a password: it is not shown.
+        # The text may hold a password: leave it out of the message.
         raise BadConfiguration(
             "ACQUIRE_DATABASE: must be sqlite:///FILE or postgresql://USER@HOST:PORT/DATABASE"
         ) from None
     if url.password is not None and "@" in f"{url.host}{url.database}":
-        # A part of the password stands where host and database should.
+        # Part of the password stands where host and database should be.
         raise BadConfiguration(
             "ACQUIRE_DATABASE: more than one @: in a password write it as %40 (and % as %25), or "
             "leave the password out and set PGPASSWORD"
@@ -277,13 +277,13 @@ def database_url(text: str) -> URL:
 
 
 def shown_url(url: URL) -> str:
-    """The URL for a message, its password hidden, also where the query part has it."""
+    """Format a database URL for a message, passwords hidden, including those in its query part."""
     hidden = {name: "***" for name in SECRETS if name in url.query}
     return url.update_query_dict(hidden).render_as_string(hide_password=True)
 
 
 def database_file(url: URL) -> DatabaseFile | None:
-    """The file of a SQLite database; None for a server."""
+    """File of a SQLite database, from its URL; None for a database server."""
     if url.drivername != "sqlite":
         return None
     return DatabaseFile(Path(url.database or "").absolute())
@@ -296,11 +296,10 @@ def writing_engine(
     create: bool = True,
     timeouts: Timeouts | None = None,
 ) -> Engine:
-    """The engine of the one connection that writes.
+    """Create the engine of the one connection that writes.
 
-    SQLite's file is created by the first connection, where `create` allows it, and by
-    no other; `file` remembers which one it is.  Without `timeouts` the connection waits for
-    as long as it takes.
+    SQLite's file is created by the first connection, where `create` allows it, and by no other;
+    `file` remembers its identity.  Without `timeouts` the connection waits for as long as it takes.
     """
     if url.drivername != "sqlite":
         return _postgresql(url, timeouts, pool_size=1, max_overflow=0)
@@ -309,18 +308,18 @@ def writing_engine(
     _open_as_file(engine, file, create)
     # Savepoints are journalled in memory: otherwise SQLite makes a file for each.
     kept = ("temp_store = MEMORY", f"cache_size = -{WRITER_CACHE_KIB}")
-    # SQLite's default checkpoint after a thousand pages stays: with four thousand the writer waits
-    # 20 ms for each, and nothing is gained.
+    # Keep SQLite's default checkpoint after a thousand pages: with four thousand the writer waits
+    # 20 ms for each checkpoint and gains nothing.
     pragmas = ("journal_mode = WAL", "synchronous = FULL", *kept)
     _set_up_sqlite(engine, *pragmas, begin=TO_WRITE, timeouts=timeouts)
     return engine
 
 
 def reading_engine(url: URL, timeouts: Timeouts | None = None, most: int = MAX_READERS) -> Engine:
-    """The engine of the readers, none of which can write.
+    """Create the engine of the reading connections, none of which can write.
 
-    As many connections are kept as were ever in use at once, up to `most`: to
-    open one costs more than a dozen reads.
+    The pool keeps as many connections as were ever in use at once, up to `most`: opening one costs
+    more than a dozen reads.
     """
     pool: dict[str, Any] = {"pool_size": most, "max_overflow": 0}
     if timeouts is not None:
@@ -346,22 +345,22 @@ def _postgresql(url: URL, timeouts: Timeouts | None, **pool: Any) -> Engine:
 
 
 def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
-    """An engine whose connections wait no longer than the timeouts; what the URL says holds."""
+    """Create a PostgreSQL engine with bounded waits; bounds given in the URL take precedence."""
     import psycopg
 
     class BoundedConnection(psycopg.Connection[tuple[object, ...]]):
-        """A connection that is closed once an answer takes longer than `answer_s`.
+        """PostgreSQL connection that is closed if an answer takes longer than `answer_s`.
 
-        A server's own time-outs hold as long as it runs.  A server that is stopped, or a
-        proxy before it, acknowledges every packet and never answers.
+        A server's own timeouts hold only while it runs.  A stopped server, or a proxy before it,
+        acknowledges every packet and never answers.
         """
 
         answer_s = timeouts.statement_s + MORE_S
 
         def wait(self, gen: "PQGen[RV]", interval: float = 0.1, timeout: float | None = None) -> RV:
-            """Let a statement run to its end; raises `OperationalError` where it takes long."""
+            """Wait for a statement to end; raises `OperationalError` after the timeout."""
             if timeout is None:
-                # SQLAlchemy asks whether the connection is there outside of any transaction.
+                # Outside of any transaction SQLAlchemy only checks that the connection is alive.
                 timeout = min(PING_S, self.answer_s) if self.autocommit else self.answer_s
             try:
                 return super().wait(gen, interval, timeout)
@@ -398,7 +397,7 @@ def _bounded(url: URL, timeouts: Timeouts, pool: dict[str, Any]) -> Engine:
 
 
 def _open_as_file(engine: Engine, file: DatabaseFile | None = None, create: bool = False) -> None:
-    """Let SQLite create a file with the first connection at most, where that is allowed."""
+    """Let SQLite create its file with the first connection only, and only where allowed."""
     may_create = create
 
     @event.listens_for(engine, "do_connect")
@@ -430,22 +429,22 @@ def _set_up_sqlite(
 
     @event.listens_for(engine, "connect")
     def _connected(connection: sqlite3.Connection, _record: Any) -> None:
-        # None: the driver begins nothing by itself; `_begun` below does.
+        # With None the driver begins no transaction by itself; `_begun` below does.
         connection.isolation_level = None
-        # The timeout comes first: it also holds for the pragmas that follow.
+        # Set the timeout first: it also holds for the pragmas that follow.
         for pragma in (f"busy_timeout = {busy_ms}", "foreign_keys = ON", *pragmas):
             connection.execute(f"PRAGMA {pragma}")
 
     @event.listens_for(engine, "begin")
     def _begun(connection: Connection) -> None:
-        # If `PersistentConnection` has begun one, SQLAlchemy joins it.
+        # If `PersistentConnection` has begun a transaction, SQLAlchemy joins it.
         if not driver_of(connection).in_transaction:
             run_by_driver(connection, begin)
 
 
 @contextmanager
 def patience(connection: Connection) -> Iterator[None]:
-    """Let the statements of a transaction take longer than those that a post waits for."""
+    """Extend the timeouts of a transaction's statements beyond those of a post."""
     driver: Any = connection.connection.driver_connection
     answer_s = getattr(driver, "answer_s", None)
     if answer_s is None:

@@ -1,7 +1,7 @@
-"""The schema's migrations: bringing a database up to date, and telling whether it is.
+"""Schema migrations: upgrade a database, and check that its schema is up to date.
 
-alembic is loaded only where there is something to change or to compare: a
-service that starts would wait for it.
+alembic is imported only to change or compare a schema: the import would delay the start of the
+service.
 """
 
 import json
@@ -31,14 +31,14 @@ log = logging.getLogger(__name__)
 HEAD = max(each.name[:4] for each in shipped("migrations", "versions").glob("[0-9]*.py"))
 """The latest revision of `migrations/`."""
 UNFINISHED = "copy:"
-"""How the revision of a database begins that `upkeep.copy` has not copied to its end."""
+"""Prefix of the revision of a database that `upkeep.copy` has not finished copying."""
 
 
 def upgrade(database: str) -> None:
-    """Create what is missing and bring the schema to this version's; data is kept.
+    """Upgrade a database to this version's schema, creating missing tables; data is kept.
 
-    Raises `BadConfiguration` for a database that cannot be reached, is none,
-    or was written by a newer version.
+    Raises `BadConfiguration` for a database that cannot be reached, is none, or was written by a
+    newer version.
     """
     url = engines.database_url(database)
     with writing_alone(engines.database_file(url)), disposed(engines.writing_engine(url)) as engine:
@@ -47,7 +47,7 @@ def upgrade(database: str) -> None:
 
 @contextmanager
 def reading(database: str) -> Iterator[Connection]:
-    """A connection that reads a database as of one moment, and creates nothing.
+    """Connect to a database for reading as of one moment, creating nothing.
 
     Raises `BadConfiguration` where the database is missing or cannot be reached.
     """
@@ -61,7 +61,7 @@ def reading(database: str) -> Iterator[Connection]:
 
 @contextmanager
 def connected(url: URL) -> Iterator[Connection]:
-    """A connection that reads the database of a URL as of one moment."""
+    """Connect to the database of a URL for reading as of one moment."""
     engine = engines.reading_engine(url)
     with disposed(engine), reported(url), engine.begin() as connection:
         yield connection
@@ -70,7 +70,7 @@ def connected(url: URL) -> Iterator[Connection]:
 def require_records(database: str) -> None:
     """Raise `BadConfiguration` for a SQLite file that is missing or was never the service's.
 
-    What opens a database to write would make the service's tables in it.
+    Opening the file to write would create the service's tables in it.
     """
     url = engines.database_url(database)
     if url.drivername == "sqlite" and revision_of(database) is None:
@@ -80,16 +80,15 @@ def require_records(database: str) -> None:
 
 
 def revision_of(database: str) -> str | None:
-    """The revision of a database's schema; None where it holds no records of the service."""
+    """Revision of a database's schema; None where it holds no records of the service."""
     with reading(database) as connection:
         return revision_in(connection)
 
 
 def check(database: str) -> list[str]:
-    """How the schema of a database differs from the tables of the code; empty: not at all.
+    """List the differences between a database's schema and the tables of the code.
 
-    Nothing is written and nothing created: raises `BadConfiguration` where
-    there is no database.
+    Nothing is written and nothing created: raises `BadConfiguration` where there is no database.
     """
     with reading(database) as connection:
         differs = _difference(connection)
@@ -120,7 +119,7 @@ def _unknown_tables(connection: Connection) -> list[str]:
 
 
 def _is_about(difference: Any, tables: Collection[str]) -> bool:
-    """True if alembic would remove one of these tables, or an index of one."""
+    """True if alembic's difference removes one of the given tables, or an index of one."""
     if isinstance(difference, list):
         return False
     verb, thing = difference[:2]
@@ -130,25 +129,25 @@ def _is_about(difference: Any, tables: Collection[str]) -> bool:
 
 def all_tables() -> list[Table]:
     """All database tables that the code defines, each after the tables that it refers to."""
-    # A table is known to the metadata when its module is loaded.
+    # Importing a module registers its tables in the metadata.
     from service.storage.sql import (  # noqa: F401
         chain_tables,
         definitive_tables,
         tables,
     )
 
-    # A feature that is off keeps its tables.
+    # A feature that is switched off keeps its tables.
     feature_modules("tables", off="")
     return metadata.sorted_tables
 
 
 def brought_tables() -> list[Table]:
-    """The tables of features that other packages bring: no migration of the service makes them."""
+    """Tables of features from other packages, which the service's migrations do not create."""
     return [table for module in brought_modules("tables") for table in module.TABLES]
 
 
 def check_fresh() -> list[str]:
-    """How the migrations, run from nothing, differ from the tables of the code."""
+    """List the differences between a newly migrated database and the tables of the code."""
     with tempfile.TemporaryDirectory() as folder:
         database = f"sqlite:///{Path(folder, 'fresh.db')}"
         upgrade(database)
@@ -156,7 +155,7 @@ def check_fresh() -> list[str]:
 
 
 def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None) -> None:
-    """Run the migrations that are missing, in one transaction; `before` is called first of all."""
+    """Run the missing migrations in one transaction; `before` is called before the first."""
     with reported(engine.url), engine.begin() as connection:
         found = revision_in(connection)
         if found == HEAD:
@@ -184,7 +183,7 @@ def bring_up_to_date(engine: Engine, before: Callable[[], object] = lambda: None
 
 
 def require_up_to_date(engine: Engine) -> None:
-    """Raise `BadConfiguration` unless the schema is this version's."""
+    """Raise `BadConfiguration` unless the database has this version's schema."""
     with reported(engine.url), engine.begin() as connection:
         differs = _difference(connection)
     if differs is not None:
@@ -193,7 +192,7 @@ def require_up_to_date(engine: Engine) -> None:
 
 @contextmanager
 def reported(url: URL) -> Iterator[None]:
-    """Turn what a database says of itself on opening into a `BadConfiguration`."""
+    """Convert database errors on opening into a `BadConfiguration`."""
     try:
         yield
     except (SQLAlchemyError, UnicodeDecodeError) as error:
@@ -203,7 +202,7 @@ def reported(url: URL) -> Iterator[None]:
 
 @contextmanager
 def disposed(engine: Engine) -> Iterator[Engine]:
-    """An engine whose connections are closed at the end."""
+    """Provide an engine whose connections are closed at the end."""
     try:
         yield engine
     finally:
@@ -220,7 +219,7 @@ def _config() -> "Config":
 
 
 def revision_in(connection: Connection) -> str | None:
-    """`revision_of` the database of a connection."""
+    """Schema revision of a connection's database; None where it holds no records of the service."""
     if not inspect(connection).has_table("alembic_version"):
         return None
     revisions = connection.exec_driver_sql("SELECT version_num FROM alembic_version").scalars()
@@ -253,13 +252,13 @@ def _difference(connection: Connection) -> str | None:
 
 
 def _missing(connection: Connection) -> list[Table]:
-    """The tables of brought features that the database does not have."""
+    """Tables of features from other packages that the database lacks."""
     brought = brought_tables()
     return [each for each in brought if not inspect(connection).has_table(each.name)]
 
 
 def _writer(connection: Connection) -> str:
-    """The version that wrote the newest answer, as far as another schema lets it be known."""
+    """Service version that wrote the newest answer, if another schema still lets it be read."""
     newest = "SELECT answer FROM results ORDER BY id DESC LIMIT 1"
     with suppress(SQLAlchemyError, ValueError, LookupError, TypeError), connection.begin_nested():
         answer = unpack(connection.exec_driver_sql(newest).scalar_one())
@@ -269,7 +268,7 @@ def _writer(connection: Connection) -> str:
 
 
 def _in_words(difference: Any) -> str:
-    """One difference as alembic tells it: a verb, then what it is about, perhaps in a list."""
+    """Describe one of alembic's differences: a verb, then its subject; or a list of these."""
     if isinstance(difference, list):
         return "; ".join(_in_words(each) for each in difference)
     verb, *about = difference

@@ -1,13 +1,12 @@
-"""The lock of the one service that projects, among those that share a PostgreSQL database.
+"""Lock of the one service that projects, among those that share a PostgreSQL database.
 
 It is an advisory lock of the session that writes.  PostgreSQL releases it when the session ends,
-whatever ends it, and rolls back what the session had not committed: a service that has lost the
-lock has lost its connection too.  Another session of the same pool does not hold the lock, so
-each transaction of the projector begins with the question whose session it has, which costs
-nothing.
+for any reason, and rolls back what the session had not committed: a service that has lost the lock
+has lost its connection too.  Another session of the same pool does not hold the lock, so each
+transaction of the projector first checks its session, which costs nothing.
 
-The same session holds a lock for each replay and calibration that its service is at work on, so
-that others see which ones go on, and which ones a service left that has ended.
+The same session holds a lock for each replay and calibration in progress in its service, so that
+other services see which ones run, and which ones were left by a service that ended.
 """
 
 import threading
@@ -19,9 +18,9 @@ from sqlalchemy import Connection
 from service.errors import Busy
 from service.storage.sql.statements import execute
 
-# Two numbers, the second of which is that of a table: each schema of a database has its own lock.
+# Key of two numbers; the second is a table's, so that each schema of a database has its own lock.
 _TAKE = "SELECT pg_try_advisory_lock(1633906037, 'event_counter'::regclass::oid::int)"
-# An id has 80 bits of chance: schemas do not come in each other's way.
+# An id has 80 random bits: locks of different schemas do not collide.
 _OF_WORK = "hashtextextended(%(id)s, 0)"
 _HOLD = f"SELECT pg_advisory_lock_shared({_OF_WORK})"
 _RELEASE = f"SELECT pg_advisory_unlock_shared({_OF_WORK})"
@@ -31,43 +30,43 @@ Attempt = Literal["kept", "taken", "refused"]
 
 
 class NotProjecting(Busy):
-    """Refusal of work that only one service on a database does: another one does it."""
+    """Error for work that only one service on a database does, while another service does it."""
 
 
 class ProjectorLock:
-    """Knows if the session that writes holds the lock; used by the writer's thread."""
+    """State of the projector's lock in the session that writes; used by the writer's thread."""
 
     def __init__(self) -> None:
         self._session: object | None = None
-        """The driver's connection that holds the lock."""
+        """The driver's connection that holds the lock; None without the lock."""
         self.lost = threading.Event()
-        """Set where a transaction found that its session does not hold the lock."""
+        """Event set when a transaction finds that its session does not hold the lock."""
         self.at_work: set[str] = set()
-        """The ids of replays and calibrations that this service is at work on."""
+        """Ids of the replays and calibrations in progress in this service."""
         self._work_session: object | None = None
         self._held: set[str] = set()
 
     @property
     def is_held(self) -> bool:
-        """True if this service projects, as far as is known without asking the database."""
+        """True if this service projects, to its own knowledge, without asking the database."""
         return self._session is not None
 
     def require(self) -> None:
-        """Raise `NotProjecting` unless the lock is held, as far as is known without asking."""
+        """Raise `NotProjecting` unless this service holds the lock, without asking the database."""
         if self._session is None:
             raise NotProjecting("another service projects what is recorded")
 
     def require_in(self, connection: Connection) -> None:
-        """Raise `NotProjecting` unless a transaction's session is the one that holds the lock."""
+        """Raise `NotProjecting` unless a transaction runs in the session that holds the lock."""
         if _session(connection) is not self._session:
             self._session = None
             self.lost.set()
             raise NotProjecting("the session that held the projector's lock has ended")
 
     def take(self, connection: Connection) -> Attempt:
-        """Take the lock for a session, unless that has it already or another session has.
+        """Take the projector's lock for a session, unless this or another session has it.
 
-        The locks of the work at hand are taken and released along with it.
+        The locks of the replays and calibrations in progress are taken and released along with it.
         """
         session = _session(connection)
         self._hold_work(connection, session)
@@ -89,7 +88,7 @@ class ProjectorLock:
 
 
 def left_behind(connection: Connection, ids: Collection[str]) -> set[str]:
-    """The replays and calibrations that no session holds the lock of."""
+    """Replays and calibrations, out of `ids`, that no session holds a lock for."""
     return {id for id in ids if execute(connection, _IS_FREE, {"id": id})[0][0]}
 
 

@@ -1,4 +1,4 @@
-"""Statements that are put into SQL once and run many times, and the inserts of results."""
+"""SQL statements that are compiled once and run many times, and the inserts of results."""
 
 import operator
 import sqlite3
@@ -18,20 +18,20 @@ from service.storage.sql.tables import COUNTS, MAXIMA, MINIMA, SUMS, runs
 
 T = TypeVar("T")
 
-# SQLAlchemy compiles a statement at every execution and wraps every row.  With a
-# dozen statements for each group of results that takes longer than running them.
-# For a file the compiled text goes to the driver directly, with values by position;
-# for a server through SQLAlchemy, with values by name.
+# SQLAlchemy compiles a statement at every execution and wraps every row.  For a dozen statements
+# for each group of results this takes longer than running them.  On SQLite the compiled text goes
+# to the driver directly, with values by position; on a server through SQLAlchemy, with values by
+# name.
 
 ROWS_AT_ONCE = (64, 8)
-"""Few sizes, so that the driver keeps what it made of each statement."""
+"""Row counts of multi-row inserts; two only, so that the driver can cache each statement."""
 
 
 class Prepared:
-    """A statement whose SQL is the same whatever its values."""
+    """Statement compiled to the same SQL text whatever its values."""
 
     def __init__(self, make: Callable[[Any], sa.Executable]) -> None:
-        """`make` is given the module of a dialect, whose `insert` knows of conflicts."""
+        """`make` builds the statement from a dialect's module, whose `insert` handles conflicts."""
         self._make = make
         self._ready: dict[Dialect, tuple[str, tuple[str, ...]]] = {}
         self._of_many: dict[int, str] = {}
@@ -39,7 +39,7 @@ class Prepared:
         """Values that are part of the statement itself."""
 
     def run(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
-        """Run the statement with the values of every row, by name."""
+        """Run the statement once for each row of named values."""
         if not rows:
             return
         dialect = dialect_of(connection)
@@ -54,10 +54,10 @@ class Prepared:
             driver.executemany(sql, map(take, rows) if len(names) > 1 else zip(map(take, rows)))
 
     def insert(self, connection: sa.Connection, rows: Sequence[Row]) -> None:
-        """`run` of an INSERT that ends with its values, on SQLite of many rows at a time.
+        """Run an INSERT for all rows; on SQLite with several rows in each statement.
 
-        The driver lets go of the interpreter's lock with every step, and while
-        others compute it takes longer to get that back than to write a row.
+        The driver releases the interpreter's lock at every step, and while other threads compute,
+        taking the lock back takes longer than writing a row.
         """
         dialect = dialect_of(connection)
         if dialect.is_shared or len(rows) < ROWS_AT_ONCE[-1]:
@@ -77,7 +77,7 @@ class Prepared:
             driver.executemany(sql, values[done:])
 
     def _many(self, sql: str, columns: int, count: int) -> str:
-        """The statement of so many rows; always the same object, whose hash is known."""
+        """SQL text that inserts `count` rows; always the same object, whose hash is cached."""
         many = self._of_many.get(count)
         if many is None:
             one_more = ", (" + ", ".join("?" * columns) + ")"
@@ -85,7 +85,7 @@ class Prepared:
         return many
 
     def read(self, connection: sa.Connection, values: Row) -> list[Row]:
-        """The rows that the statement gives."""
+        """Run the statement as a query; its rows by column name."""
         dialect = dialect_of(connection)
         sql, names = self._sql(dialect)
         values = self._constants | values
@@ -98,7 +98,7 @@ class Prepared:
             return [dict(zip(_names(cursor), row, strict=True)) for row in rows]
 
     def _sql(self, dialect: Dialect) -> tuple[str, tuple[str, ...]]:
-        """The text, and the names of its values in the order of their places."""
+        """SQL text for a dialect, and the names of its values by position."""
         ready = self._ready.get(dialect)
         if ready is None:
             module: Any = dialect.module
@@ -112,14 +112,14 @@ class Prepared:
 
 
 def prepared(statement: sa.Executable) -> Prepared:
-    """A statement that is the same in every dialect."""
+    """Prepare a statement that is the same in every dialect."""
     return Prepared(lambda _: statement)
 
 
 def execute(
     connection: sa.Connection, sql: str, values: Row | None = None
 ) -> list[tuple[Any, ...]]:
-    """Run SQL of the dialect's own, values by name; its rows."""
+    """Run SQL text of the connection's dialect with named values; returns the rows."""
     if dialect_of(connection).is_shared:
         result = connection.exec_driver_sql(sql, values or {})
         return [tuple(row) for row in result] if result.returns_rows else []
@@ -132,26 +132,26 @@ def _names(cursor: sqlite3.Cursor) -> list[str]:
 
 
 def portions(values: Sequence[T]) -> Iterator[Sequence[T]]:
-    """The values in portions of a thousand: no database takes any number of them at once."""
+    """Split values into portions of a thousand, since databases limit the number in a statement."""
     for first in range(0, len(values), 1_000):
         yield values[first : first + 1_000]
 
 
 def count(connection: sa.Connection, table: sa.Table, *chosen: sa.ColumnElement[bool]) -> int:
-    """The number of a table's rows that are chosen."""
+    """Count the rows of a table that meet the given conditions."""
     query = sa.select(sa.func.count()).select_from(table).where(*chosen)
     return int(connection.execute(query).scalar_one())
 
 
 def rows_of(connection: sa.Connection, query: sa.Select[Any]) -> list[Row]:
-    """The rows that a query gives, by the names of their columns."""
+    """Run a query; its rows as values by column name."""
     return [dict(row) for row in connection.execute(query).mappings()]
 
 
 def owned_rows(
     connection: sa.Connection, table: sa.Table, owner: str, ids: Iterable[str]
 ) -> dict[str, list[Row]]:
-    """The rows of a table by the id that their column `owner` names, which may have none."""
+    """Group a table's rows by the id in column `owner`; an id without rows has an empty list."""
     found: dict[str, list[Row]] = {id: [] for id in ids}
     for row in rows_of(connection, sa.select(table).where(table.c[owner].in_(found))):
         found[row[owner]].append(row)
@@ -159,9 +159,9 @@ def owned_rows(
 
 
 COPIED_FROM = 50
-"""Rows; to set a COPY up takes as long as to insert a few."""
+"""Least number of rows inserted by COPY; its setup takes as long as inserting a few rows."""
 
-# Of two that fit, the narrower stands first; Text is a String.
+# Where two types fit, the narrower stands first; Text is a String.
 _COPIED: Sequence[tuple[type[Any], str]] = (
     (sa.BigInteger, "int8"),
     (sa.SmallInteger, "int2"),
@@ -175,7 +175,7 @@ _COPIED: Sequence[tuple[type[Any], str]] = (
 
 
 def insert_all(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
-    """Insert rows that name every column; on PostgreSQL many of them by COPY."""
+    """Insert rows that name every column; on PostgreSQL many rows by COPY."""
     if len(rows) >= COPIED_FROM and dialect_of(connection).is_shared:
         _copy(connection, table, rows)
         return
@@ -187,12 +187,12 @@ def insert_all(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) 
 
 @cache
 def _packed(table: sa.Table) -> Sequence[str]:
-    """The columns whose values SQLite's driver is given packed."""
+    """Names of the columns whose values are compressed before SQLite's driver gets them."""
     return [column.name for column in table.c if isinstance(column.type, PackedText)]
 
 
 def insert_missing(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
-    """Insert the rows whose keys are not there yet; leave the others as they are."""
+    """Insert the rows whose keys are missing in the table; rows with a known key stay unchanged."""
     _insert_missing(table).run(connection, rows)
 
 
@@ -203,21 +203,21 @@ def insert_runs(
     alarms: bool = False,
     tracked: bool = False,
 ) -> None:
-    """Note runs by the moments when they were made; known ones stay as they are."""
+    """Insert runs with the times of their creation; known runs stay unchanged."""
     others = {"alarms": alarms, "tracked": tracked}
     rows = [{"name": name, "created": moment} | others for name, moment in created.items()]
     insert_missing(connection, runs, rows)
 
 
 def add_rollups(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
-    """Merge each row of a rollup into that of its key: sums add up, outer extremes stay."""
+    """Merge rows into a rollup by key: sums are added, extremes widened."""
     _add_rollups(table).run(connection, rows)
 
 
 def _copy(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> None:
-    """Send rows as PostgreSQL's COPY takes them, in the transaction and savepoint at hand.
+    """Insert rows by PostgreSQL's COPY in the present transaction and savepoint.
 
-    What the server says against a row is raised as by any other statement.
+    The server's objection to a row is raised as by any other statement.
     """
     sql, types = _copy_of(table)
     names = [column.name for column in table.columns]
@@ -239,7 +239,7 @@ def _copy(connection: sa.Connection, table: sa.Table, rows: Sequence[Row]) -> No
 
 @cache
 def _copy_of(table: sa.Table) -> tuple[str, list[str]]:
-    """The statement, and the types that its binary rows are made of."""
+    """COPY statement for a table, and the PostgreSQL types of its binary columns."""
     names = ", ".join(f'"{column.name}"' for column in table.columns)
     types = [
         next(name for kind, name in _COPIED if isinstance(column.type, kind))
@@ -266,7 +266,7 @@ def _add_rollups(table: sa.Table) -> Prepared:
 def _merging(statement: Any, table: sa.Table) -> sa.Executable:
     new = statement.excluded
     merged = {name: table.c[name] + new[name] for name in (*COUNTS, *SUMS)}
-    # By CASE: of a null SQLite's MIN is null, PostgreSQL's LEAST the other one.
+    # CASE, since MIN of a null is null on SQLite, while PostgreSQL's LEAST ignores the null.
     for names, is_outer in ((MINIMA, operator.lt), (MAXIMA, operator.gt)):
         for name in names:
             old = table.c[name]

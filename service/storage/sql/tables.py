@@ -1,31 +1,31 @@
-"""The tables, the same on SQLite and PostgreSQL.
+"""Database tables of the service, the same on SQLite and PostgreSQL.
 
     frames ──┐
     runs ── batches ── results ── star_results
                          │    └── solutions        no attitude, no row
     missions, catalogs ──┘
     idempotency_keys ── results
-    mission_uses ── missions                       from when each settings were in use
-    tracker_values ── batches                      its current result, tracker by tracker
-    rollups_hourly, rollups_daily                  of current results
-    projector                                      how far projections have come
+    mission_uses ── missions                       periods in which settings were in use
+    tracker_values ── batches                      current result of each tracker
+    rollups_hourly, rollups_daily                  sums over current results
+    projector                                      position of the projections
     annotations                                    notes of people
-    archived_parts, archived_batches, ...          batches that left it (see their figure below)
+    archived_parts, archived_batches, ...          archived batches (see their figure below)
     events, event_counter                          recent events in order of commit
-    calibrations ── calibration_adoptions          of trackers, and what holds of them
+    calibrations ── calibration_adoptions          of trackers, and the adopted ones
     replays
-    access_tokens ── access_sessions, audit        who may ask, who changed what
+    access_tokens ── access_sessions, audit        permissions, and the log of changes
 
-A batch is what was sent; a result is what was made of it.  The first result of
-a batch has the batch's own id; recorded what-ifs add others, and exactly one
-result of a batch is current.  Results repeat the spacecraft, run and time of
-their batch, so that one index answers a list, a history or a trend.
+A batch holds the observations sent; a result is one evaluation of a batch.  The first result of a
+batch has the batch's own id; recorded what-ifs add others, and exactly one result of a batch is
+current.  Results repeat the spacecraft, run and time of their batch, so that one index answers a
+list, a history or a trend.
 
-A batch that was made of a frame has a row in `frames`: what was found on it, and a
-small picture.  The frame itself is not kept.
+A batch made from a frame has a row in `frames`: the detections and a small picture.  The frame
+itself is not kept.
 
-A batch's time is kept as the text of its UTC and as `time_ns`, nanoseconds of
-TAI from 2000-01-01T12:00:00 TAI, for order and ranges.
+A batch's time is kept as the text of its UTC and as `time_ns`, nanoseconds of TAI from
+2000-01-01T12:00:00 TAI, for order and ranges.
 """
 
 import sqlalchemy as sa
@@ -83,25 +83,25 @@ audit = sa.Table(
 
 # The rollups: sums and extremes of current results by hour and day, for trends.
 #
-# Of spacecraft, and of the trackers of spacecraft that have several.
+# One pair is by spacecraft; the other also by tracker, for spacecraft with several.
 
 COUNTS = ("batches", "observed", "unique", "ambiguous", "unmatched", "solved", "suspect")
 _ROLLED_UP = {name: source for name, source in STORED.items() if source.rolled_up}
 SHARES = tuple(name for name, source in _ROLLED_UP.items() if isinstance(source, StarShare))
-"""Shares of a batch's stars; their means follow from the counts."""
+"""Columns with shares of a batch's stars; their means follow from the counts."""
 VALUES = tuple(name for name in _ROLLED_UP if name not in SHARES)
 SUMS = tuple(f"{name}_{part}" for name in VALUES for part in ("n", "sum"))
 MINIMA = tuple(f"{name}_min" for name in (*SHARES, *VALUES))
 MAXIMA = tuple(f"{name}_max" for name in (*SHARES, *VALUES))
 ROLLED_UP = (*COUNTS, *SUMS, *MINIMA, *MAXIMA)
-"""The columns of a rollup without its key."""
+"""Columns of a rollup without its key."""
 
 
 def _rollup(name: str, *key: str) -> sa.Table:
-    """Sums and extremes over the current results of each spacecraft, run, tracker and bucket.
+    """Create a table of sums and extremes over current results by spacecraft, run and bucket.
 
-    A bucket is a UTC hour or day (see `Utc.bucket`).  `_n` batches have the
-    value whose `_sum` stands beside it; an extreme of none is null.
+    A bucket is a UTC hour or day (see `Utc.bucket`).  `_n` counts the batches with a value, whose
+    sum is `_sum`; an extreme of no values is null.
     """
     return sa.Table(
         name,
@@ -128,10 +128,10 @@ tracker_rollups_daily = _rollup("tracker_rollups_daily", "tracker")
 tracker_splits = sa.Table(
     "tracker_splits",
     metadata,
-    # A run of a spacecraft whose older batches are not split by tracker yet; no row: all are.
+    # A run of a spacecraft with older batches that are not split by tracker; no row: all are split.
     sa.Column("spacecraft", Name, primary_key=True),
     sa.Column("run", RunName, primary_key=True),
-    # Batches before this one, in order of time, are still to be split; null: none was.
+    # Batches before this one, in order of time, remain to be split; null: none is split yet.
     sa.Column("time_ns", sa.BigInteger),
     sa.Column("batch_id", Id),
     sqlite_with_rowid=False,
@@ -143,9 +143,9 @@ runs = sa.Table(
     metadata,
     sa.Column("name", RunName, primary_key=True),
     sa.Column("created", Moment, nullable=False),
-    # Whether limits are held against the run; live batches are watched in any case.
+    # True if limits are evaluated for the run; for live batches they always are.
     sa.Column("alarms", sa.Boolean, nullable=False, server_default=sa.false()),
-    # Whether it was reprocessed with tracking: it must not continue without, nor another with.
+    # True if reprocessed with tracking; the run must continue in the same mode.
     sa.Column("tracked", sa.Boolean, nullable=False, server_default=sa.false()),
 )
 
@@ -169,13 +169,13 @@ mission_uses = sa.Table(
     sa.Column("row_digest", sa.BigInteger),
 )
 
-# Calibrations of the trackers, and what an operator adopted of them in the place of the settings.
+# Calibrations of the trackers, and those that an operator adopted in place of the settings.
 calibrations = sa.Table(
     "calibrations",
     metadata,
     sa.Column("id", Id, primary_key=True),
     sa.Column("spacecraft", Name, nullable=False),
-    # From 1 for each spacecraft.
+    # Number of the calibration, from 1 for each spacecraft.
     sa.Column("version", sa.Integer, nullable=False),
     sa.Column("run", RunName, nullable=False),
     sa.Column("created", Moment, nullable=False),
@@ -184,9 +184,9 @@ calibrations = sa.Table(
     sa.Column("state", sa.String(16), nullable=False),
     sa.Column("done", sa.Integer, nullable=False),
     sa.Column("total", sa.Integer, nullable=False),
-    # The settings that it started from.
+    # Settings that the calibration started from.
     sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
-    # JSON: what was asked, what was found, and the covariance, which is large, by itself.
+    # JSON: the request, the result, and, since it is large, the covariance by itself.
     sa.Column("request", sa.Text, nullable=False),
     sa.Column("result", sa.Text),
     sa.Column("covariance", sa.Text),
@@ -202,12 +202,12 @@ calibration_adoptions = sa.Table(
     sa.Column("adopted", Moment, nullable=False),
     sa.Column("who", sa.String(64), nullable=False),
     sa.Column("note", sa.Text, nullable=False),
-    # Null: back to the mission file.
+    # Null: a return to the mission file.
     sa.Column("calibration_id", Id, sa.ForeignKey(calibrations.c.id)),
-    # The settings of the mission file that it lies over, and those of both together.
+    # Settings of the mission file below the adoption, and those of both combined.
     sa.Column("file_digest", Digest, nullable=False),
     sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
-    # JSON: alignment and focal plane of every tracker.  Null: as the mission file has them.
+    # JSON: alignment and focal plane of every tracker.  Null: those of the mission file.
     sa.Column("trackers", sa.Text),
     sa.Index("ix_calibration_adoptions_spacecraft", "spacecraft", "id"),
 )
@@ -241,10 +241,10 @@ frames = sa.Table(
     metadata,
     sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), primary_key=True),
     sa.Column("digest", Digest, nullable=False, index=True),
-    # JSON: what the answer says of the frame, and what was found on it.
+    # JSON: the answer's part about the frame, and the detections.
     sa.Column("summary", sa.Text, nullable=False),
     sa.Column("detections", sa.Text, nullable=False),
-    # PNG; so many pixels a side of the frame make one of it.
+    # PNG; `preview_step` frame pixels a side make one pixel of the preview.
     sa.Column("preview", sa.LargeBinary, nullable=False),
     sa.Column("preview_step", sa.Integer, nullable=False),
 )
@@ -252,9 +252,9 @@ frames = sa.Table(
 MEASURED = tuple(
     name for name, source in STORED.items() if isinstance(source, Measured | MeasuredOfBatch)
 )
-"""The columns of measured quantities."""
+"""Columns of measured quantities in the table of results."""
 COUNTED = ("observed", "unique", "ambiguous", "unmatched")
-"""The columns that count stars."""
+"""Columns that count stars by outcome."""
 _FILTERS = ("status", "unique", "ambiguous", "unmatched")
 
 results = sa.Table(
@@ -264,7 +264,7 @@ results = sa.Table(
     sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), nullable=False),
     sa.Column("parent_id", Id, sa.ForeignKey("results.id")),
     sa.Column("current", sa.Boolean, nullable=False),
-    # The order in which results were recorded; zero: before there was one, or from an archive.
+    # The order of recording; zero: recorded before orders were kept, or from an archive.
     sa.Column("seq", sa.BigInteger, nullable=False, server_default=sa.text("0")),
     sa.Column("created", Moment, nullable=False),
     sa.Column("spacecraft", Name, nullable=False),
@@ -275,23 +275,23 @@ results = sa.Table(
     sa.Column("mission_digest", Digest, sa.ForeignKey(missions.c.digest), nullable=False),
     sa.Column("catalog_digest", Digest, sa.ForeignKey(catalogs.c.digest), nullable=False),
     *(sa.Column(name, sa.Integer, nullable=False) for name in COUNTED),
-    # Of the attitude: good or suspect; null where there is none, and then a reason.
+    # Status of the attitude: good or suspect; null without an attitude, which has a reason then.
     sa.Column("status", sa.String(16)),
     sa.Column("reason", sa.String(64)),
     # Null where the quantity is not known.
     *(sa.Column(name, sa.Double) for name in MEASURED),
-    # The answer's JSON, byte for byte as it was sent.
+    # The answer's JSON, byte for byte as sent.
     sa.Column("answer", PackedText, nullable=False),
-    # Of all that is kept of the result.  Null: an earlier version recorded it, and the service has
-    # not come to it yet; negative: then it was made, after the result.
+    # Digest of all that is kept of the result.  Null: recorded by an earlier version and not
+    # digested yet; negative: digested later than recorded.
     sa.Column("digest", sa.BigInteger),
-    # Lists, histories and trends look at current results alone, newest or oldest first; what they
-    # filter by stands in the index, so that a page touches the table only for the rows it shows.
+    # Lists, histories and trends read current results only, newest or oldest first; the columns of
+    # their filters stand in the index, so that a page reads only its own rows from the table.
     sa.Index(
         "ix_results_current_by_spacecraft",
         *("spacecraft", "run", "time_ns", "batch_id"),
         *_FILTERS,
-        # A trend over batches is drawn from the index alone.
+        # With these columns a trend over batches reads the index only.
         *MEASURED,
         **CURRENT,
     ),
@@ -301,11 +301,11 @@ results = sa.Table(
     ),
     sa.Index("uq_results_current", "batch_id", unique=True, **CURRENT),
     sa.Index("ix_results_what_ifs", "batch_id", **rows_where("parent_id IS NOT NULL")),
-    # The projector takes results in their order.
+    # The projector reads results in this order.
     sa.Index("ix_results_seq", "seq"),
-    # Empty, or what `OlderDigests` still has to do.
+    # Results that `OlderDigests` still has to digest; empty when it is done.
     sa.Index("ix_results_without_digest", "id", **rows_where("digest IS NULL")),
-    # Deleting a batch checks the foreign key of its results, and finds them.
+    # Deleting a batch checks the foreign key of its results.
     sa.Index("ix_results_batch_id", "batch_id"),
     # Deleting a result checks the foreign key of its what-ifs.
     sa.Index("ix_results_parent", "parent_id", **rows_where("parent_id IS NOT NULL")),
@@ -326,17 +326,17 @@ star_results = sa.Table(
     sqlite_with_rowid=False,
 )
 
-# Only of spacecraft with several trackers: of one alone the result has the same values.
+# Only for spacecraft with several trackers: with one tracker the result has the same values.
 tracker_values = sa.Table(
     "tracker_values",
     metadata,
     sa.Column("batch_id", Id, sa.ForeignKey(batches.c.id), primary_key=True),
     sa.Column("tracker", Name, primary_key=True),
     *(sa.Column(name, sa.Integer, nullable=False) for name in COUNTED),
-    # Of the attitude: good, or suspect if this is the tracker that disagrees; null without.
+    # Status of the attitude: good, or suspect if this tracker disagrees; null without an attitude.
     sa.Column("status", sa.String(16)),
     *(sa.Column(name, sa.Double) for name in MEASURED),
-    # Null: an earlier version recorded it.
+    # Null for rows recorded by an earlier version.
     sa.Column("row_digest", sa.BigInteger),
     sqlite_with_rowid=False,
 )
@@ -363,7 +363,7 @@ solutions = sa.Table(
 idempotency_keys = sa.Table(
     "idempotency_keys",
     metadata,
-    # The token whose key it is; empty: none, for keys sent while access was open.
+    # Token that sent the key; empty for keys sent while access was open.
     sa.Column("token_id", sa.String(26), primary_key=True, server_default=sa.text("''")),
     sa.Column("key", sa.String(255), primary_key=True),
     sa.Column("fingerprint", sa.String(64), nullable=False),
@@ -385,7 +385,7 @@ replays = sa.Table(
     sa.Column("finished", Moment),
 )
 
-# Of each hour of TAI, up to the projector's position; see `projections.seals`.
+# Digest of each hour of TAI, up to the projector's position; see `projections.seals`.
 seals = sa.Table(
     "seals",
     metadata,
@@ -400,7 +400,7 @@ seals = sa.Table(
 projector = sa.Table(
     "projector",
     metadata,
-    # One row: every result up to this one is in the projections, and none after it.
+    # One row: every result up to this place is in the projections, and none after it.
     sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
     sa.Column("seq", sa.BigInteger, nullable=False),
     info={HAS_FIRST_ROW: True},
@@ -414,14 +414,14 @@ events = sa.Table(
     sa.Column("run", RunName),
     sa.Column("spacecraft", Name),
     sa.Column("data", sa.Text, nullable=False),
-    # Null: recorded by an earlier version.
+    # Null for events recorded by an earlier version.
     sa.Column("at", Moment),
 )
 
 event_counter = sa.Table(
     "event_counter",
     metadata,
-    # One row, whose lock orders the events of several processes as they are committed.
+    # One row; its lock orders the events of several processes by their commit.
     sa.Column("id", sa.SmallInteger, primary_key=True, autoincrement=False),
     sa.Column("last", sa.BigInteger, nullable=False),
     info={HAS_FIRST_ROW: True},
@@ -442,7 +442,7 @@ WRITTEN_BY_POSTS = (
     events,
     event_counter,
 )
-"""The tables that a batch is written to, by its post and by the projector, without features'."""
+"""Tables written for a batch by its post and by the projector, without those of features."""
 
 annotations = sa.Table(
     "annotations",
@@ -450,7 +450,7 @@ annotations = sa.Table(
     sa.Column("id", Id, primary_key=True),
     # Null: about every spacecraft.
     sa.Column("spacecraft", Name),
-    # In telemetry time, as a batch has it; without an end it is about a moment.
+    # Telemetry time, as a batch has; without an end the annotation is about a moment.
     sa.Column("start", Moment, nullable=False),
     sa.Column("start_ns", sa.BigInteger, nullable=False),
     sa.Column("end", Moment),
@@ -461,33 +461,33 @@ annotations = sa.Table(
 )
 
 
-# The tables of the archive: which batches left the database, and where they are.
+# The tables of the archive: the batches that left the database, and the files that hold them.
 #
 # archived_parts ── archived_batches ── archived_what_ifs
 #          └── archived_hours
 #
-# A batch has a row in `batches` or in `archived_batches`, never in both: one transaction takes it
-# from one to the other, and so (spacecraft, run, batch) stays unique after archiving.
+# A batch has a row in `batches` or in `archived_batches`, never in both: one transaction moves it
+# between them, and so (spacecraft, run, batch) stays unique after archiving.
 
 archived_parts = sa.Table(
     "archived_parts",
     metadata,
     sa.Column("id", sa.Integer, primary_key=True),
-    # Below the folder of the archive.
+    # Path below the folder of the archive.
     sa.Column("path", sa.Text, nullable=False, unique=True),
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("run", RunName, nullable=False),
-    # Of the first batch and of the last.
+    # Times of the first batch and of the last.
     sa.Column("first_ns", sa.BigInteger, nullable=False),
     sa.Column("last_ns", sa.BigInteger, nullable=False),
     sa.Column("batches", sa.Integer, nullable=False),
     sa.Column("sha256", sa.String(64), nullable=False),
-    # A part spans no more than a day: those of a period are found by their end.
+    # A part spans no more than a day, so those of a period are found by their end.
     sa.Index("ix_archived_parts_by_spacecraft", "spacecraft", "run", "last_ns"),
     sa.Index("ix_archived_parts_by_time", "last_ns"),
 )
 
-# No foreign key names the part: to delete a part, each would be looked for without an index.
+# No foreign key to the part: without an index, deleting a part would scan this table.
 archived_batches = sa.Table(
     "archived_batches",
     metadata,
@@ -501,7 +501,7 @@ archived_batches = sa.Table(
     sqlite_with_rowid=False,
 )
 
-# The results of archived batches that do not have the id of their batch.
+# Archived results that do not have the id of their batch.
 archived_what_ifs = sa.Table(
     "archived_what_ifs",
     metadata,
@@ -510,14 +510,14 @@ archived_what_ifs = sa.Table(
     sqlite_with_rowid=False,
 )
 
-# The share of a part in the trends of an hour: extremes cannot be subtracted from those of others.
+# Share of a part in the trends of an hour, kept since extremes cannot be subtracted afterwards.
 archived_hours = sa.Table(
     "archived_hours",
     metadata,
     sa.Column("spacecraft", Name, primary_key=True),
     sa.Column("run", RunName, primary_key=True),
     sa.Column("bucket", sa.Integer, primary_key=True, autoincrement=False),
-    # Empty: of the spacecraft as a whole.
+    # Empty for the spacecraft as a whole.
     sa.Column("tracker", Name, primary_key=True),
     sa.Column("part_id", sa.Integer, primary_key=True, autoincrement=False),
     # JSON: the columns of a rollup.
@@ -532,7 +532,7 @@ gyro_blocks = sa.Table(
     sa.Column("spacecraft", Name, nullable=False),
     sa.Column("run", RunName, sa.ForeignKey(runs.c.name), nullable=False),
     sa.Column("block", Name, nullable=False),
-    # Of the first sample and of the last.
+    # Times of the first sample and of the last.
     sa.Column("start", Moment, nullable=False),
     sa.Column("end", Moment, nullable=False),
     sa.Column("start_ns", sa.BigInteger, nullable=False),
@@ -540,14 +540,14 @@ gyro_blocks = sa.Table(
     sa.Column("received", Moment, nullable=False),
     sa.Column("fingerprint", sa.String(64), nullable=False),
     sa.Column("samples", sa.Integer, nullable=False),
-    # Null where the block has times of its own.
+    # Null where the block has a time for each sample.
     sa.Column("step_s", sa.Double),
-    # Packed: see service/gyro/blocks.py.
+    # Packed arrays: see service/gyro/blocks.py.
     sa.Column("times_s", sa.LargeBinary),
     sa.Column("rates_rad_per_s", sa.LargeBinary, nullable=False),
     sa.UniqueConstraint("spacecraft", "run", "block"),
-    # Periods, and blocks that may share a time with another: no block spans more than a day.
+    # For periods, and for blocks that may share a time: no block spans more than a day.
     sa.Index("ix_gyro_blocks_by_start", "spacecraft", "run", "start_ns", "end_ns"),
-    # Pruning finds blocks by their end, in all runs or in one.
+    # For pruning, which finds blocks by their end, in all runs or in one.
     sa.Index("ix_gyro_blocks_by_end", "end_ns"),
 )

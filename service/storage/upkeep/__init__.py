@@ -1,1 +1,1 @@
-"""Backup, pruning and verification of a database."""
+"""Maintenance of a database: backup, archiving, pruning, copying and verification."""

@@ -1,11 +1,10 @@
-"""Moves old batches from the database to an archive, and never loses one on the way.
+"""Archiving: moves old batches from the database to an archive without losing any.
 
-A part is written, read back from its file and named in the manifest.  Then one transaction
-compares the file with the record bit by bit, notes the batches as archived and deletes them.
-Whatever ends the command in between leaves them in the record, and a part that the next one
-discards.
+A part is written, read back from its file and named in the manifest.  Then one transaction compares
+the file with the record bit by bit, notes the batches as archived and deletes them.  If the command
+is interrupted before that, the batches stay in the record, and the next call discards the part.
 
-Here archived batches are also taken back into the database, and an archive is verified.
+The module also takes archived batches back into the database, and verifies an archive.
 """
 
 import hashlib
@@ -69,7 +68,7 @@ from service.times import DAY_S, HOUR_S, Utc, bucket_start, parse_utc, utc_now
 Integers = npt.NDArray[np.int64]
 
 MOST_BATCHES = 10_000
-"""The most batches of a part: it is held in memory, and deleted in one transaction."""
+"""Largest number of batches in a part, which is held in memory and deleted in one transaction."""
 
 MAX_ATTEMPTS = 5
 
@@ -104,10 +103,10 @@ def archive(
 ) -> Archived:
     """Move the batches whose time is before `before` to the archive in `folder`.
 
-    Of each spacecraft and run the hours of the newest batch and of the newest attitude stay, so
-    that its state is known without the archive.  Gyro blocks stay.  Interrupted, it is called
-    again and goes on.  Raises `BadConfiguration` where the folder is missing, in use or of
-    another database, where batches are not split by tracker yet, and where a part of the archive
+    The hours of the newest batch and of the newest attitude of each spacecraft and run stay, so
+    that its state is known without the archive.  Gyro blocks stay.  After an interruption another
+    call continues.  Raises `BadConfiguration` where the folder is missing, in use or of another
+    database, where batches are not split by tracker yet, and where a part of the archive
     contradicts the record.
     """
     with locked(folder):
@@ -145,7 +144,7 @@ def _days(connection: Connection, before: Utc) -> list[_Day]:
 
 
 def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElement[bool]]:
-    """The current results of a day that are to be archived, as SQL."""
+    """SQL conditions for the current results of a day that are to be archived."""
     end_ns = min(bucket_start(day.number + 1, DAY_S).tai_ns, before.tai_ns)
     chosen: list[ColumnElement[bool]] = [
         tables.results.c.current,
@@ -154,7 +153,7 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
         tables.results.c.time_ns >= bucket_start(day.number, DAY_S).tai_ns,
         tables.results.c.time_ns < end_ns,
     ]
-    # A batch that is dated ahead is not the newest one.
+    # A batch dated in the future does not count as the newest one.
     until = utc_now().bucket(HOUR_S)
     for begin_ns, end_ns in newest_hours(connection, day.spacecraft, day.run, until):
         chosen.append(~tables.results.c.time_ns.between(begin_ns, end_ns - 1))
@@ -164,9 +163,9 @@ def _chosen(connection: Connection, day: _Day, before: Utc) -> list[ColumnElemen
 def newest_hours(
     connection: Connection, spacecraft: str, run: str, until: int | None = None
 ) -> Iterator[tuple[int, int]]:
-    """The begin and end of the hours of a run's newest batch and of its newest attitude.
+    """Bounds in ns of TAI of the hours of a run's newest batch and of its newest attitude.
 
-    `until` is the last hour that is looked at.
+    Hours after `until` are left out.
     """
     hourly = tables.rollups_hourly.c
     own = [hourly.spacecraft == spacecraft, hourly.run == run]
@@ -179,7 +178,7 @@ def newest_hours(
 
 
 def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[list[str]]:
-    """The ids of the batches of one part after another, in order of time."""
+    """Batch ids for one archive part after another, in order of time."""
     query = select(tables.results.c.batch_id).where(*chosen)
     query = query.order_by(tables.results.c.time_ns, tables.results.c.batch_id).limit(MOST_BATCHES)
     while True:
@@ -191,7 +190,7 @@ def _portions(store: Store, chosen: Sequence[ColumnElement[bool]]) -> Iterator[l
 
 
 def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) -> Part:
-    """Write a part, name it in the manifest, and take its batches out of the database."""
+    """Write an archive part, name it in the manifest, and delete its batches from the database."""
     for _ in range(MAX_ATTEMPTS):
         with store.reading() as connection:
             rows = read_rows(connection, batch_ids)
@@ -217,20 +216,20 @@ def _archive(store: Store, folder: Path, day: _Day, batch_ids: Sequence[str]) ->
         take_out = partial(_take_out, day=day, part=part, path=path, written=written)
         if store.writer.change(take_out):
             return part
-        # Changed since it was read, by a what-if for example: written again as it is now.
+        # The record changed after it was read, for example by a what-if: write the part again.
         remove_part(folder, manifest, part)
     raise BadConfiguration(f"{path}: the record of these batches changes too often, or is damaged")
 
 
 def _new_file(folder: Path) -> Path:
-    """A name that no file has, whether a manifest names it or not."""
+    """Choose a name for an archive file that no existing file has, named in a manifest or not."""
     names = [each.name for each in folder.glob("part-*.parquet")]
     numbers = [int(each.removeprefix("part-").partition(".")[0]) for each in names]
     return folder / f"part-{1 + max(numbers, default=0)}.parquet"
 
 
 def described(name: str, run: str, rows: Rows, content: bytes) -> Part:
-    """The entry of a partition in the manifest of its day."""
+    """Build the manifest entry of an archive part from its rows and file content."""
     found = rows["batches"]
     first, last = found.slice(0, 1).to_pylist()[0], found.slice(len(found) - 1).to_pylist()[0]
     made = rows["results"]
@@ -253,7 +252,7 @@ def described(name: str, run: str, rows: Rows, content: bytes) -> Part:
 def keep_settings(
     connection: Connection, folder: Path, of_missions: Sequence[str], of_catalogs: Sequence[str]
 ) -> None:
-    """Keep in the archive what these digests stand for."""
+    """Copy the settings and catalogs with these digests to the archive."""
     for digests, table in ((of_missions, tables.missions), (of_catalogs, tables.catalogs)):
         query = select(table).where(table.c.digest.in_(digests))
         for row in connection.execute(query).mappings():
@@ -263,7 +262,7 @@ def keep_settings(
 def note_part(
     connection: Connection, spacecraft: str, part: Part, path: str, found: pa.Table
 ) -> int:
-    """Note the batches of a part as archived; returns the id of the part."""
+    """Note the batches of an archive part in the database; returns the id of the part."""
     names = ("run", "first_ns", "last_ns", "batches", "sha256")
     row = {name: getattr(part, name) for name in names} | {"path": path, "spacecraft": spacecraft}
     part_id = connection.execute(
@@ -278,7 +277,7 @@ def note_part(
 
 
 def _take_out(connection: Connection, day: _Day, part: Part, path: str, written: Rows) -> bool:
-    """Note the batches of a part as archived and delete them; False: the record is another now."""
+    """Note an archive part's batches and delete them; False if the record has changed meanwhile."""
     ids = written["batches"]["id"].to_pylist()
     lock_rows(connection, ids)
     if differing(read_rows(connection, ids), written) is not None:
@@ -288,18 +287,18 @@ def _take_out(connection: Connection, day: _Day, part: Part, path: str, written:
     further = made.filter(pc.not_equal(made["id"], made["batch_id"])).select(["id", "batch_id"])
     insert_all(connection, tables.archived_what_ifs, further.to_pylist())
     of_hour = _by_hour(day, written)
-    # Who counts an hour anew reads its results, then its shares: all of it before, or after.
+    # A recount of an hour reads its results, then its shares: it must see all of this, or nothing.
     position = rollups.lock_position(connection)
     keep_share(connection, number, day.spacecraft, day.run, of_hour)
     delete_batches(connection, ids)
     if pc.max(made["seq"]).as_py() > position:
-        # The projector will not find them any more.
+        # The projector will not find these results any more.
         rollups.renew(connection, ((day.spacecraft, day.run, hour) for hour in of_hour))
     return True
 
 
 def _by_hour(day: _Day, rows: Rows) -> dict[int, list[str]]:
-    """The ids of the batches of each hour of a day."""
+    """Ids of a day's batches by the number of their hour."""
     hours = hours_of(day.number, rows["batches"]["time_ns"].to_numpy())
     found: dict[int, list[str]] = {}
     for hour, id in zip(hours, rows["batches"]["id"].to_pylist(), strict=True):
@@ -308,18 +307,18 @@ def _by_hour(day: _Day, rows: Rows) -> dict[int, list[str]]:
 
 
 def hours_of(day: int, times_ns: Integers) -> list[int]:
-    """The numbers of the hours of batches (n,) of a day, as `Utc.bucket` gives them."""
+    """Hour numbers of a day's batches (n,), as `Utc.bucket` gives them, from times in ns of TAI."""
     hours = range(24 * day, 24 * day + 24)
     starts_ns = np.array([bucket_start(hour, HOUR_S).tai_ns for hour in hours])
-    # A leap second belongs to the hour that it ends, and begins no other.
+    # A leap second belongs to the hour that it ends.
     place = np.searchsorted(starts_ns, times_ns, side="right") - 1
     return [hours[k] for k in place.tolist()]
 
 
 def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
-    """Remove the parts of a day that were written and whose batches then stayed in the record.
+    """Delete archive files of a day whose batches stayed in the record.
 
-    Those of other databases, which have none of these batches, stay.
+    Files of other databases, which have none of these batches, stay.
     """
     manifest = manifest_of(folder, day.spacecraft, day.text)
     paths = {path_of(folder, manifest, part): part for part in manifest.parts}
@@ -345,7 +344,7 @@ def _discard_unfinished(store: Store, folder: Path, day: _Day) -> None:
 
 @dataclass(frozen=True)
 class PartFilter:
-    """Selects the parts of a spacecraft and a run with a time from `start` to before `end`."""
+    """Filter for archive parts of a spacecraft and run with a time from `start` to before `end`."""
 
     spacecraft: str | None = None
     run: str | None = None
@@ -353,7 +352,7 @@ class PartFilter:
     end: Utc | None = None
 
     def takes(self, manifest: Manifest, part: Part) -> bool:
-        """True if a part is selected."""
+        """True if the filter selects an archive part."""
         return (
             self.spacecraft in (None, manifest.spacecraft)
             and self.run in (None, part.run)
@@ -364,7 +363,7 @@ class PartFilter:
 
 @dataclass
 class Restored:
-    """How many batches the selected parts have, how many were looked at, how many restored."""
+    """Progress of a restore: batches in the selected parts, batches checked, batches restored."""
 
     total: int
     batches: int = 0
@@ -378,11 +377,11 @@ def restore(
     *,
     step: Callable[[Restored], object] = lambda restored: None,
 ) -> Restored:
-    """Record the batches of all selected parts again, each part whole and in one transaction.
+    """Record the batches of all selected archive parts again, each part in one transaction.
 
-    The files stay.  A part whose batches are recorded is passed over, so that an interrupted
-    call is made again.  Raises `BadConfiguration` for a damaged part, and for one whose batches
-    the database has from somebody else.
+    The files stay.  A part whose batches are recorded is skipped, so that an interrupted call can
+    be repeated.  Raises `BadConfiguration` for a damaged part, and for one whose batches the
+    database has from another source.
     """
     with locked(folder):
         parts = [
@@ -408,7 +407,7 @@ def restore(
 
 
 def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bool:
-    """Insert the rows of a part; False: they are there."""
+    """Insert the rows of an archive part into the database; False if they are there already."""
     ids = rows["batches"]["id"].to_pylist()
     query = select(tables.batches.c.id).where(tables.batches.c.id.in_(ids[:1]))
     if connection.scalar(query) is not None:
@@ -419,7 +418,7 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     for digests, table in ((part.missions, tables.missions), (part.catalogs, tables.catalogs)):
         rows_of_settings = [read_settings(folder, each).row for each in digests]
         for row in rows_of_settings:
-            # Of an archive of an earlier version they have none.
+            # Settings in an archive of an earlier version have no digest.
             digest = row.get("row_digest")
             row["row_digest"] = made_later(digest_of_row(table, row)) if digest is None else digest
         insert_missing(connection, table, rows_of_settings)
@@ -433,7 +432,7 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
     for some_ids in portions(ids):
         seals.add(connection, tables.results.c.batch_id.in_(some_ids))
     if part_id is None:
-        # The trends have the share of a part that the database knows.
+        # The trends already have the share of a part that the database knows.
         _add_to_trends(connection, rows)
     return True
 
@@ -441,7 +440,7 @@ def put_back(connection: Connection, folder: Path, part: Part, rows: Rows) -> bo
 def forget_part(
     connection: Connection, part_id: int, spacecraft: str, run: str, batch_ids: Sequence[str]
 ) -> None:
-    """Delete what the database knows of a part with these batches, and its share in the trends."""
+    """Delete an archive part from the database: its entry, batch ids, and share in the trends."""
     rollups.forget_share(connection, part_id, spacecraft, run)
     for ids in portions(batch_ids):
         for column in (tables.archived_batches.c.id, tables.archived_what_ifs.c.batch_id):
@@ -451,9 +450,9 @@ def forget_part(
 
 
 def _placed(rows: Rows, position: int) -> Rows:
-    """The rows with their places in the record where these are not after `position`, else none.
+    """Keep the rows' places in the record up to `position`; reset later places to none.
 
-    The projector passes over them: what they add to the trends is there, or is added here.
+    The projector passes over the kept places: their part in the trends is there, or added here.
     """
     made = rows["results"]
     places = pc.fill_null(made["seq"], 0)
@@ -477,10 +476,10 @@ def verify_archive(
     needed: Mapping[str, str],
     step: Callable[[int], object] = lambda batches: None,
 ) -> Iterator[str]:
-    """The faults of an archive, a sentence each, as they are found; none: every part is whole.
+    """Check an archive; yields a sentence for each fault, none if every part is whole.
 
-    Every file is read, its hash compared, and its rows with what the manifest and the
-    fingerprints say.  `needed` has the hashes of the parts that a database needs, by path.
+    Every file is read, its hash compared, and its rows compared with the manifest and the
+    fingerprints.  `needed` has the hashes of the parts that a database needs, by path.
     """
     done, whole = 0, {}
     named: dict[Path, set[str]] = {day: set() for day in day_folders(folder)}
@@ -493,7 +492,7 @@ def verify_archive(
             yield str(error)
         done += part.batches
         step(done)
-    # Another command may be writing parts: what it has not named yet is not left over.
+    # Another command may be writing parts: a file without an entry is no fault.
     if not is_locked(folder):
         for day, files in named.items():
             yield from _unnamed(day, files)
@@ -511,7 +510,7 @@ def _unnamed(day: Path, named: Container[str]) -> Iterator[str]:
 
 
 def _is_own(input: str, fingerprint: str) -> bool:
-    """True if a fingerprint is that of an input; of one that cannot be read it is not."""
+    """True if an input has the given fingerprint; False for an unreadable input."""
     try:
         return fingerprint_of(input) == fingerprint
     except BadInput:
@@ -528,7 +527,7 @@ def _of_a_part(folder: Path, path: str, manifest: Manifest, part: Part) -> Itera
         yield f"{name}: has batches of another spacecraft or run"
     framed = set(rows["frames"]["batch_id"].to_pylist())
     for each in found:
-        # That of a frame is of more than what is kept.
+        # The fingerprint of a frame covers more than the archive keeps.
         if each["id"] not in framed and not _is_own(each["input"], each["fingerprint"]):
             yield f"{name}: batch {each['id']}: its input is not the one that was fingerprinted"
     current = [each["batch_id"] for each in made if each["current"]]

@@ -1,8 +1,7 @@
-"""Backups: the whole database copied at one moment while it is served, and restored from a copy.
+"""Backups: the whole database copied as of one moment while in use, and restored from a copy.
 
-SQLite is copied page by page from one read transaction: writers go on beside
-it, and what they write meanwhile is not in the copy.  PostgreSQL's own tool
-does the same with a snapshot.
+SQLite is copied page by page in one read transaction: writes continue meanwhile, and are not in the
+copy.  PostgreSQL's own tool does the same with a snapshot.
 
 A backup keeps the schema of the version that wrote it, and restoring does not migrate it: that
 version can be installed again and serve the restored database.
@@ -27,24 +26,24 @@ from service.storage.sql.database_file import PRIVATE_FILE, DatabaseFile, sync_f
 from service.storage.sql.migrations import connected, reading, revision_of
 
 PAGES_AT_ONCE = 2_000
-"""About eight megabytes: often enough to show how far it is."""
+"""Number of pages copied between two progress reports, about eight megabytes."""
 SQLITE, POSTGRESQL = b"SQLite format 3\0", b"PGDMP"
 """First bytes of an SQLite database file and of a PostgreSQL dump."""
 BESIDE = ("-wal", "-shm", "-journal")
-"""The files that SQLite keeps beside a file: another database's would be taken for this one's."""
+"""Endings of SQLite's files beside a database; another database's would be read as its own."""
 
 Step = Callable[[int, int], object]
-"""Called with the pages that are left and those there are."""
+"""Callback for the progress of a backup: pages left, pages in total."""
 
 
 def back_up(
     database: str, target: Path, step: Step = lambda left, total: None
 ) -> RecordHead | None:
-    """Write a copy of a database to a file that is not there yet, whole or not at all.
+    """Write a copy of a database to a new file, whole or not at all.
 
-    Of SQLite the copy is a database of its own; of PostgreSQL it is what
-    `pg_restore` reads.  Returns the last head of the record from before the copy.  Raises
-    `BadConfiguration` where the database cannot be read, and for a target that is there already.
+    For SQLite the copy is a database file; for PostgreSQL it is an archive for `pg_restore`.
+    Returns the last head of the record from before the copy.  Raises `BadConfiguration` where the
+    database cannot be read, and for a target that exists already.
     """
     url = engines.database_url(database)
     if target.exists():
@@ -52,9 +51,9 @@ def back_up(
     if not target.absolute().parent.is_dir():
         raise BadConfiguration(f"{target}: there is no such folder")
     head = None
-    # What cannot be read cannot be copied either, which is said below.
+    # A database that cannot be read cannot be copied either; the copy reports the error.
     with suppress(BadConfiguration), reading(database) as connection:
-        # Earlier versions had none.
+        # Earlier versions made no heads.
         if inspect(connection).has_table(record_heads.name):
             head = newest_head(connection)
     with _part_of(target) as part:
@@ -68,11 +67,11 @@ def back_up(
 
 @contextmanager
 def _part_of(target: Path) -> Iterator[Path]:
-    """A file beside the target to write to, which nothing is left of at the end."""
+    """Provide a temporary file beside the target; it is deleted at the end."""
     part = target.with_name(target.name + ".part")
     part.unlink(missing_ok=True)
     try:
-        # It holds what access depends on, such as the secrets of webhooks.
+        # The backup holds secrets, such as those of webhooks.
         part.touch(mode=PRIVATE_FILE, exist_ok=False)
         yield part
     finally:
@@ -81,7 +80,7 @@ def _part_of(target: Path) -> Iterator[Path]:
 
 
 def _move(part: Path, target: Path, move: Callable[[Path, Path], object]) -> None:
-    """Give a file its name, where both then outlast a power cut."""
+    """Move a file to its final name, so that both survive a power cut."""
     with part.open("rb") as file:
         os.fsync(file.fileno())
     move(part, target)
@@ -93,13 +92,13 @@ def _copy_sqlite(source: Path, part: Path, step: Step) -> None:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {source}: there is no such file")
     try:
         with closing(_opened(source)) as reading, closing(sqlite3.connect(part)) as writing:
-            # Reading first of all: from here on it sees this one moment.  Without it every commit
-            # of another process would begin the copy anew.
+            # Read before copying: the transaction then sees one moment.  Otherwise every commit of
+            # another process would restart the copy.
             reading.execute("BEGIN")
             reading.execute("SELECT count(*) FROM sqlite_master").fetchone()
             _copy_pages(reading, writing, step)
             reading.execute("ROLLBACK")
-            # One file is the whole of it: no log beside it that could be left behind.
+            # Make the copy a single file, without a log beside it that could be left behind.
             writing.execute("PRAGMA journal_mode = DELETE")
     except sqlite3.Error as error:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {source}: cannot be copied: {error}") from None
@@ -135,13 +134,13 @@ def _dump_postgresql(url: URL, part: Path) -> None:
 
 
 def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
-    """How PostgreSQL's programs reach the database of a URL: arguments, and environment.
+    """Arguments and environment that connect PostgreSQL's programs to the database of a URL.
 
-    All of the URL counts, its query part too; the password is in the environment, because
-    every user of the machine can read a command line.  Raises `BadConfiguration` for what has no
-    other place.
+    All of the URL counts, its query part too; the password is in the environment, because every
+    user of the machine can read a command line.  Raises `BadConfiguration` for a part that cannot
+    be passed on.
     """
-    # First of all: it says what to install where psycopg is missing.
+    # Call this first: without psycopg its error says what to install.
     dialect = engines.reading_engine(url).dialect
     from psycopg.conninfo import make_conninfo
     from psycopg.pq import Conninfo
@@ -153,7 +152,7 @@ def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
             "ACQUIRE_DATABASE: sslpassword: every user of the machine could read it while "
             "PostgreSQL's programs run; name a key without a passphrase"
         )
-    # What else is given is for psycopg alone.
+    # The remaining options are for psycopg only.
     known = {option.keyword.decode() for option in Conninfo.get_defaults()}
     named = make_conninfo(**{name: value for name, value in options.items() if name in known})
     secret = {} if password is None else {"PGPASSWORD": str(password)}
@@ -161,10 +160,9 @@ def client_options(url: URL) -> tuple[list[str], dict[str, str]]:
 
 
 def run_client(command: list[str], about: str, secret: Mapping[str, str] | None = None) -> str:
-    """Run a client program of PostgreSQL; what it printed.
+    """Run a client program of PostgreSQL; returns its output.
 
-    Raises `BadConfiguration`, which says what it was `about`, where the program is missing or
-    fails.
+    Raises `BadConfiguration`, with the subject `about`, where the program is missing or fails.
     """
     environment = os.environ | (secret or {})
     try:
@@ -180,11 +178,11 @@ def run_client(command: list[str], about: str, secret: Mapping[str, str] | None 
 
 
 def restore(database: str, source: Path, step: Step = lambda left, total: None) -> str:
-    """Make a database from a file of `back_up`, whole or not at all; returns its revision.
+    """Restore a database from a backup file, whole or not at all; returns its schema revision.
 
     A SQLite file must not exist yet; a PostgreSQL database must exist, without the service's
-    tables.  Raises `BadConfiguration` for a backup that is missing, damaged or of the other
-    kind, and for a database that holds records already or that a service is using.
+    tables.  Raises `BadConfiguration` for a backup that is missing, damaged or of the other kind,
+    and for a database that holds records already or that a service is using.
     """
     url = engines.database_url(database)
     _check_kind(source, url)
@@ -227,7 +225,8 @@ def _restore_sqlite(source: Path, target: Path, step: Step) -> str:
             if found != ["ok"]:
                 raise BadConfiguration(f"{source}: is damaged: {found[0]}")
             revision = _revision(f"sqlite:///{part}", source)
-            # Unlike `replace` this refuses a file that a service has made in the meantime.
+            # `link`, unlike `replace`, refuses to overwrite a file that a service has made
+            # meanwhile.
             _move(part, target, os.link)
     except FileExistsError:
         raise BadConfiguration(f"ACQUIRE_DATABASE: {target}: exists already") from None
@@ -265,12 +264,12 @@ def _restore_postgresql(source: Path, url: URL) -> str:
 
 
 def _entry(line: str) -> str:
-    """The subject of a line in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
+    """Subject of a line in a backup's list: the end of `5; 2615 2200 SCHEMA - public me`."""
     return " ".join(line.partition(";")[2].split(" ")[3:])
 
 
 def _makes_schema(line: str, schema: str) -> bool:
-    """True if a line of a backup's contents makes a schema that the database has already."""
+    """True if a line of a backup's list creates a schema that the database has already."""
     return _entry(line).startswith((f"SCHEMA - {schema} ", f"COMMENT - SCHEMA {schema} "))
 
 

@@ -1,10 +1,10 @@
-"""Copies a whole record to another database, from SQLite to PostgreSQL or back.
+"""Copy of a whole record to another database, from SQLite to PostgreSQL or back.
 
-Every table is copied row by row, those of projections too.  A table is read in the order of its
-primary key, and each transaction of the copy takes the next rows: the number of rows that the
-copy has is how far it came, and an interrupted copy goes on from there.
+Every table is copied row by row, including those of projections.  A table is read in the order of
+its primary key, and each transaction of the copy takes the next rows: the number of rows in the
+copy is its progress, and an interrupted copy continues from there.
 
-Until it is whole, the schema of the copy has a revision that no service opens.  The revision
+Until it is complete, the schema of the copy has a revision that no service opens.  The revision
 names the source by its numbers of rows.
 """
 
@@ -28,21 +28,21 @@ from service.storage.sql.statements import count, insert_all
 from service.storage.upkeep.verify import verify
 
 ROWS_AT_ONCE, LARGE_ROWS_AT_ONCE = 2_000, 20
-"""The second for tables with packed samples and pictures, of up to a megabyte a row."""
+"""Rows in memory at a time; fewer for tables with packed samples and pictures (1 MB a row)."""
 
 Step = Callable[[str, int, int], object]
-"""Called with what is being done, the rows or batches that are done, and all of them."""
+"""Callback for the progress of a copy: the action, rows or batches done, and the total."""
 Counts = dict[str, int]
 
 
 def copy_record(
     source: str, target: str, step: Step = lambda what, done, total: None
 ) -> tuple[int, list[str]]:
-    """Copy a database to another one: its number of rows, and what `verify` finds in the copy.
+    """Copy a database to another one; returns the number of rows, and the faults of the copy.
 
-    The target must be missing, empty, or an unfinished copy of the same source; SQLite's file
-    and the tables of either are made.  Nothing else may write to the two meanwhile.
-    Raises `BadConfiguration` with what to do, also if the copy is not equal to its source.
+    The target must be missing, empty, or an unfinished copy of the same source; SQLite's file and
+    all tables are created.  Nothing else may write to either database meanwhile.  Raises
+    `BadConfiguration` with the remedy, also if the copy does not equal its source.
     """
     with _source(source) as reading, _target(target) as writing:
         try:
@@ -57,12 +57,12 @@ def copy_record(
 
 @contextmanager
 def _source(database: str) -> Iterator[sa.Connection]:
-    """A connection that sees the source as of one moment, while no service writes to it."""
+    """Connect to the source of a copy as of one moment, while no service writes to it."""
     with _named("FROM"):
         migrations.require_records(database)
         url = engines.database_url(database)
     file = engines.database_file(url)
-    # Nothing can write to a read-only file, and its lock cannot be taken.
+    # No process can write to a read-only file, and its lock cannot be taken.
     locked = writing_alone(None if file is None or file.is_read_only else file)
     with _named("FROM"), locked, migrations.disposed(engines.reading_engine(url)) as engine:
         migrations.require_up_to_date(engine)
@@ -74,7 +74,7 @@ def _source(database: str) -> Iterator[sa.Connection]:
 
 @contextmanager
 def _target(database: str) -> Iterator[sa.Connection]:
-    """A connection that writes to the target, which has tables and no service."""
+    """Connect to the target of a copy for writing; it gets tables, and no service may use it."""
     with _named("TO"):
         url = engines.database_url(database)
     with (
@@ -93,7 +93,7 @@ def _target(database: str) -> Iterator[sa.Connection]:
 
 @contextmanager
 def _named(argument: str) -> Iterator[None]:
-    """Let a message name the argument of the command in the place of the setting."""
+    """Name a command's argument instead of the setting in error messages."""
     try:
         yield
     except BadConfiguration as error:
@@ -102,7 +102,7 @@ def _named(argument: str) -> Iterator[None]:
 
 
 def _take_lock(connection: sa.Connection) -> None:
-    """Hold the projector's lock of a shared database until the session ends."""
+    """Take the projector's lock of a shared database until the session ends."""
     if not dialect_of(connection).is_shared:
         return
     if ProjectorLock().take(connection) != "taken":
@@ -114,7 +114,7 @@ def _take_lock(connection: sa.Connection) -> None:
 
 
 def _copy(reading: sa.Connection, writing: sa.Connection, step: Step) -> int:
-    """Copy what is missing, and compare all of it; returns the number of rows."""
+    """Copy the missing rows, then compare all rows; returns the number of rows."""
     tables = migrations.all_tables()
     counts = _counted(reading, tables)
     total = sum(counts.values())
@@ -150,7 +150,7 @@ def _counted(connection: sa.Connection, tables: Sequence[sa.Table]) -> Counts:
 
 
 def _begin(connection: sa.Connection, tables: Sequence[sa.Table], counts: Counts) -> bool:
-    """Mark a new database as an unfinished copy; False if it has as many rows as the source."""
+    """Mark a new database as an unfinished copy; False if the copy is complete already."""
     marked = (
         migrations.UNFINISHED + blake2b(msgspec.json.encode(counts), digest_size=12).hexdigest()
     )
@@ -186,7 +186,7 @@ def _set_revision(connection: sa.Connection, revision: str) -> None:
 def _chunks(
     connection: sa.Connection, query: sa.Select[Any], table: sa.Table
 ) -> Iterator[Sequence[sa.Row[Any]]]:
-    """The rows of a query on a table, as many at a time as memory allows."""
+    """Read the rows of a query in chunks that fit in memory."""
     has_large = any(isinstance(column.type, sa.LargeBinary) for column in table.columns)
     at_once = LARGE_ROWS_AT_ONCE if has_large else ROWS_AT_ONCE
     with connection.execute(query, execution_options={"yield_per": at_once}) as read:
@@ -196,7 +196,7 @@ def _chunks(
 def _copy_rows(
     reading: sa.Connection, writing: sa.Connection, table: sa.Table, present: int
 ) -> Iterator[int]:
-    """Copy the rows after those that are there; yields how many each transaction took."""
+    """Copy the rows after the first `present` ones; yields the row count of each transaction."""
     query = sa.select(table).order_by(*table.primary_key).offset(present)
     later = dict.fromkeys(column.name for column in _own_references(table))
     for chunk in _chunks(reading, query, table):
@@ -206,7 +206,7 @@ def _copy_rows(
 
 
 def _own_references(table: sa.Table) -> list[sa.Column[Any]]:
-    """The columns that refer to rows of the same table, which may come later."""
+    """Columns that refer to rows of the same table, which may be copied later."""
     return [key.parent for key in table.foreign_keys if key.column.table is table]
 
 
@@ -241,7 +241,7 @@ def _digest(connection: sa.Connection, table: sa.Table) -> int:
 
 
 def _set_sequences(connection: sa.Connection, tables: Sequence[sa.Table]) -> None:
-    """Let PostgreSQL's next numbers come after those that were copied; SQLite looks for itself."""
+    """Set PostgreSQL's sequences to continue after the copied numbers; SQLite needs none."""
     if not dialect_of(connection).is_shared:
         return
     after = "coalesce(max({0}), 0) + 1, false) FROM {1}"

@@ -1,4 +1,4 @@
-"""Dates on which something ends while the service runs: its table of leap seconds, and tokens."""
+"""Expiry dates that a running service watches: of its table of leap seconds, and of tokens."""
 
 import logging
 from collections.abc import Callable
@@ -16,7 +16,7 @@ from service.times import LAST_YEAR, Utc, parse_utc, recorded_utc, shifted, utc_
 log = logging.getLogger(__name__)
 
 SOON_DAYS = 30
-"""Days before an end from which the service warns when it starts; alert rules begin then, too."""
+"""Days before an expiry at which warnings and alert rules begin."""
 DAY_S = 86_400.0
 _FIRST_YEAR = 2017
 
@@ -29,17 +29,17 @@ class TokenTerm(Struct, frozen=True):
     expires: str
 
     def ends_soon(self, now: Utc) -> bool:
-        """True in its last `SOON_DAYS`, and of a token for less time in its last quarter."""
+        """True in the last `SOON_DAYS` of a token's term, or in its last quarter if shorter."""
         ends = recorded_utc(self.expires)
         quarter_s = (ends.tai_ns - recorded_utc(self.created).tai_ns) / 4e9
         return (ends.tai_ns - now.tai_ns) / 1e9 <= min(quarter_s, SOON_DAYS * DAY_S)
 
 
 class Expiries(Struct, frozen=True):
-    """When something ends.
+    """Expiry dates of the table of leap seconds and of access tokens.
 
-    `leap_seconds` is the moment from which the table no longer vouches for the difference
-    between TAI and UTC, as UTC text.  `tokens` are those in force, the first to expire first.
+    `leap_seconds` is the UTC text of the moment from which the table no longer guarantees the
+    difference between TAI and UTC. `tokens` are those in force, the first to expire first.
     """
 
     leap_seconds: str
@@ -48,7 +48,7 @@ class Expiries(Struct, frozen=True):
 
 @cache
 def leap_seconds_end() -> Utc:
-    """The first year that ERFA calls dubious: more than five years after its table was made.
+    """Start of the first year that ERFA calls dubious: over five years after its table was made.
 
     The International Earth Rotation Service announces a leap second half a year ahead in its
     Bulletin C, so the table can be out of date earlier; a newer `pyerfa` brings the newest.
@@ -63,13 +63,13 @@ def leap_seconds_end() -> Utc:
 
 @dataclass(frozen=True)
 class ExpiryDates:
-    """Reads what ends when, and warns of what ends soon."""
+    """Reader of expiry dates, which warns of those that are near."""
 
     reading: Callable[[], AbstractContextManager[Connection]]
     now: Callable[[], Utc] = utc_now
 
     def dates(self) -> Expiries:
-        """The dates on which something ends."""
+        """Current expiry dates of the table of leap seconds and of tokens in force."""
         c = access_tokens.c
         query = (
             select(c.name, c.created, c.expires)
@@ -81,7 +81,7 @@ class ExpiryDates:
         return Expiries(leap_seconds_end().text, tokens)
 
     def warn(self) -> list[str]:
-        """Log a warning about each thing that ends soon, or has ended."""
+        """Log a warning for each expiry that is near or past."""
         found, now = self.dates(), self.now()
         soon = shifted(now, SOON_DAYS * DAY_S).text
         warnings = []

@@ -1,8 +1,8 @@
-"""Removes what was recorded wrongly: a run, or named batches and gyro blocks of it.
+"""Removal of wrongly recorded data: a whole run, or named batches and gyro blocks of it.
 
 Trends, filtered attitudes and the archive follow.  Alarms, events, notes, replays and the audit
-list stay: they say what happened.  Batches go in portions, each in one transaction with its part
-in the trends; after an interruption the same call again goes on.
+list stay: they document the history.  Batches are removed in portions, each in one transaction with
+its part in the trends; after an interruption the same call continues.
 """
 
 from collections.abc import Callable, Collection
@@ -35,15 +35,15 @@ from service.storage.upkeep.prune import delete_batches, delete_blocks, delete_d
 from service.times import DAY_S, HOUR_S, recorded_utc
 
 _AT_ONCE = 1_000
-"""Batches of one transaction: others that write wait for its end."""
+"""Number of batches removed in one transaction, which other writers wait for."""
 _DAY_NS = DAY_S * 10**9
 MOST_NAMES = 1_000
-"""Batches, or gyro blocks, that are named at once."""
+"""Largest number of batches, or gyro blocks, named in one call."""
 
 
 @dataclass(frozen=True)
 class ForgetFilter:
-    """The part of a run that is forgotten: all of it, or only the named batches and gyro blocks."""
+    """Selection of data to forget: a whole run, or only its named batches and gyro blocks."""
 
     run: str
     spacecraft: str | None = None
@@ -52,11 +52,11 @@ class ForgetFilter:
 
     @property
     def is_whole(self) -> bool:
-        """True if no batch and no block is named."""
+        """True if the selection is a whole run, with no batch and no block named."""
         return not (self.batches or self.gyro_blocks)
 
     def of(self, table: Table, names: Collection[str] = (), name: str = "") -> list[Any]:
-        """The rows of a table that are selected, as SQL."""
+        """SQL conditions for the selected rows of a table."""
         chosen: list[ColumnElement[bool]] = [table.c.run == self.run]
         if self.spacecraft is not None:
             chosen.append(table.c.spacecraft == self.spacecraft)
@@ -65,16 +65,16 @@ class ForgetFilter:
         return chosen
 
     def of_batches(self, table: Table) -> list[Any]:
-        """The selected rows of `batches` or `archived_batches`."""
+        """SQL conditions for the selected rows of `batches` or `archived_batches`."""
         return self.of(table, self.batches, "batch")
 
     def of_blocks(self) -> list[Any]:
-        """The selected rows of `gyro_blocks`."""
+        """SQL conditions for the selected rows of `gyro_blocks`."""
         return self.of(gyro_blocks, self.gyro_blocks, "block")
 
 
 def found(connection: Connection, selected: ForgetFilter) -> Forgotten:
-    """The selected data; raises `NotFound` where nothing is, or a name is not there."""
+    """Count the selected data; raises `NotFound` for an empty selection or an unknown name."""
     _require_names(connection, selected)
     counts = {
         name: count(connection, table, *chosen)
@@ -98,12 +98,11 @@ def forget(
     note: Callable[[Connection, Forgotten], object] = lambda connection, total: None,
     step: Callable[[int, Forgotten], object] = lambda done, total: None,
 ) -> Forgotten:
-    """Remove what is selected; returns what it was.
+    """Remove the selected data; returns the counts of the removed data.
 
-    `note` is called in the first transaction, and `step` with the number of batches that are
-    removed and the whole.  `archive` is the folder with the archived batches.  Raises `NotFound`
-    as `found` does, and `BadConfiguration` where archived batches are selected and `archive` is
-    not the folder that has them.
+    `note` is called in the first transaction, and `step` with the number of removed batches and all
+    counts.  `archive` is the folder with the archived batches.  Raises `NotFound` as `found` does,
+    and `BadConfiguration` where archived batches are selected and `archive` is not their folder.
     """
     with store.reading() as connection:
         total = found(connection, selected)
@@ -117,7 +116,7 @@ def forget(
             pass
         note(connection, total)
 
-    # What is computed from the batches goes first: it is computed again from what is left.
+    # Delete the computed days first: they are computed again from the remaining batches.
     store.writer.change(forget_days)
     done = 0
     if total.archived_batches and archive is not None:
@@ -155,11 +154,11 @@ def _of(selected: ForgetFilter) -> str:
 
 
 def _of_days(selected: ForgetFilter) -> list[Any]:
-    """The days of filtered attitudes that were computed with what is selected, as SQL."""
+    """SQL conditions for the days of filtered attitudes computed from the selected data."""
     chosen = selected.of(graded_days)
     if selected.is_whole:
         return chosen
-    # A day depends on less than a day before it and after it.
+    # A day depends on less than one day before and after it.
     begin, end = (graded_days.c.start_ns - _DAY_NS, graded_days.c.end_ns + _DAY_NS)
     overlapping: list[ColumnElement[bool]] = []
     if selected.batches:
@@ -190,7 +189,7 @@ def _of_days(selected: ForgetFilter) -> list[Any]:
 
 
 def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
-    """Delete some of the selected batches and count their hours anew; how many."""
+    """Delete a portion of the selected batches and recount their hours; returns its size."""
     if not selected.is_whole and not selected.batches:
         return 0
     query = select(batches.c.id, batches.c.spacecraft, batches.c.time)
@@ -202,10 +201,10 @@ def _forget_batches(connection: Connection, selected: ForgetFilter) -> int:
 
 
 def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
-    """Remove the archived batches that are selected; how many.
+    """Remove the selected archived batches; returns their number.
 
-    Parts of which all batches are selected are deleted.  Of others all batches are recorded
-    again, from where the selected ones are then deleted; `acquire archive` archives the rest.
+    A part whose batches are all selected is deleted.  The batches of any other part are recorded
+    again, and the selected ones deleted there; `acquire archive` archives the rest.
     """
     # Archives need pyarrow, which is an extra.
     from service.storage.archive.folder import claim, locked, manifest_of, parts_of, remove_part
@@ -247,13 +246,14 @@ def _forget_archived(store: Store, folder: Path, selected: ForgetFilter) -> int:
             else:
                 rows = read_part(folder, path, part.sha256)
                 store.writer.change(partial(forget_some, part=part, rows=rows))
-            # After the record: a file too many is named by `archive verify`, a missing one lost.
+            # Delete files after the database rows: `archive verify` names a surplus file; a missing
+            # one is lost.
             remove_part(folder, manifest_of(folder, manifest.spacecraft, manifest.day), part)
     return sum(counts.values())
 
 
 def _forget_run(store: Store, run: str) -> None:
-    """Delete the settings of a run, unless something was recorded in it meanwhile."""
+    """Delete the settings of a run, unless data were recorded in it meanwhile."""
     deletion = delete(runs).where(runs.c.name == run)
     with suppress(IntegrityError):
         store.writer.change(lambda connection: connection.execute(deletion))

@@ -1,4 +1,4 @@
-"""Proofs that a result is in the record, which are checked years later without the database."""
+"""Proofs that a result is in the record, which can be checked years later without the database."""
 
 import hashlib
 from pathlib import Path
@@ -21,27 +21,27 @@ class Proof(msgspec.Struct, kw_only=True):
     """An inclusion proof of a result; digests are in hexadecimal digits."""
 
     result: str
-    """The id."""
+    """Id of the proven result."""
     answer_sha256: str
-    """SHA-256 of the answer, byte for byte as it was sent."""
+    """SHA-256 of the answer, byte for byte as sent."""
     content: str
-    """BLAKE2b (32 bytes) of all that is kept of the result."""
+    """BLAKE2b (32 bytes) over all rows of the result."""
     adopted: bool
-    """True if it was current when it was recorded."""
+    """True if the result was current when it was recorded."""
     index: int
-    """The place of its leaf in the tree of the head."""
+    """Index of the result's leaf in the Merkle tree of the head."""
     size: int
-    """The number of leaves."""
+    """Number of leaves in the Merkle tree of the head."""
     path: list[str]
-    """The audit path, from below (RFC 6962)."""
+    """Audit path of the leaf, from below (RFC 6962)."""
     statement: str
-    """The head's statement, whose `root` the path leads to."""
+    """Statement of the head, whose `root` the audit path leads to."""
     signature: str | None
-    """Ed25519 signature of the statement."""
+    """Ed25519 signature of the statement; None if the head is not signed."""
 
 
 def prove(connection: sa.Connection, id: str) -> Proof:
-    """The proof of a recorded result; raises `NotFound` where no head has it."""
+    """Build the inclusion proof of a recorded result; raises `NotFound` if no head covers it."""
     query = sa.select(results, record_leaves.c.leaf).join_from(
         results, record_leaves, results.c.seq == record_leaves.c.seq
     )
@@ -79,7 +79,7 @@ def prove(connection: sa.Connection, id: str) -> Proof:
 
 
 def read_proof(file: Path) -> Proof:
-    """A proof from its file; raises `BadConfiguration` for another file."""
+    """Read a proof from its file; raises `BadConfiguration` for any other file."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=Proof)
     except msgspec.MsgspecError as error:

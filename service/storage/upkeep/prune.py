@@ -1,7 +1,7 @@
-"""Deletes old batches with their results and their part in the trends, gyro blocks, grades.
+"""Pruning: deletes old batches with their results and trends, gyro blocks, and graded days.
 
-One hour of a run at a time, of a dense hour a part, each in one transaction of the writer: other
-writes run between two of them, and the trends always match the stored batches.
+Each transaction of the writer deletes one hour of a run, or a part of a dense hour: other writes
+run between transactions, and the trends always match the stored batches.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,11 +31,11 @@ from service.times import HOUR_S, Utc, bucket_start
 OF_A_RESULT = (star_results, solutions, idempotency_keys)
 OF_A_BATCH = (frames, tracker_values)
 MOST_BATCHES = 10_000
-"""The most batches that one transaction deletes: other writers of the hour, on SQLite all, wait."""
+"""Largest number of batches deleted in one transaction, which delays other writers."""
 _BLOCKS_AT_ONCE = 100
-"""Blocks that one transaction deletes, of up to 240 kB each."""
+"""Number of gyro blocks deleted in one transaction, of up to 240 kB each."""
 _DAYS_AT_ONCE = 10
-"""Days that one transaction deletes, of about 12 MB each."""
+"""Number of graded days deleted in one transaction, of about 12 MB each."""
 
 Conditions = list[ColumnElement[bool]]
 
@@ -63,11 +63,11 @@ def prune(
     """Delete the batches whose time is before `before`, of one run or of all.
 
     Gyro blocks are deleted whose last sample is before it, and days of filtered and smoothed
-    attitudes, with all their revisions, that end by then.  Missions, catalogs, alarms and the
-    audit list stay.  Interrupted, it has deleted the oldest; the same call again goes on.
+    attitudes, with all their revisions, that end by then.  Missions, catalogs, alarms and the audit
+    list stay.  Data are deleted oldest first; after an interruption the same call continues.
     """
     with store.reading() as connection:
-        # A batch has exactly one current result, and those have the index by time.
+        # A batch has exactly one current result, and current results have an index by time.
         is_old = _of_run(run, results, results.c.time_ns < before.tai_ns)
         old_blocks = _of_run(run, gyro_blocks, gyro_blocks.c.end_ns < before.tai_ns)
         old_days = _of_run(run, graded_days, graded_days.c.end_ns <= before.tai_ns)
@@ -101,12 +101,12 @@ def prune(
 
 
 def _of_run(run: str | None, table: Table, chosen: ColumnElement[bool]) -> Conditions:
-    """The chosen rows of a table, of one run or of all."""
+    """Extend an SQL condition on a table to one run, or to all for None."""
     return [chosen] if run is None else [chosen, table.c.run == run]
 
 
 def delete_days(connection: Connection, chosen: Conditions) -> int:
-    """Delete some of the graded days that are chosen, with their samples; how many."""
+    """Delete a portion of the chosen graded days with their samples; returns its size."""
     ids = list(connection.scalars(select(graded_days.c.id).where(*chosen).limit(_DAYS_AT_ONCE)))
     connection.execute(delete(graded_blocks).where(graded_blocks.c.day_id.in_(ids)))
     chain.note_removed(connection, graded_days, ids)
@@ -115,7 +115,7 @@ def delete_days(connection: Connection, chosen: Conditions) -> int:
 
 
 def delete_blocks(connection: Connection, chosen: Conditions) -> int:
-    """Delete some of the blocks that are chosen; how many."""
+    """Delete a portion of the chosen gyro blocks; returns its size."""
     chunk = select(gyro_blocks.c.id).where(*chosen).limit(_BLOCKS_AT_ONCE)
     ids = list(connection.scalars(chunk))
     chain.note_removed(connection, gyro_blocks, ids)
@@ -126,7 +126,7 @@ def delete_blocks(connection: Connection, chosen: Conditions) -> int:
 def _delete_oldest(
     connection: Connection, spacecraft: str, run: str, hour: int, before: Utc
 ) -> int:
-    """Delete the oldest batches of an hour; how many."""
+    """Delete a portion of an hour's batches, oldest first; returns its size."""
     end_ns = min(bucket_start(hour + 1, HOUR_S).tai_ns, before.tai_ns)
     oldest = select(results.c.batch_id).where(
         results.c.current,
@@ -143,7 +143,7 @@ def _delete_oldest(
 
 
 def delete_batches(connection: Connection, batch_ids: Sequence[str]) -> None:
-    """Delete batches with all that was made of them, what refers to others first."""
+    """Delete batches with all their results, referring rows first."""
     for ids in portions(batch_ids):
         seals.take_out(connection, ids)
         chain.note_results_removed(connection, ids)

@@ -1,7 +1,7 @@
-"""Parts of a run that was made from other parts: what the database keeps of them.
+"""Reprocessed runs in an archive: the data that the database keeps of their parts.
 
-The parts are like those of `acquire archive`, but their batches were never in the database.  It
-gets their identities, their share in the trends, and what their limits say.
+The parts are like those of `acquire archive`, but their batches were never in the database.  The
+database gets their identities, their share in the trends, and the evaluation of their limits.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,27 +33,27 @@ from service.storage.upkeep.archiving import described, hours_of, newest_hours, 
 from service.times import DAY_S, bucket_start, parse_utc
 
 IDENTITY = ("id", "spacecraft", "run", "batch", "fingerprint")
-"""The columns of a batch that stay in the database."""
+"""Columns of an archived batch that stay in the database."""
 _LONG = ["answer", "options"]
 
 
 @dataclass(frozen=True)
 class RunPart:
-    """A part of a run that is written, with all that the database keeps of it."""
+    """A written archive part of a reprocessed run, with the data for the database."""
 
     spacecraft: str
     day: str
     part: Part
     identities: pa.Table
-    """The columns of `IDENTITY`."""
+    """Table of the batches' identities, with the columns of `IDENTITY`."""
     shares: Mapping[int, Mapping[str, Row]]
-    """The rollups by hour, of each tracker and of the `WHOLE`."""
+    """Rollups by hour, of each tracker and of the `WHOLE`."""
     latest: Row
-    """The latest batch, as an event tells it."""
+    """The latest batch, in the form of an event."""
 
 
 def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
-    """The description of a part with these rows, whose file has this content."""
+    """Describe an archive part of a reprocessed run from its rows and file content."""
     found = rows["batches"]
     first = found.slice(0, 1).to_pylist()[0]
     part = msgspec.structs.replace(described(name, first["run"], rows, content), source=source)
@@ -69,7 +69,7 @@ def run_part(name: str, source: str, rows: Rows, content: bytes) -> RunPart:
 
 
 def _latest(rows: Rows) -> Row:
-    """The latest batch, chosen as `projections.projector` does."""
+    """The latest batch of a part, chosen as `projections.projector` does."""
     batch = rows["batches"].slice(len(rows["batches"]) - 1).to_pylist()[0]
     (result,) = (
         rows["results"].filter(pc.equal(rows["results"]["batch_id"], batch["id"])).to_pylist()
@@ -96,14 +96,14 @@ def _shares(rows: Rows, day: int) -> dict[int, dict[str, Row]]:
 
 
 def name_part(folder: Path, made: RunPart) -> str:
-    """Name a part in the manifest of its day; returns its path below the folder."""
+    """Name an archive part in the manifest of its day; returns its path below the folder."""
     manifest = manifest_of(folder, made.spacecraft, made.day).with_part(made.part)
     write_manifest(folder, manifest)
     return path_of(folder, manifest, made.part)
 
 
 def merge(store: Store, folder: Path, path: str, made: RunPart) -> None:
-    """Note a part that a manifest names in the database, in one transaction.
+    """Note an archive part of a reprocessed run in the database, in one transaction.
 
     Raises `BadConfiguration` where the run has other batches of the same names.
     """
@@ -118,8 +118,8 @@ def _merge(
     connection: Connection, folder: Path, path: str, made: RunPart, features_off: str
 ) -> None:
     spacecraft, run = made.spacecraft, made.part.run
-    # A batch that another process records in the run holds this row until its commit, and waits
-    # for it: the table of archived batches and that of recorded ones have no unique key together.
+    # Lock the run: a batch that another process records in it holds this row until its commit, and
+    # waits for it.  The tables of archived and of recorded batches have no unique key together.
     connection.execute(
         select(tables.runs.c.name).where(tables.runs.c.name == run).with_for_update()
     )
@@ -133,7 +133,7 @@ def _merge(
             if known := look_up(connection, wanted).identities:
                 raise _taken(made, next(iter(known))[2])
     number = note_part(connection, spacecraft, made.part, path, made.identities)
-    # Whoever counts an hour anew locks its rollup and then reads the shares.
+    # A recount of an hour locks its rollup and then reads the shares.
     rollups.add_shares(connection, spacecraft, run, made.shares)
     insert_share(connection, number, spacecraft, run, made.shares)
     of_features = feature_modules("projection", features_off)
@@ -155,7 +155,7 @@ def _taken(made: RunPart, what: str) -> BadConfiguration:
 
 
 def _as_recorded(rows: Rows) -> Iterator[Sequence[RecordedResult]]:
-    """The results of a part as they would have been recorded, in order of time, some at a time."""
+    """Results of an archive part in the form for projections, in order of time, in portions."""
     made = {row["batch_id"]: row for row in rows["results"].drop_columns(["answer"]).to_pylist()}
     trackers: dict[str, list[Row]] = {}
     for row in rows["tracker_values"].to_pylist():
@@ -168,9 +168,10 @@ def _as_recorded(rows: Rows) -> Iterator[Sequence[RecordedResult]]:
 
 
 def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPart]]:
-    """The parts of a run that manifests name and the database does not know, with their paths.
+    """Archive parts of a run that a manifest names but the database lacks, with their paths.
 
-    A process that was killed in between left them.  Raises `BadConfiguration` for a damaged one.
+    A process that was killed between the two steps left them.  Raises `BadConfiguration` for a
+    damaged part.
     """
     for path, manifest, part in parts_of(folder):
         if part.run != run or part.source is None:
@@ -185,7 +186,7 @@ def unmerged(store: Store, folder: Path, run: str) -> Iterator[tuple[str, RunPar
 
 
 def _has_some(store: Store, ids: Sequence[str]) -> bool:
-    """True if some batches are recorded, others of them perhaps pruned, or are archived."""
+    """True if any of the batches is recorded or archived."""
     with store.reading() as connection:
         return any(
             connection.scalar(select(table.c.id).where(table.c.id.in_(some_ids)).limit(1))
@@ -195,7 +196,7 @@ def _has_some(store: Store, ids: Sequence[str]) -> bool:
 
 
 def restore_newest(store: Store, folder: Path, spacecraft: str, run: str) -> None:
-    """Record the batches of the part with a run's newest batch, and with its newest attitude.
+    """Record the batches of the archive parts with a run's newest batch and newest attitude.
 
     As with `acquire archive`, the state of a spacecraft is known without the archive.
     """

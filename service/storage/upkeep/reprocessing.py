@@ -1,8 +1,8 @@
-"""How far the reprocessings into an archive are: a file for each run, beside the archive's parts.
+"""Progress files of reprocessings into an archive, one for each run, beside the parts.
 
     reprocessing/RUN.json
 
-The command writes it, the service shows it; pyarrow is not needed.
+The command writes the file, the service shows it; pyarrow is not needed.
 """
 
 import logging
@@ -18,20 +18,20 @@ from service.times import Utc, recorded_utc, utc_now
 
 FOLDER = "reprocessing"
 SILENT_S = 60.0
-"""A command that has not written for so long is taken for stopped."""
+"""Seconds without an update after which a command counts as interrupted."""
 
 log = logging.getLogger(__name__)
 
 
 class Reprocessing(Struct, frozen=True, kw_only=True):
-    """A reprocessing into an archive, as it was when it was written last."""
+    """Progress of a reprocessing into an archive at its last update."""
 
     run: str
     source: str
     partitions: int
     partitions_done: int
     batches: int
-    """The number of batches of the selected period."""
+    """Number of batches in the selected period."""
     before: int
     """Number of the period's batches that the run had before the command began."""
     recorded: int
@@ -42,20 +42,20 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
 
     @property
     def batches_per_s(self) -> float:
-        """Batches a second since the command began."""
+        """Mean rate in batches per second since the command began."""
         passed_s = _seconds(self.started, self.finished or self.updated)
         return (self.recorded + self.refused) / passed_s if passed_s > 0.0 else 0.0
 
     @property
     def left_s(self) -> float | None:
-        """Seconds that the rest takes at the same rate; None: it is not known."""
+        """Estimated seconds until the reprocessing ends, at its mean rate; None if not known."""
         left = self.batches - self.before - self.recorded - self.refused
         if self.finished is not None or left <= 0:
             return 0.0
         return left / self.batches_per_s if self.batches_per_s > 0.0 else None
 
     def state(self, now: Utc) -> Literal["running", "done", "interrupted"]:
-        """The state at a time."""
+        """State of a reprocessing at a time."""
         if self.finished is not None:
             return "done"
         silent_s = (now.tai_ns - recorded_utc(self.updated).tai_ns) * 1e-9
@@ -63,18 +63,18 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
 
 
 def write_reprocessing(folder: Path, state: Reprocessing) -> None:
-    """Put a state in the place of the one before."""
+    """Write the progress file of a reprocessing, replacing the previous one."""
     place = folder / FOLDER
     place.mkdir(exist_ok=True)
     file = place / f"{quote(state.run, safe='')}.json"
     beside = file.with_suffix(".new")
     beside.write_bytes(msgspec.json.format(msgspec.json.encode(state), indent=1))
-    # It may be lost in a power cut: nothing depends on it.
+    # The file may be lost in a power cut: nothing depends on it.
     os.replace(beside, file)
 
 
 def reprocessings(folder: Path) -> list[Reprocessing]:
-    """The reprocessings into an archive, the latest first; one that cannot be read is left out."""
+    """All reprocessings into an archive, the latest first; unreadable files are left out."""
     found = []
     for file in (folder / FOLDER).glob("*.json"):
         try:

@@ -1,11 +1,11 @@
-"""Splits older batches by tracker: what recording does by itself since schema 0008.
+"""Splitting of older batches by tracker, which recording does by itself since schema 0008.
 
-Also the thread that does this, and what else an upgrade leaves to be done.
+The module also has the thread that does this and other remaining work of an upgrade.
 
-A few batches at a time: they are read and computed beside the writer, and written
-in one short transaction, which also notes how far it came.  Killed, it has split
-whole steps; the next call goes on from there.  A batch that another process split,
-or whose result was replaced meanwhile, is left as it is.
+Batches are split in small steps: read and computed beside the writer, then written in one short
+transaction, which also notes the position.  If the process is killed, whole steps are done; the
+next call continues from there.  A batch that another process split, or whose result was replaced
+meanwhile, is left unchanged.
 """
 
 import logging
@@ -50,18 +50,18 @@ log = logging.getLogger(__name__)
 
 AT_ONCE = 50
 PAUSE_S = 0.25
-"""The pause between two steps of the service, each of which takes the writer some milliseconds."""
+"""Pause in seconds between two steps, each of which takes the writer some milliseconds."""
 RETRY_S = 30.0
 LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
-"""(spacecraft, run)."""
+"""A spacecraft and a run."""
 Place = tuple[int | None, str | None]
-"""The `time_ns` and id of the batch that was looked at last; None at the beginning."""
+"""`time_ns` and id of the batch examined last; None at the beginning."""
 
 
 @dataclass
 class TrackerSplitter:
-    """Splits the older batches of missions with several trackers."""
+    """Splitter of older batches by tracker, for missions with several trackers."""
 
     store: Store
     sky: SkyModel
@@ -70,7 +70,7 @@ class TrackerSplitter:
     _catalogs: dict[str, tuple[RunCatalog, dict[str, int]]] = field(default_factory=dict)
 
     def waiting(self) -> list[Owner]:
-        """The runs of spacecraft with several trackers whose batches are still to be split."""
+        """Runs of spacecraft with several trackers that have batches to be split."""
         several = [each.name for each in self.missions.values() if len(each.trackers) > 1]
         columns = tracker_splits.c.spacecraft, tracker_splits.c.run
         query = select(*columns).where(tracker_splits.c.spacecraft.in_(several))
@@ -84,12 +84,12 @@ class TrackerSplitter:
         pause_s: float = 0.0,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Split all that is waiting; how many batches were looked at, see `_in_steps`."""
+        """Split all remaining batches; returns the number of batches examined, see `_in_steps`."""
         work = [partial(self._step, owner) for owner in self.waiting()]
         return _in_steps(work, step, pause_s, is_stopped)
 
     def _step(self, owner: Owner) -> int:
-        """Split the next batches of a run; 0 when it is done."""
+        """Split the next batches of a run by tracker; returns their number, 0 at the end."""
         with self.store.reading_record() as connection:
             place = _place(connection, owner)
             if place is None:
@@ -102,14 +102,14 @@ class TrackerSplitter:
         return len(rows)
 
     def _split(self, row: Row) -> list[Row]:
-        """The values of the trackers of a recorded batch, as its answer gives them."""
+        """Rows of `tracker_values` for a recorded batch, computed from its answer."""
         answer = answer_from_json(row["answer"])
         mission = self._recorded[row["mission_digest"]]
         try:
             batch = submission_from_json(row["input"]).batch
             corrected = correct(batch, mission)
         except BadInput:
-            # `verify` tells of an input that cannot be read.
+            # `verify` reports an input that cannot be read.
             return []
         catalog, place = self._catalog(answer, mission, row["time"])
         stars = BatchStars(
@@ -120,7 +120,7 @@ class TrackerSplitter:
     def _catalog(
         self, answer: Answer, mission: Mission, time: str
     ) -> tuple[RunCatalog, Mapping[str, int]]:
-        """A run catalog with its rows by star; no row if the answer's is no longer there."""
+        """Run catalog of an answer, with indices by star id; none if the catalog changed."""
         digest = answer.provenance.run_catalog
         if digest not in self._catalogs:
             catalog = self.sky.run_catalog(mission, parse_utc(time))
@@ -131,9 +131,9 @@ class TrackerSplitter:
 
 
 class BackgroundUpgrade:
-    """Brings what earlier versions recorded up to date, in a thread, once.
+    """Thread that upgrades data recorded by earlier versions, once.
 
-    Gives results their digests, then splits batches by tracker.
+    It gives results their digests, then splits batches by tracker.
     """
 
     def __init__(self, splitter: TrackerSplitter) -> None:
@@ -142,13 +142,13 @@ class BackgroundUpgrade:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Begin, if anything is waiting."""
+        """Start the upgrade thread if there is work to do."""
         if self._thread is None and (self.digests.waiting() or self.splitter.waiting()):
             self._thread = threading.Thread(target=self._run, name="upgrade")
             self._thread.start()
 
     def stop(self) -> None:
-        """End after the present step; the next start goes on."""
+        """Stop the upgrade after the present step; the next start continues."""
         self._stopping.set()
         if self._thread is not None:
             self._thread.join()
@@ -173,7 +173,7 @@ class BackgroundUpgrade:
                 self._stopping.wait(RETRY_S)
                 continue
             except Exception:
-                # What is missing stays so, and is told of; everything else goes on.
+                # The remaining work stays undone and is logged; everything else continues.
                 log.exception("not all %s", outcome)
                 return
             if done and not self._stopping.is_set():
@@ -187,10 +187,10 @@ def _in_steps(
     pause_s: float,
     is_stopped: Callable[[], bool],
 ) -> int:
-    """Call each function until it gives zero; the sum of what they gave.
+    """Call each function until it returns zero; returns the sum of all return values.
 
-    `step` is called with that sum as it grows.  After each step it pauses, so that batches that
-    are sent meanwhile do not wait.
+    `step` is called with that sum as it grows.  The pause after each step lets batches through that
+    are sent meanwhile.
     """
     done = 0
     for function in work:
@@ -202,7 +202,7 @@ def _in_steps(
 
 
 def _place(connection: Connection, owner: Owner, *, lock: bool = False) -> Place | None:
-    """How far the batches of a run were looked at; None if all are."""
+    """Position up to which the batches of a run were examined; None if all are."""
     query = select(tracker_splits.c.time_ns, tracker_splits.c.batch_id).where(_is(owner))
     row = connection.execute(query.with_for_update() if lock else query).first()
     return None if row is None else (row[0], row[1])
@@ -213,7 +213,7 @@ def _is(owner: Owner) -> Any:
 
 
 def _next(owner: Owner, place: Place) -> Select[Any]:
-    """The next batches to be looked at, the newest first, with what their values need."""
+    """Query for the next batches of a run to be split, newest first, with the columns needed."""
     spacecraft, run = owner
     query = (
         select(
@@ -238,7 +238,7 @@ def _write(
     split: Mapping[str, list[Row]],
 ) -> None:
     if _place(connection, owner, lock=True) != place:
-        # Another process was here.
+        # Another process has split these batches.
         return
     if not rows:
         connection.execute(deleted(tracker_splits).where(_is(owner)))
@@ -257,28 +257,28 @@ def _write(
         for values in split[row["id"]]
     ]
     insert_all(connection, tracker_values, [values for _, values in new])
-    # The projector adds those that it has not come to yet.
+    # The projector adds the results that it has not reached yet.
     passed = [(id, values) for id, values in new if current[id] <= position]
     rollups.add(connection, (((*owner, hours[id]), values) for id, values in passed))
     last = {"time_ns": rows[-1]["time_ns"], "batch_id": rows[-1]["batch_id"]}
     connection.execute(update(tracker_splits).where(_is(owner)).values(last))
 
 
-# Gives results of earlier versions their digests: what recording does by itself since schema 0017.
+# Digests for results of earlier versions, which recording computes by itself since schema 0017.
 #
-# A few at a time, each step in one short transaction with the seals of their hours.  Killed, it has
-# done whole steps; the next call goes on from there.  These digests are marked as made later: they
-# say nothing of what happened to a result before.
+# Results get digests in small steps, each in one short transaction with the seals of their hours.
+# If the process is killed, whole steps are done; the next call continues from there.  These digests
+# are marked as made later: they prove nothing about the time before.
 
 
 @dataclass(frozen=True)
 class OlderDigests:
-    """Makes the digests that are missing in a database."""
+    """Calculator of digests that are missing in a database of an earlier version."""
 
     store: Store
 
     def waiting(self) -> bool:
-        """True if any is missing."""
+        """True if any digest is missing."""
         with self.store.reading_record() as connection:
             return any(
                 connection.execute(select(column).where(digest.is_(None)).limit(1)).first()
@@ -295,15 +295,15 @@ class OlderDigests:
         pause_s: float = 0.0,
         is_stopped: Callable[[], bool] = lambda: False,
     ) -> int:
-        """Make all that are missing; how many results got one, see `_in_steps`."""
+        """Compute all missing digests; returns the number of results changed, see `_in_steps`."""
         self.store.writer.change(_give_to_settings)
         work = [lambda: self.store.writer.change(_give)]
         return _in_steps(work, step, pause_s, is_stopped)
 
 
 def _give(connection: Connection) -> int:
-    """Give some results their digests; how many."""
-    # Whoever deletes results takes this lock, too.
+    """Compute the digests of a portion of results; returns its size."""
+    # Deleting results takes this lock as well.
     rollups.lock_position(connection)
     query = select(results).where(results.c.digest.is_(None)).order_by(results.c.id).limit(AT_ONCE)
     made = rows_of(connection, query)

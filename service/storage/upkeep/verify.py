@@ -1,7 +1,7 @@
-"""Checks a database for consistency; reads all of it and changes nothing.
+"""Consistency check of a database; reads all of it and changes nothing.
 
-Batches are read a few at a time, each time as of one moment, so that it can be
-done while the database is being served.
+Batches are read a few at a time, each time as of one moment, so that the check can run while the
+database is being served.
 """
 
 import hashlib
@@ -50,10 +50,10 @@ from service.times import unix_seconds, utc_of_unix
 AT_ONCE, BLOCKS_AT_ONCE = 500, 50
 OUTCOMES = ("unique", "ambiguous", "unmatched")
 TOLERANCE = 1e-9
-"""Relative, for sums of the same numbers in another order."""
+"""Relative tolerance for sums of the same numbers in another order."""
 
 Step = Callable[[int, int], object]
-"""Called with the batches that were looked at and those there are."""
+"""Callback for the progress of a check: batches examined, batches in total."""
 
 
 def verify(
@@ -63,12 +63,12 @@ def verify(
     public_key: PublicKey | None = None,
     anchors: Sequence[Anchor] = (),
 ) -> list[str]:
-    """The faults of a database, a sentence each; empty: none.
+    """Check a database; returns a sentence for each fault.
 
-    Looks at the file itself (SQLite), the schema, every batch with all that
-    was made of it, the trends, the gyro blocks, the filtered and smoothed attitudes, and
-    which batches are archived, and the chain, with the key that signed its heads and with heads
-    noted elsewhere.  Raises `BadConfiguration` where there is no database.
+    Checked are the file itself (SQLite), the schema, every batch with all its results, the trends,
+    the gyro blocks, the filtered and smoothed attitudes, the list of archived batches, and the
+    chain, with the key that signed its heads and with heads noted elsewhere.  Raises
+    `BadConfiguration` where there is no database.
     """
     problems = check(database)
     if problems:
@@ -87,7 +87,7 @@ def faults_in(
     public_key: PublicKey | None = None,
     anchors: Sequence[Anchor] = (),
 ) -> list[str]:
-    """The faults of a database with the schema of this version, a sentence each."""
+    """Check a database that has the schema of this version; a sentence for each fault."""
     found = list(_of_the_file(engine))
     # The content of a damaged file is not evidence of what was written.
     if not found:
@@ -104,12 +104,12 @@ def faults_in(
 
 
 def _read_any_text(connection: Any, _: object) -> None:
-    """Read a changed byte that leaves no UTF-8 as another letter, so that its row is named."""
+    """Let SQLite's driver read damaged UTF-8 as other letters, so that the fault's row is named."""
     connection.text_factory = partial(str, encoding="utf-8", errors="replace")
 
 
 def earlier_results(database: str) -> tuple[int, int]:
-    """Results of earlier versions: those without a digest, and those that got one at an upgrade."""
+    """Count results of earlier versions: without a digest, and with one made at an upgrade."""
     digest = tables.results.c.digest
     query = sa.select(sa.func.count().filter(digest.is_(None)), sa.func.count().filter(digest < 0))
     with reading(database) as connection:
@@ -155,7 +155,7 @@ def _of_the_batches(engine: sa.Engine, step: Step) -> Iterator[str]:
 def _pages(
     engine: sa.Engine, table: sa.Table, order: Sequence[str], at_once: int
 ) -> Iterator[tuple[sa.Connection, list[Row]]]:
-    """The rows of a table in the order of unique columns, each page as of one moment."""
+    """Read a table page by page in the order of unique columns, each page as of one moment."""
     columns = [table.c[name] for name in order]
     query = sa.select(table).order_by(*columns).limit(at_once)
     beyond = query
@@ -194,12 +194,12 @@ def _of_a_chunk(connection: sa.Connection, chunk: Mapping[str, Row]) -> Iterator
 def _of_the_trackers(
     connection: sa.Connection, chunk: Mapping[str, Row], made: Sequence[Row]
 ) -> Iterator[str]:
-    """The faults of what is stored of each tracker: it must be what its stars say.
+    """Faults in the stored values of trackers, which must agree with the trackers' stars.
 
-    A batch of several trackers that has none must be waiting for it.
+    A batch of several trackers without such values must be waiting to be split.
     """
     current = {row["id"]: row["batch_id"] for row in made if row["current"]}
-    # Those of an earlier version got one at an upgrade, and are negative.
+    # Digests of results of an earlier version were made at an upgrade, and are negative.
     own = [row for row in made if row["current"] and row["digest"] is not None]
     digested = {row["batch_id"] for row in own if row["digest"] >= 0}
     stars = tables.star_results.c
@@ -229,12 +229,12 @@ def _of_the_trackers(
 
 
 def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[str]:
-    """The faults of a batch; `frame` is the row of the frame it was made of, if any."""
+    """Faults of a batch; `frame` is the row of the frame that it was made from, if any."""
     name = f"batch {batch['id']}"
     current = sum(bool(row["current"]) for row in made)
     if current != 1:
         yield f"{name}: {current} of its results are current, not one"
-    # The fingerprint of a batch made of a frame is that of the frame and of what was told with it.
+    # The fingerprint of a batch made from a frame covers the frame and the data sent with it.
     try:
         if frame is None and fingerprint_of(batch["input"]) != batch["fingerprint"]:
             yield f"{name}: its input is not the one that was fingerprinted"
@@ -252,9 +252,9 @@ def _of_a_batch(batch: Row, made: Sequence[Row], frame: Row | None) -> Iterator[
 def _of_a_frame(
     name: str, frame: Row, read: ObservationBatch, made: Sequence[Row]
 ) -> Iterator[str]:
-    """The faults of a batch made of a frame.
+    """Faults of a batch that was made from a frame.
 
-    What was told with the frame is not kept, so its fingerprint cannot be computed again.
+    The data sent with the frame are not kept, so its fingerprint cannot be computed again.
     """
     sent = [mag for each in read.observations for mag in each.magnitude_mag.tolist()]
     try:
@@ -316,7 +316,7 @@ def _of_trends_by(engine: sa.Engine, bucket: Bucket, *, of_trackers: bool) -> It
                 rollups.recount(connection, bucket, of_trackers=of_trackers),
             )
         )
-        # What is not projected yet will be added.
+        # Results that are not projected yet will be added.
         waiting = rollups.waiting(connection, bucket)
     for key in sorted(stored.keys() | counted.keys()):
         spacecraft, run, *tracker, number = key
@@ -327,14 +327,14 @@ def _of_trends_by(engine: sa.Engine, bucket: Bucket, *, of_trackers: bool) -> It
 
 
 def _of_the_missions(engine: sa.Engine) -> Iterator[str]:
-    """Settings and catalogs that are not what was recorded, under the digests that results name."""
+    """Faults of settings and catalogs whose content does not match their digest."""
     with engine.begin() as connection:
         rows = {table: rows_of(connection, sa.select(table)) for table in SETTINGS}
     for table, table_rows in rows.items():
         for row in table_rows:
             if not agrees(row["row_digest"], digest_of_row(table, row)):
                 yield f"{table.name}, {row['digest']}: the row is not what was recorded"
-    # See `Mission.digest`.
+    # Hash the settings as `Mission.digest` does.
     for digest, settings in ((row["digest"], row["settings"]) for row in rows[tables.missions]):
         try:
             canonical = json.dumps(json.loads(settings), sort_keys=True, separators=(",", ":"))
@@ -370,7 +370,7 @@ def _same(one: float | None, other: float | None) -> bool:
 
 
 def _of_the_archived(engine: sa.Engine) -> Iterator[str]:
-    """The faults: batches in no part, in fewer than their part has, and recorded ones."""
+    """Faults of archived batches: without a part, too few for their part, or recorded as well."""
     archived, recorded_ones = tables.archived_batches.c, tables.batches.c
     counted = sa.select(archived.part_id, sa.func.count()).group_by(archived.part_id)
     same = (archived[name] == recorded_ones[name] for name in ("spacecraft", "run", "batch"))
@@ -394,14 +394,14 @@ _UNPACKED: dict[str, Callable[[bytes, int], GradedSamples | MeasuredInnovations]
 
 
 def _of_the_grades(engine: sa.Engine) -> Iterator[str]:
-    """The faults of the graded days, a sentence each.
+    """Faults of the days of filtered and smoothed attitudes, a sentence each.
 
-    The samples of a current day must be those that were digested, in order of time, within the
-    day and as many as it says; an earlier revision has none.
+    The samples of a current day must be those that were digested, in order of time, within the day
+    and as many as it says; an earlier revision has none.
     """
     pages = _pages(engine, graded_days, ("id",), AT_ONCE)
     for id in [day["id"] for _, days in pages for day in days]:
-        # As of one moment: a new revision takes the samples from the one before.
+        # Read as of one moment: a new revision takes the samples from the one before.
         with engine.begin() as connection:
             yield from _of_a_day(connection, id)
 
@@ -423,7 +423,7 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
     except msgspec.MsgspecError:
         yield f"{name}: its summary cannot be read"
         return
-    # Of each sample of a grade; that of measurements is not used.
+    # The model of each sample of a grade; the model of measurements is not used.
     models = [each.model for each in stretches for _ in range(each.samples)]
     for grade in (*GRADES, INNOVATIONS):
         end_ns = row["start_ns"]
@@ -442,7 +442,7 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
             samples[grade] += block["samples"]
             times = found.tai_ns
             bounds = block["start_ns"], block["end_ns"]
-            # Measurements of two trackers may be of the same moment.
+            # Measurements of two trackers may have the same time.
             least = 0 if grade == INNOVATIONS else 1
             if np.any(np.diff(times) < least) or bounds != (int(times[0]), int(times[-1])):
                 yield f"{where}: its times are not those of its samples"
@@ -456,7 +456,7 @@ def _of_a_day(connection: sa.Connection, id: str) -> Iterator[str]:
 
 
 def _of_the_gyro_blocks(engine: sa.Engine) -> Iterator[str]:
-    """The faults of the gyro blocks, a sentence each.
+    """Faults of the gyro blocks, a sentence each.
 
     A block must be the one that was sent, and no two of a spacecraft and a run may share a time.
     """

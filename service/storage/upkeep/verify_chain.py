@@ -1,7 +1,7 @@
-"""Checks the chain of the record: heads, leaves and facts against what is in the tables.
+"""Check of the record's chain: heads, leaves and facts against the rows of the tables.
 
-It needs no secret: signatures are checked with a public key, and heads that were noted outside
-of the database show a record that was rolled back, cut or made anew.
+It needs no secret: signatures are checked with a public key, and heads noted outside of the
+database reveal a record that was rolled back, cut or made anew.
 """
 
 import json
@@ -26,7 +26,7 @@ from service.storage.sql.tables import results
 
 AT_ONCE = 500
 MOST_NAMED = 20
-"""The most places of results that are named one by one."""
+"""Largest number of faulty results that are named one by one."""
 _ANCHOR = re.compile(r"\b(\d+) ([0-9a-f]{64})\b")
 
 UNBOUND = {
@@ -49,23 +49,23 @@ UNBOUND = {
     "tracker_splits": "how far an upgrade is",
     "tracker_values": "verified against the stars, and by a digest",
 }
-"""The tables that the chain does not bind, and why; those of features say so themselves."""
+"""Tables outside the chain, with the reason; those of features declare it themselves."""
 BY_LEAVES = frozenset({"batches", "results", "star_results", "solutions", "frames"})
-"""The tables whose rows are in leaves of results."""
+"""Tables whose rows are covered by the leaves of results."""
 OF_OTHERS = frozenset({"graded_blocks"})
-"""The tables whose rows are bound by a digest of the row that they belong to."""
+"""Tables whose rows are covered by a digest in the row that they belong to."""
 
 
 @dataclass(frozen=True)
 class Anchor:
-    """A head that was noted outside of the database."""
+    """Head of the record that was noted outside of the database."""
 
     number: int
     sha256: str
 
 
 def anchors_in(text: str) -> list[Anchor]:
-    """The heads in a text, such as a log: a number and 64 hexadecimal digits each.
+    """Find heads in a text, such as a log: a number and 64 hexadecimal digits each.
 
     Raises `BadConfiguration` for a text without any.
     """
@@ -78,7 +78,7 @@ def anchors_in(text: str) -> list[Anchor]:
 def faults_of_the_chain(
     engine: sa.Engine, public_key: PublicKey | None = None, anchors: Sequence[Anchor] = ()
 ) -> Iterator[str]:
-    """The faults of the chain, a sentence each; reads as of one moment."""
+    """Check the chain of the record as of one moment; yields a sentence for each fault."""
     with engine.begin() as connection:
         stored = rows_of(connection, sa.select(record_heads).order_by(record_heads.c.number))
         yield from _of_the_heads(stored, public_key)
@@ -92,7 +92,7 @@ def faults_of_the_chain(
 
 
 def _statements(stored: Sequence[Row]) -> list[Statement]:
-    """The statements that can be read; what cannot is a fault of `_of_the_heads`."""
+    """Decode the statements of heads; unreadable ones are reported by `_of_the_heads`."""
     found = []
     for row in stored:
         try:
@@ -159,7 +159,7 @@ def _of_the_roots(connection: sa.Connection, statements: Sequence[Statement]) ->
 def bound_by(
     connection: sa.Connection, before: Statement, head: Statement
 ) -> tuple[list[tuple[int, bytes]], list[Row]]:
-    """The leaves and facts of a head."""
+    """Leaves and facts that a head covers."""
     place = record_leaves.c.seq
     query = sa.select(place, record_leaves.c.leaf)
     later = query.where(place > before.last, place <= head.last).order_by(place)
@@ -170,7 +170,7 @@ def bound_by(
 
 
 def _of_the_results(connection: sa.Connection, last: Statement) -> Iterator[str]:
-    """Results that are not what their leaves say, that are gone, or that have none."""
+    """Faults of results: changed since their leaf was made, deleted, or without a leaf."""
     removed = _removed(connection)
     place = record_leaves.c.seq
     joined = sa.outerjoin(record_leaves, results, results.c.seq == place)
@@ -202,7 +202,7 @@ def _of_a_result(row: Row, content: bytes, last: Statement) -> Iterator[str]:
 
 
 def _leaves_of(row: Row, content: bytes) -> tuple[bytes, bytes]:
-    """The leaf of a result that was not adopted when it was recorded, and of one that was."""
+    """Both possible leaves of a result: not current when recorded, and current."""
     later, at_once = (
         chain.leaf_of(row["id"], row["answer"], content, mark) for mark in (False, True)
     )
@@ -210,7 +210,7 @@ def _leaves_of(row: Row, content: bytes) -> tuple[bytes, bytes]:
 
 
 def _of_the_current(connection: sa.Connection) -> Iterator[str]:
-    """Batches whose current result is not the latest that was adopted."""
+    """Faults of batches whose current result is not the latest adopted one."""
     what_ifs = sa.select(results.c.batch_id).where(results.c.parent_id.is_not(None)).distinct()
     chosen = sa.select(results, record_leaves.c.leaf).join_from(
         results, record_leaves, results.c.seq == record_leaves.c.seq
@@ -241,13 +241,13 @@ def _removed(connection: sa.Connection) -> list[tuple[int, int]]:
 
 
 def _is_in(place: int, ranges: Sequence[tuple[int, int]]) -> bool:
-    """True if one of these ranges, which are in order and apart, has the place."""
+    """True if a place lies in one of the ranges, which are sorted and disjoint."""
     at = bisect_right(ranges, (place, sys.maxsize)) - 1
     return at >= 0 and place <= ranges[at][1]
 
 
 def _of_the_facts(connection: sa.Connection) -> Iterator[str]:
-    """Rows of other tables that are not what the latest fact of each says."""
+    """Faults of rows in other tables that differ from the latest fact about them."""
     latest: dict[str, dict[str, str]] = {}
     c = record_facts.c
     for kind, key, sha256 in connection.execute(sa.select(c.kind, c.key, c.sha256).order_by(c.id)):
