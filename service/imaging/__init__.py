@@ -1,1 +1,1 @@
-"""How light becomes a star: images of a point source, and where on the sensor the star stands."""
+"""Image processing for star cameras: images of point sources, centroids, frames."""

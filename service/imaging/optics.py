@@ -1,9 +1,9 @@
-"""The transfer functional (report, part II): from an aperture and a spectrum to a star's image.
+"""Images of stars by Fourier optics: from an aperture and a spectrum to a point source's image.
 
-The image of a point of light is the transform of the aperture's autocorrelation in
-space, taken with the light's autocorrelation in time (2.23).  Its forms below give the
-same numbers; directions p = u / f and q = v / f are in radians, so that one answer
-serves any focal length f, which is taken to be the same for all colours.
+This is the transfer functional of the report (part II): the Fourier transform of the aperture's
+autocorrelation in space, combined with the light's autocorrelation in time (2.23). The functions
+below give the same numbers in several ways; directions p = u / f and q = v / f are in radians, so
+that one result serves any focal length f, assumed the same for all colours.
 
 The report's 2.9 has no 1/(lambda f).  Without it the image of each colour holds
 (lambda f)² times the open area, and red is weighted too high.  Here an image is
@@ -23,9 +23,10 @@ from service.imaging.centroids.window import Array
 
 @dataclass(frozen=True)
 class PointImage:
-    """The image of a star: `intensity` (rows along q, columns along p), odd, the star amid it.
+    """The image of a point source by direction: `intensity` (rows along q, columns along p) of odd
+    size, centred.
 
-    The sum of intensity times `step_rad`² is the light held, in m² of open aperture.
+    The sum of intensity times `step_rad`² is the light in the image, in m² of open aperture.
     """
 
     intensity: Array
@@ -33,55 +34,57 @@ class PointImage:
 
     @property
     def held_m2(self) -> float:
-        """The light within the image."""
+        """The total light within the image of a point source, in m² of open aperture."""
         return float(self.intensity.sum()) * self.step_rad**2
 
     @property
     def angles_rad(self) -> Array:
-        """P of the columns, and q of the rows."""
+        """The directions p of an image's columns, equal to q of its rows, in radians."""
         reach = self.intensity.shape[0] // 2
         return np.arange(-reach, reach + 1) * self.step_rad
 
 
-# What stands in the aperture: open discs, wires, glass of any thickness.
-#
-# An aperture is a square grid of complex transmissions P = p e^(j alpha) (report, 2.5),
-# centred between the middle cells; edges are weighted by the area they cover.
+# Apertures: open discs, wires, glass of any thickness. An aperture is a square grid of complex
+# transmissions P = p e^(j alpha) (report, 2.5), centred between the middle cells; edges are
+# weighted by the area they cover.
 
 PupilField = npt.NDArray[np.complex128] | npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Pupil:
-    """Transmission (n, n), rows along y, columns along x; `cell_m` is a cell's side."""
+    """An aperture: complex transmission (n, n), rows along y, columns along x; cell size in m."""
 
     transmission: PupilField
     cell_m: float
 
     @property
     def open_area_m2(self) -> float:
-        """The part of a uniform light that it lets through: the integral of |P|²."""
+        """The integral of |P|² over an aperture: the area in m² that transmits as much light."""
         return float(np.sum(np.abs(self.transmission) ** 2)) * self.cell_m**2
 
     @property
     def places_m(self) -> Array:
-        """Middles of the cells along either axis, symmetric about zero."""
+        """Middles of the aperture's cells along either axis, symmetric about zero, in metres."""
         return centres(self.transmission.shape[0], self.cell_m)
 
     def behind(self, transmission: PupilField) -> "Pupil":
-        """The pupil with a further transparency before or after it."""
+        """An aperture combined with a second transmission mask."""
         return Pupil(self.transmission * transmission, self.cell_m)
 
     def with_plate(self, thickness_m: Array, index: float, wavelength_m: float) -> "Pupil":
-        """The pupil with a glass of this thickness: alpha = 2 pi (n1 - 1) gamma / lambda (2.5).
+        """An aperture behind a glass plate of varying thickness: alpha = 2 pi (n1 - 1) gamma /
+        lambda (2.5).
 
-        The phase, and where the glass disperses the index, belong to one wavelength.
+        The phase, and the index where the glass is dispersive, hold for one wavelength.
         """
         alpha = 2.0 * math.pi * (index - 1.0) * thickness_m / wavelength_m
         return self.behind(np.exp(1j * alpha))
 
     def is_even(self) -> bool:
-        """True if f(x, y) = f(-x, y) = f(x, -y), which makes the image even (7.10 to 7.16)."""
+        """True if f(x, y) = f(-x, y) = f(x, -y) for an aperture, so that its image is even (7.10 to
+        7.16).
+        """
         f = self.transmission
         tight = 1e-12 * float(np.abs(f).max())
         return bool(np.allclose(f, f[::-1], 0, tight) and np.allclose(f, f[:, ::-1], 0, tight))
@@ -93,7 +96,7 @@ def centres(number: int, cell_m: float) -> Array:
 
 
 def disc(number: int, cell_m: float, radius_m: float, obscuration: float = 0.0) -> Pupil:
-    """An open circle on a grid of number x number cells; a central part of it may be dark.
+    """A circular aperture on a grid of number x number cells, with an optional central obscuration.
 
     Raises `BadInput` where the circle is larger than the grid.
     """
@@ -108,7 +111,7 @@ def disc(number: int, cell_m: float, radius_m: float, obscuration: float = 0.0) 
 
 
 def between_wires(places_m: Array, cell_m: float, wires: Sequence[tuple[float, float]]) -> Array:
-    """The open share of every cell in a row, behind parallel wires (middle, diameter) in metres."""
+    """Uncovered share of every cell in a row behind parallel wires (middle, diameter) in metres."""
     covered = np.zeros_like(places_m)
     for middle, diameter in wires:
         low = np.maximum(places_m - cell_m / 2.0, middle - diameter / 2.0)
@@ -118,10 +121,10 @@ def between_wires(places_m: Array, cell_m: float, wires: Sequence[tuple[float, f
 
 
 def behind_wires(pupil: Pupil, wires: Sequence[tuple[float, float, float]]) -> Pupil:
-    """The pupil behind straight wires in any directions.
+    """An aperture behind straight wires in any directions.
 
-    Each is (direction that it runs in, rad from x towards y; how far its middle is from that of
-    the pupil, along the direction turned by a right angle, m; diameter, m).
+    Each wire is (direction along the wire, rad from x towards y; distance from the aperture's
+    middle along the direction turned by a right angle, m; diameter, m).
     """
     x, y = pupil.places_m[None, :], pupil.places_m[:, None]
     found = pupil
@@ -134,21 +137,21 @@ def behind_wires(pupil: Pupil, wires: Sequence[tuple[float, float, float]]) -> P
 
 
 def image_by_fft(pupil: Pupil, wavelength_m: float) -> PointImage:
-    """One colour's image over all directions that the grid of the pupil resolves.
+    """The monochromatic image of an aperture over all directions that its grid resolves.
 
-    The step is lambda over the width of the grid, which should be at least twice the
-    pupil: half the step that an image of that pupil needs.
+    The step is lambda over the width of the grid. The grid should be at least twice as wide as the
+    open aperture, which halves the step that sampling requires.
     """
     n = pupil.transmission.shape[0]
     field = np.fft.fftshift(np.fft.fft2(pupil.transmission))
     intensity = np.abs(field) ** 2 * (pupil.cell_m**2 / wavelength_m) ** 2
-    # An odd number of directions, so that the star is on one of them.
+    # An odd number of directions, so that one of them is the star's.
     first = 0 if n % 2 else 1
     return PointImage(intensity[first:, first:], wavelength_m / (n * pupil.cell_m))
 
 
 def image_at(pupil: Pupil, wavelength_m: float, p_rad: Array, q_rad: Array) -> Array:
-    """One colour's intensity (len(q), len(p)) in any directions, by the transform itself."""
+    """Monochromatic intensity (len(q), len(p)) of an aperture's image, by direct transform."""
     place = pupil.places_m
     turn = -2j * math.pi / wavelength_m
     along_p = np.exp(turn * np.outer(place, p_rad))
@@ -157,18 +160,17 @@ def image_at(pupil: Pupil, wavelength_m: float, p_rad: Array, q_rad: Array) -> A
     return np.asarray(np.abs(field) ** 2 * (pupil.cell_m**2 / wavelength_m) ** 2)
 
 
-# The colours of a star's light, and what they make of its correlation in time.
-#
-# Frequencies are angular, rad/s; wavelengths metres; delays seconds.
+# The colours of a star's light, and the resulting correlation in time. Frequencies are angular,
+# rad/s; wavelengths in metres; delays in seconds.
 
 LIGHT_SPEED_M_PER_S = 299_792_458.0
 PLANCK_OVER_BOLTZMANN_K_S = 7.638_232_577e-12
-"""h-bar / k, for a thermal spectrum by angular frequency."""
+"""Planck's reduced constant over Boltzmann's, h-bar / k in K s."""
 
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Power at some frequencies: a one-sided spectral density times the width that each stands for.
+    """A spectrum as discrete powers: spectral density (one-sided) times the width of each bin.
 
     `omega_rad_per_s` rises; `power` is not negative.  One frequency is monochromatic light.
     """
@@ -188,16 +190,18 @@ class Spectrum:
 
     @property
     def wavelength_m(self) -> Array:
-        """Wavelength of each colour."""
+        """The wavelengths of a spectrum's frequencies, in metres."""
         return np.asarray(2.0 * math.pi * LIGHT_SPEED_M_PER_S / self.omega_rad_per_s)
 
     @property
     def mean_wavelength_m(self) -> float:
-        """The mean wavelength, weighted by power."""
+        """The mean wavelength of a spectrum, weighted by power, in metres."""
         return float(self.wavelength_m @ self.power / self.power.sum())
 
     def correlation(self, delay_s: npt.ArrayLike) -> npt.NDArray[np.complex128]:
-        """e_hh(tau) = (1/2 pi) integral of S e^(j omega tau) d omega (2.22), complex."""
+        """The complex autocorrelation of light in time, e_hh(tau) = (1/2 pi) integral of S e^(j
+        omega tau) d omega (2.22).
+        """
         delay = np.asarray(delay_s, dtype=np.float64)
         total = np.zeros(delay.shape, dtype=np.complex128)
         for omega, power in zip(self.omega_rad_per_s, self.power, strict=True):
@@ -206,7 +210,7 @@ class Spectrum:
 
 
 def monochromatic(wavelength_m: float) -> Spectrum:
-    """Light of one colour."""
+    """The spectrum of light of one wavelength."""
     omega = 2.0 * math.pi * LIGHT_SPEED_M_PER_S / wavelength_m
     return Spectrum(np.array([omega]), np.array([1.0]))
 
@@ -214,9 +218,10 @@ def monochromatic(wavelength_m: float) -> Spectrum:
 def gaussian_line(
     wavelength_m: float, relative_width: float, colours: int = 201, reach: float = 6.0
 ) -> Spectrum:
-    """exp(-(omega - omega0)² / 2 sigma²) with sigma = relative_width omega0 (report, 2.5).
+    """The spectrum of a Gaussian line, exp(-(omega - omega0)² / 2 sigma²) with sigma =
+    relative_width omega0 (report, 2.5).
 
-    Taken at `colours` places out to `reach` sigma, as far as frequencies are above zero.
+    Sampled at `colours` frequencies out to `reach` sigma, as far as they are positive.
     """
     omega0 = 2.0 * math.pi * LIGHT_SPEED_M_PER_S / wavelength_m
     sigma = relative_width * omega0
@@ -229,7 +234,7 @@ def gaussian_line(
 def thermal(
     temperature_k: float, shortest_m: float, longest_m: float, colours: int = 41
 ) -> Spectrum:
-    """A black body through a band with sharp ends."""
+    """The spectrum of a black body within a sharply limited band."""
     ends = 2.0 * math.pi * LIGHT_SPEED_M_PER_S / np.array([longest_m, shortest_m])
     width = (ends[1] - ends[0]) / colours
     omega = ends[0] + width * (np.arange(colours) + 0.5)
@@ -245,10 +250,10 @@ def image_of(
     reach: int,
     photons: bool = False,
 ) -> PointImage:
-    """The image in all colours of a spectrum, 2 reach + 1 directions each way.
+    """The image of an aperture in all colours of a spectrum, 2 reach + 1 directions each way.
 
-    A transparency whose phase depends on the colour is given as a function of the
-    wavelength.  `photons` weighs by number, as a detector counts, instead of by energy.
+    An aperture whose phase depends on the colour is passed as a function of the wavelength.
+    `photons` weights by photon number, as a detector counts, instead of by energy.
     """
     angle = np.arange(-reach, reach + 1, dtype=np.float64) * step_rad
     total = np.zeros((2 * reach + 1, 2 * reach + 1))
@@ -260,7 +265,7 @@ def image_of(
 
 
 def autocorrelation(pupil: Pupil) -> Array | npt.NDArray[np.complex128]:
-    """phi(D1, D2) (2.13) at whole cells, (2n - 1, 2n - 1), no displacement in its middle."""
+    """The autocorrelation phi(D1, D2) of an aperture (2.13) at whole cells; (2n - 1, 2n - 1)."""
     n = pupil.transmission.shape[0]
     field = np.fft.fft2(pupil.transmission, (2 * n - 1, 2 * n - 1))
     phi = np.fft.fftshift(np.fft.ifft2(np.abs(field) ** 2)) * pupil.cell_m**2
@@ -274,10 +279,11 @@ def image_by_functional(
     p_rad: Array,
     q_rad: Array,
 ) -> Array:
-    """2.23 itself: 2 pi times the sum of phi e_hh(-(u D1 + v D2) / (c f)), at pairs (p, q).
+    """The image of an aperture by the report's functional 2.23: 2 pi times the sum of phi e_hh(-(u
+    D1 + v D2) / (c f)), at pairs (p, q).
 
-    `phi` (odd, odd) at steps of `cell_m`.  Of the plain spectrum this is the report's
-    form; with S / lambda² in its place it is right in colour, up to a constant.
+    `phi` (odd, odd) at steps of `cell_m`. With the plain spectrum this is the report's form; with S
+    / lambda² instead, the weights of the colours are correct up to a constant.
     """
     reach = phi.shape[0] // 2
     place = np.arange(-reach, reach + 1) * cell_m

@@ -1,4 +1,4 @@
-"""Pictures with what was made of them: stars, names, residual arrows; and residuals alone."""
+"""Drawings of results on frames: stars with names and residual arrows; and maps of residuals."""
 
 import io
 import math
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 LEAST_SIDE_PX = 768
 ARROW_PX = 28.0
-"""The length of the median residual's arrow; all are drawn longer by the same factor."""
+"""Length in pixels of the arrow of the median residual; all arrows have the same scale factor."""
 MOST_ENLARGED = 5000.0
 RADIUS_PX, SMALL_RADIUS_PX = 9, 5
 LINE_PX = 18
@@ -42,11 +42,11 @@ _WORDS = {"left_out": "not in the batch", "sharp": "hot pixel or cosmic ray"}
 
 @dataclass(frozen=True)
 class Mark:
-    """A place on a frame, in its pixels.
+    """A marked place on a frame, in pixels: a star with its outcome, or a hot pixel or cosmic ray.
 
-    `kind` is the star's outcome, `left_out` for one that is in no batch, or `sharp` for
-    a hot pixel or cosmic ray.  `predicted_px` is where the catalog and the attitude have
-    the star, None where either is missing.
+    `kind` is the star's outcome, `left_out` for a star in no batch, or `sharp` for a hot pixel or
+    cosmic ray. `predicted_px` is the star's place by catalog and attitude, None if either is
+    missing.
     """
 
     u_px: float
@@ -64,7 +64,7 @@ def marks_of(
     detections: Mapping[str, Any],
     run_catalog: RunCatalog | None,
 ) -> list[Mark]:
-    """The marks of a recorded `Answer`; without a run catalog no star has a predicted place."""
+    """The marks for a recorded `Answer`: stars, names, and predicted places if available."""
     found = [star for star in detections["stars"] if star["u_px"] is not None]
     used = [star for star in found if star["used"]]
     answered = next(each.stars for each in answer.observations if each.tracker == tracker.name)
@@ -93,7 +93,7 @@ def _predicted(
     run_catalog: RunCatalog | None,
 ) -> list[tuple[float, float] | None]:
     attitude = answer.attitude
-    # Without a calibration the lens that was fitted to the frame is not known any more.
+    # Without a calibration the lens model fitted to the frame is not recorded.
     if attitude is None or run_catalog is None or not camera.calibrated:
         return [None] * len(names)
     wanted = set(names)
@@ -112,7 +112,7 @@ def _predicted(
 
 
 def draw_overlay(preview: bytes, step: int, marks: Sequence[Mark], title: str) -> bytes:
-    """A PNG: the preview, of which one pixel is `step` of the frame's, under its marks."""
+    """A PNG of a frame's preview with marks; one of its pixels is `step` pixels of the frame."""
     from PIL import Image, ImageDraw, ImageFont
 
     with Image.open(io.BytesIO(preview), formats=("PNG",)) as stored:
@@ -125,7 +125,7 @@ def draw_overlay(preview: bytes, step: int, marks: Sequence[Mark], title: str) -
     font = ImageFont.load_default(12)
     scale = enlarged / step
     factor = _arrow_factor(marks)
-    # The stars of the batch last, so that nothing hides them.
+    # Stars of the batch are drawn last, so that nothing hides them.
     for mark in sorted(marks, key=lambda each: each.kind not in _WORDS):
         _draw_mark(draw, mark, scale, factor, font, canvas.width)
     _draw_foot(draw, marks, title, factor, font, picture.height)
@@ -172,7 +172,7 @@ def _draw_arrow(draw: "ImageDraw", x: float, y: float, along_x: float, along_y: 
 
 
 def _arrow_factor(marks: Sequence[Mark]) -> float:
-    """How much longer than true the arrows are: one digit, so that it can be said."""
+    """The enlargement of residual arrows, rounded to one digit so that it can be stated."""
     lengths = [
         math.hypot(mark.predicted_px[0] - mark.u_px, mark.predicted_px[1] - mark.v_px)
         for mark in marks
@@ -201,7 +201,7 @@ def _draw_foot(
 
 SIDE_PX, MAP_FOOT_PX = 900, 24
 MAP_ARROW_PX = 22.0
-"""The length of the arrow of the reference residual."""
+"""Length in pixels of the arrow of the reference residual on a residual map."""
 _GROUND, _STAR, _MAP_ARROW, _MAP_TEXT = (
     (12, 14, 20),
     (90, 120, 150),
@@ -217,7 +217,7 @@ def draw_residuals(
     arrow_of_px: float,
     title: str,
 ) -> bytes:
-    """A PNG of residuals (n, 2) at places (n, 2) of a sensor; `arrow_of_px` has a usual arrow."""
+    """A PNG of residuals (n, 2) as arrows on a sensor; `arrow_of_px` is the reference residual."""
     from PIL import Image, ImageDraw, ImageFont
 
     scale = SIDE_PX / max(size_px)

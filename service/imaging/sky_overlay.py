@@ -1,4 +1,4 @@
-"""A picture with its sky drawn over it: stars with names, a grid, a scale, every candidate."""
+"""A picture with the sky drawn over it: named stars, a coordinate grid, a scale, candidates."""
 
 import io
 import math
@@ -16,7 +16,7 @@ MOST_SIDE_PX, LEAST_SIDE_PX = 1600, 800
 BLACK_SIGMAS, BEND_SIGMAS, WHITE_SIGMAS = -0.5, 3.0, 300.0
 STEPS_DEG = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 15.0, 30.0)
 GRID_LINES = 4.0
-"""About so many cross the shorter side."""
+"""Approximate number of grid lines across the shorter side."""
 MOST_LABELS = 60
 _GRID, _STAR, _CANDIDATE, _TEXT = (60, 90, 130), (90, 220, 120), (150, 120, 70), (230, 230, 230)
 Box = tuple[float, float, float, float]
@@ -26,7 +26,7 @@ Places = Callable[[Vector], tuple[Vector, Vector]]
 
 @dataclass(frozen=True)
 class DrawnStar:
-    """A star where it is seen, with its label."""
+    """An identified star to draw at its measured place, with its label."""
 
     u_px: float
     v_px: float
@@ -35,7 +35,7 @@ class DrawnStar:
 
 @dataclass(frozen=True)
 class SkyView:
-    """How the sky lies on a picture: the lens's places and the attitude (3, 3) that they take."""
+    """The mapping of the sky to a picture: projection, attitude (3, 3), boresight and field."""
 
     places: Places
     attitude: Matrix
@@ -52,11 +52,12 @@ def draw_sky(
     view: SkyView | None,
     title: str,
 ) -> bytes:
-    """A PNG of the light above the background, stretched by asinh, under its marks.
+    """A PNG of a picture's light above the background, with asinh stretch, stars, candidates and
+    grid.
 
-    `light` has one of its pixels for `binning` of the picture's a side; without a view
-    only the candidates are drawn.  Labels that would cover one another are left out, those
-    of the brightest stars, which come first, last.
+    `light` is binned by `binning` pixels of the picture a side; without a view only the candidates
+    are drawn. Overlapping labels are left out, with priority for the brightest stars, which come
+    first.
     """
     from PIL import Image, ImageDraw, ImageFont
 
@@ -91,30 +92,30 @@ def _greys(sigmas: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
 
 
 class _Pen:
-    """Draws in pixels of the picture, and keeps labels off each other."""
+    """A drawing surface in pixels of the picture that keeps labels from overlapping."""
 
     def __init__(self, draw: Any, font: Any, scale: float, size: tuple[int, int]) -> None:
         self.draw, self.font, self.scale, self.size = draw, font, scale, size
         self.taken: list[Box] = []
 
     def at(self, u_px: float, v_px: float) -> tuple[float, float]:
-        """The point where a place of the picture is drawn."""
+        """The point (x, y) on the drawing of a place in pixels of the picture."""
         return (u_px + 0.5) * self.scale, (v_px + 0.5) * self.scale
 
     def circle(self, u_px: float, v_px: float, radius: float, color: Any) -> None:
-        """A circle of a radius on the drawing."""
+        """Draw a circle about a place of the picture, with a radius on the drawing."""
         x, y = self.at(u_px, v_px)
         self.draw.ellipse((x - radius, y - radius, x + radius, y + radius), outline=color)
 
     def text(self, x: float, y: float, text: str, color: Any) -> None:
-        """Text on a dark ground, wherever it is."""
+        """Draw text on a dark background at a fixed point of the drawing."""
         box = self.draw.textbbox((x, y), text, font=self.font)
         self.taken.append(box)
         self.draw.rectangle(box, fill=(0, 0, 0))
         self.draw.text((x, y), text, fill=color, font=self.font)
 
     def label(self, u_px: float, v_px: float, text: str, off: float, color: Any) -> bool:
-        """Text beside a place, on the first side where nothing is; whether there was one."""
+        """Draw text beside a place on the first free side; returns true if one was free."""
         x, y = self.at(u_px, v_px)
         left, top, right, bottom = self.draw.textbbox((0, 0), text, font=self.font)
         width, height = right - left, bottom - top
@@ -140,7 +141,7 @@ class _Pen:
 
 
 def _draw_grid(pen: _Pen, view: SkyView) -> None:
-    """Circles of right ascension and declination with their values where they leave."""
+    """Draw circles of right ascension and declination, labelled where they leave the picture."""
     short = min(view.field_deg)
     step = _step_of(short / GRID_LINES)
     ra, dec = view.boresight_deg
@@ -174,14 +175,14 @@ def _draw_line(pen: _Pen, view: SkyView, line: Vector, text: str) -> None:
     points = [(float(a), float(b)) for a, b in zip(x[near & seen], y[near & seen], strict=True)]
     if len(points) > 1:
         pen.draw.line(points, fill=_GRID)
-        # Where the line comes in, well inside.
+        # The label stands where the line enters the picture, well inside.
         k = int(np.flatnonzero(inside)[min(3, int(inside.sum()) - 1)]) if inside.any() else -1
         if k >= 0:
             pen.label(float(u[k]), float(v[k]), text, 2.0, _GRID)
 
 
 def _draw_scale(pen: _Pen, view: SkyView) -> None:
-    """A bar of a round angle at the lower left."""
+    """Draw a scale bar of a round angle at the lower left."""
     width_deg = view.field_deg[0]
     angle = max((each for each in STEPS_DEG if each <= width_deg / 4.0), default=STEPS_DEG[0])
     length = (

@@ -1,6 +1,6 @@
-"""From a frame and what is known of it to the batch that the pipeline processes.
+"""Conversion of a frame and its metadata to an observation batch for the pipeline.
 
-The batch holds all that the answer follows from, so that a what-if needs no frame.
+The batch holds all inputs of the answer, so that it can be solved again without the frame.
 """
 
 import hashlib
@@ -36,14 +36,17 @@ if TYPE_CHECKING:
 
 LEAST_SIGMA_ARCSEC = 1e-3
 RANKS, LEAST_RANKS = (3, 21), 4
-"""The candidates by brightness whose magnitudes are held against the sky's, and how few may be."""
+"""Range of brightness ranks compared with the average sky, and the least number compared."""
 MOST_OFF_MAG = 3.0
-"""Fields differ from the average by a factor of five in number: 1.5 mag, and cameras in colour."""
+"""Largest plausible difference of magnitudes from the average sky: star fields differ by a factor
+of five in number, 1.5 mag, and cameras in colour.
+"""
 BLENDED_SHARE = 0.15
-"""The share of the image's sigma by which an unseen companion may move a blended star.
+"""Share of the image's sigma by which an undetected companion may shift a blended star.
 
-One with the share r of the light moves it by 0.86 r sigma at most, where it stands
-1.4 sigma away; nearer ones are merged in run catalogs too."""
+A companion with the share r of the light shifts the star by 0.86 r sigma at most, at a distance of
+1.4 sigma; closer ones are merged in run catalogs too.
+"""
 MAX_SHARP_KEPT = 500
 
 
@@ -63,11 +66,11 @@ class FrameIn(schema.Wire):
     exposure_s: Annotated[schema.Number, Field(gt=0, le=3600)] | None = None
     centroid: CentroidMethod | None = None
     image: Annotated[str, Field(min_length=1, max_length=80)] | None = None
-    """Which image of a file with several; see `FrameLimits`."""
+    """The chosen image in a file with several; see `FrameLimits`."""
     options: schema.OptionsIn = schema.OptionsIn()
 
     def batch_of(self, digest: str) -> str:
-        """The batch id: the one given, else a name made from the digest and the image chosen."""
+        """The batch id of a frame: as given, or made from the digest and the chosen image."""
         if self.batch is not None:
             return self.batch
         name = digest.removeprefix("sha256:")
@@ -76,24 +79,24 @@ class FrameIn(schema.Wire):
         return f"frame-{name[:16]}"
 
     def fingerprint(self, spacecraft: str, digest: str) -> str:
-        """The digest of the frame and of all that is told of it."""
+        """A digest of the frame and all of its metadata."""
         text = f"{spacecraft}\n{digest}\n{self.model_dump_json(exclude_defaults=True)}"
         return hashlib.sha256(text.encode()).hexdigest()
 
 
 def read_known(values: dict[str, Any]) -> FrameIn:
-    """What is told of a frame, checked; raises `BadBatch` with every fault."""
-    # Through JSON: a list there is a tuple here.
+    """The validated metadata of a frame; raises `BadBatch` with every fault."""
+    # Through JSON, since a list in JSON is a tuple in the model.
     return checked_by(FrameIn.model_validate_json, json.dumps(values))
 
 
 def submission_of_frame(
     file: IO[bytes], digest: str, known: FrameIn, mission: Mission, max_pixels: int
 ) -> schema.Submission:
-    """The batch of the stars on a frame, with the record of how they were found.
+    """An observation batch of the stars on a frame, with a record of their detection.
 
-    Raises `BadFile` for a file that is no frame of the tracker's and for a frame
-    without a star, `BadInput` for what does not fit the mission.
+    Raises `BadFile` for a file that is no frame of the tracker and for a frame without a star,
+    `BadInput` for metadata that do not fit the mission.
     """
     clock = [clock_ns()]
     tracker, camera = mission.camera_tracker(known.tracker, "tracker")
@@ -106,7 +109,7 @@ def submission_of_frame(
         frame = replace(frame, exposure_s=known.exposure_s)
         stated = f"{known.exposure_s:.6g} s, as given"
     clock.append(clock_ns())
-    # What these import takes a third of the service's start, which no frame may follow.
+    # Importing these modules takes a third of the service's start, and some services get no frame.
     from service.imaging.detection.detect import detect
     from service.imaging.detection.measure import measure
     from service.imaging.detection.star_images import psf_of
@@ -150,10 +153,10 @@ def submission_of_frame(
 
 
 def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
-    """The time of a frame, and what is to be said of it.
+    """The time of a frame, and remarks on it.
 
-    Without a time, aberration cannot be corrected: where it is ignored anyway, the time of
-    arrival stands in the records.  Raises `BadBatch` where it is not.
+    Without a time, aberration cannot be corrected. If aberration is ignored anyway, the time of
+    arrival is recorded; otherwise raises `BadBatch`.
     """
     time = known.time or frame.time
     if time is not None:
@@ -169,7 +172,7 @@ def time_of(known: FrameIn, frame: Frame) -> tuple[str, list[str]]:
 
 
 def choices_of(frame: Frame) -> list[str]:
-    """The options chosen for a file, and how its pixels were turned, where they were."""
+    """Remarks on the options chosen for a file, and on how its pixels were turned."""
     turned = [f"orientation: {frame.orientation}"] if frame.is_turned else []
     return [*turned, *frame.remarks]
 
@@ -184,10 +187,10 @@ def exposure_stated(frame: Frame) -> str:
 def doubt_of_exposure(
     found: "Detections", camera: Camera, exposure_s: float | None, stated: str
 ) -> list[str]:
-    """A remark on an exposure with which the candidates have not the light of stars.
+    """A remark on a stated exposure at which the candidates' magnitudes are implausible for stars.
 
-    Their magnitudes, the brightest two left out, are held against those that as many stars of the
-    sky have on average in a field of this size.
+    The candidates' magnitudes, without the two brightest, are compared with the average magnitudes
+    of as many stars in a field of this size.
     """
     ranks = np.arange(RANKS[0], min(found.count, RANKS[1]))
     if camera.zero_point_mag is None or len(ranks) < LEAST_RANKS:
@@ -208,9 +211,9 @@ def doubt_of_exposure(
 
 
 def usual_magnitude(ranks: npt.NDArray[np.intp], field_deg2: float) -> npt.NDArray[np.floating]:
-    """The magnitude (n,) to which a field holds so many stars on average over the sky."""
+    """The average magnitude (n,) down to which a field holds a given number of stars."""
     magnitudes, counts = np.array(STARS_TO_MAG).T
-    # The logarithm of the number is nearly a straight line.
+    # The logarithm of the number of stars is nearly linear in magnitude.
     slope, level = np.polyfit(magnitudes, np.log10(counts), 1)
     return np.asarray((np.log10(ranks * 41253.0 / field_deg2) - level) / slope)
 
@@ -223,7 +226,7 @@ def batch_of_stars(
     tracker: Tracker,
     stars: list[dict[str, Any]],
 ) -> schema.BatchIn:
-    """The batch of a tracker's stars, with what is told of their frame."""
+    """The observation batch of a tracker's stars, with the metadata of their frame."""
     fields = json.loads(known.model_dump_json(exclude_defaults=True))
     for name in ("tracker", "exposure_s", "centroid", "image"):
         fields.pop(name, None)
@@ -239,7 +242,7 @@ def batch_of_stars(
 
 
 def _observed(stars: "list[MeasuredStar]", camera: Camera) -> list[dict[str, Any]]:
-    """The stars as a batch has them: direction, sigma and magnitude."""
+    """The measured stars as fields of a batch: direction, sigma and magnitude."""
     u, v = (np.array([getattr(star.record, name) for star in stars]) for name in ("u_px", "v_px"))
     sigma_u, sigma_v = (
         np.array([_sigma_px(star, name, camera) for star in stars])
@@ -260,7 +263,9 @@ def _observed(stars: "list[MeasuredStar]", camera: Camera) -> list[dict[str, Any
 
 
 def _sigma_px(star: "MeasuredStar", name: str, camera: Camera) -> float:
-    """The predicted error, what the calibration leaves, and for a blend what it may hide."""
+    """A star's position error in pixels: centroid error, calibration residual, and for a blend the
+    shift by a hidden companion.
+    """
     hidden = BLENDED_SHARE * camera.psf_sigma_px if Flag.BLENDED in star.record.flags else 0.0
     return math.hypot(getattr(star.record, name), camera.sigma_floor_px, hidden)
 
@@ -296,7 +301,7 @@ def _record(
 
 
 def _star_fields(star: "MeasuredStar") -> dict[str, Any]:
-    """A measured candidate, ready for JSON."""
+    """The fields of a measured candidate, rounded for JSON."""
     record = star.record
     return {
         "u_px": _rounded(record.u_px, 4),
@@ -324,18 +329,19 @@ MAX_SIDE_PX = 1024
 BLACK_SIGMAS = 2.0
 WHITE_SIGMAS = 400.0
 GREYS = 48
-"""Few greys, and black where there is only noise, make a small file."""
+"""Number of grey levels in a preview: few, with black for noise, make a small file."""
 
 
 def preview_of(found: "Detections") -> tuple[bytes, int]:
-    """A PNG of a frame, and how many of its pixels a side make one of the picture's."""
+    """A PNG preview of a frame, and the number of frame pixels per preview pixel along a side."""
     return preview_png(np.where(found.good, found.light, 0.0), found.noise_counts)
 
 
 def preview_png(light: CountArray, noise_counts: float) -> tuple[bytes, int]:
-    """A PNG of light (rows, columns) above its background, and how many pixels a side make one.
+    """A PNG preview of light (rows, columns) above its background, and the pixels per preview pixel
+    along a side.
 
-    The brightest of the pixels that become one counts, so that no star is lost.
+    Each preview pixel shows the brightest of its pixels, so that no star is lost.
     """
     from PIL import Image
 
@@ -350,7 +356,7 @@ def preview_png(light: CountArray, noise_counts: float) -> tuple[bytes, int]:
 
 
 def _greys(sigmas: npt.NDArray[np.floating]) -> npt.NDArray[np.uint8]:
-    """Light in sigmas of the noise as greys, by the inverse hyperbolic sine."""
+    """Grey levels of light in sigmas of the noise, by the inverse hyperbolic sine."""
     above = np.clip(sigmas - BLACK_SIGMAS, 0.0, WHITE_SIGMAS)
     share = np.arcsinh(above / 4.0) / np.arcsinh(WHITE_SIGMAS / 4.0)
     return np.asarray(np.round(share * GREYS) * (255.0 / GREYS), dtype=np.uint8)

@@ -7,7 +7,7 @@
 | `matched` | the best fit of the star's shape, by the noise of each pixel | III |
 | `recursive` | the same from one pixel after another, re-centred | VI |
 
-Two of them are sums: the cross-scan of the report (7.4, 7.5), and the same over a whole window.
+Two methods are sums: the cross-scan of the report (7.4, 7.5), and the sum over a whole window.
 
 A sum over a square is a scan whose samples are the sums of its columns, and then
 of its rows; both methods are one moment of two profiles.  The displacement comes
@@ -45,11 +45,13 @@ from service.observations.scans.lines import BREAKDOWN_RATIO, ProfileMoment, mom
 MOST_MOVES = 10
 MOST_SHARE = 0.9
 SLOPE_LEAST = 0.2
-"""Below this a moment hardly follows the star any more: the star is outside the hump."""
+"""Least slope of a moment against the star's place; below it the star is outside the image's
+core.
+"""
 
 
 def profiles(square: Array, method: str) -> tuple[Array, Array]:
-    """The samples along u and along v: the middle row and column, or sums over the square."""
+    """The samples of a square along u and along v: its middle row and column, or its sums."""
     if method == "scan":
         middle = square.shape[0] // 2
         return square[middle, :], square[:, middle]
@@ -64,16 +66,16 @@ def by_moments(
     half_width_px: int,
     recentre: bool,
 ) -> CentroidRecord:
-    """The centroid of a square or of its middle row and column; see `centroid`.
+    """The centroid of a star from first moments of a square or of its middle row and column.
 
-    Every pixel of the sum is needed: a full, masked or missing one refuses the star.
-    Near the edge the square shrinks, to stay symmetric about the star.
+    See `centroid` for the arguments. Every pixel of the sum is needed: a full, masked or missing
+    one refuses the star. Near the edge the square shrinks, to stay symmetric about the star.
     """
     column, row = start
     for iterations in range(1, MOST_MOVES + 1):
         region = symmetric_square_about(window, column, row, half_width_px)
         if region is None:
-            # Only the edge of the frame can be that close.
+            # Only a window cut by the edge of the frame leaves no room for a square.
             return refusal(method, "too close to the edge of the window", (Flag.EDGE,))
         flags = region.flags(half_width_px)
         along = _moments(region, method)
@@ -86,7 +88,7 @@ def by_moments(
         if not faintest.signal_ratio >= BREAKDOWN_RATIO:
             return too_faint(method, faintest.total, math.sqrt(faintest.total_variance), flags)
         moves = [round(each.displacement) for each in along]
-        # Less than a pixel may be noise; the square is as good a place as the next.
+        # A shift of less than a pixel may be noise; the present square serves as well as the next.
         if not recentre or all(abs(each.displacement) <= 1.0 for each in along):
             return _record(region, method, psf, along, flags, iterations)
         column, row = column + moves[0], row + moves[1]
@@ -95,7 +97,7 @@ def by_moments(
 
 def _moments(region: Region, method: str) -> tuple[ProfileMoment, ProfileMoment]:
     gain = region.window.detector.gain_e_per_count
-    # Photon noise by the counts themselves: summed linearly, that is unbiased.
+    # Photon noise from the counts themselves: a linear sum with this variance is unbiased.
     variance = region.floor_variance + region.light / gain
     lights, variances = profiles(region.light, method), profiles(variance, method)
     floors = profiles(region.floor_variance, method)
@@ -143,7 +145,8 @@ def _record(
         place, slopes, held = found
         bias = [d - p for d, p in zip(measured, place, strict=True)]
         sigmas = [sigma / slope for sigma, slope in zip(sigmas, slopes, strict=True)]
-        # At its best place: what a less precise one leaves would look like another star.
+        # The star is subtracted at its corrected place: at a less precise one the residual would
+        # look like another star.
         at = region.column + place[0], region.row + place[1]
         best = fit(region.window, psf, at, region.left)
         if best is not None and is_blended(best, psf):
@@ -166,9 +169,9 @@ def _record(
 
 
 def _share_beyond(profile: Array) -> float:
-    """2 V <Phi(V)> / E: how far a scan of this length falls short, by the light at its ends.
+    """Relative error of a scan of finite length, 2 V <Phi(V)> / E, from the light at its ends.
 
-    The samples stand for -V ... V with V half a step beyond the last of them.
+    The samples cover -V ... V, where V lies half a step beyond the last sample.
     """
     ends = 1.5 * float(profile[0] + profile[-1]) - 0.5 * float(profile[1] + profile[-2])
     return min(max(len(profile) * ends / 2.0 / float(profile.sum()), 0.0), MOST_SHARE)
@@ -177,10 +180,11 @@ def _share_beyond(profile: Array) -> float:
 def star_behind(
     region: Region, method: str, psf: Psf, measured: tuple[float, float]
 ) -> tuple[tuple[float, float], tuple[float, float], float] | None:
-    """The place whose image gives the measured moments, the slopes of the moments, the light held.
+    """The place (u, v) whose modelled image has the measured moments, the slopes of the moments,
+    and the share of light in the square.
 
-    This takes off what truncation and sampling leave in a moment.  None where the
-    moments hardly depend on the place: the star is outside the hump.
+    This corrects a moment for truncation and sampling. None where the moments hardly depend on the
+    place: the star is outside the image's core.
     """
     place, steps = measured, region.du[0]
     for _ in range(8):
@@ -195,7 +199,8 @@ def star_behind(
                 return None
             mean = float(steps @ samples) / total
             expected.append(mean)
-            # The image moves against the distance that it is evaluated at.
+            # The derivative with respect to the star's place is minus the derivative with respect
+            # to the pixel's.
             slopes.append((mean * float(change.sum()) - float(steps @ change)) / total)
         if min(slopes) < SLOPE_LEAST:
             return None
@@ -210,7 +215,7 @@ def star_behind(
 
 BLEND_SIGMAS = 4.0
 BLEND_SHARE = 0.01
-"""A second star is told where it stands this far above the noise and holds this share of light."""
+"""Signal to noise, and share of the star's light, above which a second star is reported."""
 
 
 def is_blended(found: Fit, psf: Psf) -> bool:
@@ -250,16 +255,15 @@ def centroid(
     half_width_px: int = DEFAULT_HALF_WIDTH_PX,
     recentre: bool = True,
 ) -> CentroidRecord:
-    """The place of the star in a window, with predicted sigmas and flags.
+    """The position of the star in a window by one of four methods, with predicted sigmas and flags.
 
-    `start` is (u, v) in pixels of the frame, by default the brightest 3 x 3 pixels.
-    `half_width_px` bounds the square that is summed about the star; it moves with the
-    star unless `recentre` is false.  `matched` and `recursive` need the `psf`; given to the
-    other two, it corrects their moments for what lies outside the square, and flags the
-    light of another star.  Saturated and masked pixels refuse a moment and are left out of
-    a fit.
+    `start` is (u, v) in pixels of the frame, by default the brightest 3 x 3 pixels. `half_width_px`
+    bounds the square that is summed about the star; it moves with the star unless `recentre` is
+    false. `matched` and `recursive` need the `psf`; for the other two methods it corrects their
+    moments for what lies outside the square, and flags the light of another star. Saturated and
+    masked pixels refuse a moment and are left out of a fit.
 
-    Light that allows no place gives a record that says why.  Raises `BadInput` for
+    A star that cannot be located gives a record with the reason in `refused`. Raises `BadInput` for
     arguments that make no sense.
     """
     if method not in METHODS:
@@ -288,7 +292,7 @@ def _start(window: Window, start: tuple[float, float] | None) -> tuple[float, fl
 def record_of(
     method: str, found: shape_fit.Fit | None, psf: Psf, half_width_px: int, window: Window
 ) -> CentroidRecord:
-    """The record of a fit, or its refusal in words."""
+    """The centroid record of a fitted star, or of a failed fit with the reason in words."""
     if found is None:
         return refusal(method, "the shape fits no light of this window", (Flag.OUTSIDE,))
     flags = found.region.flags(half_width_px)
@@ -317,13 +321,13 @@ def record_of(
 
 MOST_PASSES = 30
 VAGUE = 100.0
-"""The start is this many times vaguer than a window's width and its light."""
+"""Initial sigmas of the recursive fit, in multiples of the window's width and of its light."""
 
 
 def recursive_fit(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
 ) -> shape_fit.Fit | None:
-    """Passes over the pixels, each one point at a time, until the place stays; None without light.
+    """A star fitted pixel by pixel, in passes until its place converges; None without light.
 
     With `recentre` false there is one pass: the report's own form.
     """

@@ -1,4 +1,4 @@
-"""The image of a point of light on pixels: a Gaussian, or any image, as of an Airy disc."""
+"""Point spread functions integrated over pixels: a Gaussian, or a sampled image."""
 
 import math
 from collections.abc import Sequence
@@ -27,22 +27,22 @@ Array = npt.NDArray[np.float64]
 
 
 class Psf(Protocol):
-    """The shape of a star's image."""
+    """The shape of a star's image (point spread function), integrated over pixels."""
 
     @property
     def fwhm_px(self) -> float:
-        """The full width at half of the maximum."""
+        """The full width at half of the maximum, in pixels."""
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
-        """The share of the light on pixels whose centres lie (du, dv) from the star."""
+        """Share of the star's light on pixels whose centres lie (du, dv) pixels from the star."""
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of `pixel` with respect to du and dv, per pixel."""
+        """The derivatives of the pixels' share of light with respect to du and dv, per pixel."""
 
 
 @dataclass(frozen=True)
 class GaussianPsf:
-    """A round Gaussian, `sigma_px` per axis before the pixel integrates it."""
+    """A round Gaussian star image; `sigma_px` per axis, before integration over the pixel."""
 
     sigma_px: float
 
@@ -52,20 +52,20 @@ class GaussianPsf:
 
     @property
     def fwhm_px(self) -> float:
-        """The full width at half maximum of the Gaussian itself, without the pixel."""
+        """The full width at half maximum of the Gaussian, before integration over the pixel."""
         return 2.0 * math.sqrt(2.0 * math.log(2.0)) * self.sigma_px
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
-        """See `Psf`."""
+        """The share of the light on pixels at (du, dv) from the star; see `Psf`."""
         return self._share(du_px) * self._share(dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """See `Psf`."""
+        """The derivatives of that share with respect to du and dv; see `Psf`."""
         in_u, in_v = self._share(du_px), self._share(dv_px)
         return self._share_slope(du_px) * in_v, in_u * self._share_slope(dv_px)
 
     def _share(self, distance_px: npt.ArrayLike) -> Array:
-        # Loaded with the first frame: nothing else that is served asks for it.
+        # Imported at the first frame: no other request needs scipy.special.
         from scipy.special import erf
 
         x = np.asarray(distance_px, dtype=np.float64)
@@ -83,9 +83,9 @@ class GaussianPsf:
 class SampledPsf:
     """The shape of an image that was computed on a grid finer than the pixels.
 
-    `image` is odd in both directions, the star in its middle, and should be even;
-    `total` is the light in all directions, beyond the image as well, in the units of its
-    sum: by default nothing is beyond.  `jitter_px` smears it by a Gaussian.
+    `image` is odd in both directions, the star in its middle, and should be even; `total` is the
+    light in all directions, also outside the image, in the units of the image's sum; by default no
+    light is outside. `jitter_px` is the sigma of a Gaussian that smears the image.
     """
 
     image: Array = field(repr=False)
@@ -110,7 +110,7 @@ class SampledPsf:
 
     @cached_property
     def fwhm_px(self) -> float:
-        """The full width at half of the peak along u, without the pixel."""
+        """Full width at half of the peak along u in pixels, before integration over the pixel."""
         middle = self.image.shape[1] // 2
         along = self.image[self.image.shape[0] // 2, middle:] / self.image.max()
         first = int(np.argmax(along < 0.5))
@@ -119,7 +119,7 @@ class SampledPsf:
 
     @cached_property
     def reach_px(self) -> tuple[float, float]:
-        """How far the shape is known from the star, along u and v; beyond it is zero."""
+        """Largest distances along u and v (px) at which a star's sampled image is known."""
         rows, columns = self.image.shape
         return (columns // 2) / self.samples_per_px - 0.5, (rows // 2) / self.samples_per_px - 0.5
 
@@ -129,7 +129,7 @@ class SampledPsf:
         fine = self.image / (self.image.sum() if self.total is None else self.total)
         if self.jitter_px > 0.0:
             fine = gaussian_filter(fine, self.jitter_px * self.samples_per_px, mode="constant")
-        # The pixel is a box; as a transform it is exact for any number of samples a pixel.
+        # The pixel is a box; its transform is exact for any number of samples per pixel.
         box = np.outer(
             np.sinc(np.fft.fftfreq(rows) * self.samples_per_px),
             np.sinc(np.fft.rfftfreq(columns) * self.samples_per_px),
@@ -141,15 +141,15 @@ class SampledPsf:
 
     @cached_property
     def _slopes(self) -> tuple[Any, Any]:
-        """The derivatives along u and v, once: for each call they would be made anew."""
+        """Splines of an image's derivatives along u and v, cached for repeated calls."""
         return self._spline.partial_derivative(0, 1), self._spline.partial_derivative(1, 0)
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
-        """See `psf.Psf`."""
+        """The share of the light on pixels at (du, dv) from the star; see `psf.Psf`."""
         return self._at(self._spline, du_px, dv_px)
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """See `psf.Psf`."""
+        """The derivatives of that share with respect to du and dv; see `psf.Psf`."""
         along_u, along_v = self._slopes
         return self._at(along_u, du_px, dv_px), self._at(along_v, du_px, dv_px)
 
@@ -157,7 +157,7 @@ class SampledPsf:
         u, v = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         known = (np.abs(u) <= self.reach_px[0]) & (np.abs(v) <= self.reach_px[1])
         if _is_raster(u, v):
-            # Twenty times as quick as point by point.
+            # Evaluation on a grid is twenty times as fast as point by point.
             found = spline(v[:, 0], u[0], grid=True)
         else:
             found = spline(*np.broadcast_arrays(v, u), grid=False)
@@ -165,14 +165,14 @@ class SampledPsf:
 
 
 def _is_raster(u: Array, v: Array) -> bool:
-    """True if places are rising columns (1, n) and rising rows (m, 1)."""
+    """True if the places form a grid: rising columns (1, n) and rising rows (m, 1)."""
     if u.ndim != 2 or v.ndim != 2 or u.shape[0] != 1 or v.shape[1] != 1:
         return False
     return bool(np.all(np.diff(u[0]) > 0.0) and np.all(np.diff(v[:, 0]) > 0.0))
 
 
 def psfs_in_colours(shortest: SampledPsf, longer: Array, weights: Array) -> list[SampledPsf]:
-    """The images in light of many colours, by that of the shortest wavelength of them.
+    """Images (m) of stars in light of many colours, made from the image at the shortest wavelength.
 
     An aperture's image grows with the wavelength: those of the colours, `longer` (n,) times as long
     as the shortest, are summed with the `weights` (m, n), which are shares of photons, to m images.
@@ -224,7 +224,7 @@ def airy_psf(
     reach_px: int = 24,
     jitter_px: float = 0.0,
 ) -> SampledPsf:
-    """The image of a clear circle, or of a ring, in light of one colour.
+    """The Airy pattern of a clear or centrally obscured circular aperture in one colour.
 
     `lambda_over_d_px` is lambda f / D in pixels; `obscuration` the dark share of the
     diameter.  [A(q) - e² A(e q)]² / (1 - e²)² with A(q) = 2 J1(q) / q.
@@ -242,7 +242,7 @@ def airy_psf(
 
     ring = 1.0 - obscuration**2
     image = ((amplitude(q) - obscuration**2 * amplitude(obscuration * q)) / ring) ** 2
-    # The light of the whole plane: the open area, by Parseval.
+    # Total light over the whole plane: the open area, by Parseval.
     total = 4.0 / math.pi * (lambda_over_d_px * samples) ** 2 / ring
     return SampledPsf(image, samples, total, jitter_px)
 
@@ -253,15 +253,16 @@ def wired_psf(
     reach_px: int = 48,
     cells_across: int = 512,
 ) -> SampledPsf:
-    """The image, in light of one colour, of a round aperture behind wires in any directions.
+    """The diffraction image of a round aperture behind straight wires, in light of one colour.
 
-    `lambda_over_d_px` is that of the aperture without them; each wire is (direction that it runs
-    in, deg from u towards v; offset and width in diameters of the aperture), as in a `Camera`.
+    `lambda_over_d_px` is lambda f / D of the aperture without wires; each wire is (direction along
+    the wire, deg from u towards v; offset and width in diameters of the aperture), as in a
+    `Camera`.
     """
     clear = disc(cells_across, 1.0 / cells_across, 0.5)
     pupil = behind_wires(clear, [(math.radians(d), offset, width) for d, offset, width in wires])
     samples = max(LEAST_SAMPLES_PER_PX + 1, math.ceil(6.0 / lambda_over_d_px))
-    # A diameter of one metre, so that a wavelength of one metre is an angle of one.
+    # With a diameter of one metre, a wavelength of one metre is an angle of one radian.
     light = monochromatic(1.0)
     image = image_of(pupil, light, 1.0 / (lambda_over_d_px * samples), reach_px * samples)
     return SampledPsf(image.intensity, samples, pupil.open_area_m2 / image.step_rad**2)

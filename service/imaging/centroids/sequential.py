@@ -1,8 +1,8 @@
 """Linear estimation, one measurement at a time (report, part VI).
 
-A measurement is r = c . A + k: a row c, a state A that stays the same, noise k.
-Everything the report derives for it is here; what the rows are for a star's image is
-in `studies.star_image_report.measurements`.
+A measurement is r = c . A + k: a row c, a constant state A, noise k. This module has the report's
+estimators for that model; the rows for a star's image are in
+`studies.star_image_report.measurements`.
 """
 
 from collections.abc import Iterable
@@ -16,7 +16,7 @@ from service.imaging.centroids.window import Array
 
 @dataclass(frozen=True)
 class StateEstimate:
-    """A state (m,) with its covariance (m, m) after a number of measurements."""
+    """Estimate of a constant state (m,), its covariance (m, m), and its number of measurements."""
 
     state: Array
     covariance: Array
@@ -24,16 +24,16 @@ class StateEstimate:
 
     @property
     def sigma(self) -> Array:
-        """One standard deviation of every part of the state."""
+        """One standard deviation of each component of the state."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def updated(self, row: Array, value: float, variance: float) -> "StateEstimate":
-        """The estimate after one more measurement (6.20, 6.26).
+        """The estimate of a state after one more scalar measurement (6.20, 6.26).
 
-        Only a number is inverted.  The report concludes that the covariance goes to zero
-        because the matrices of 6.26 are positive definite; the one that is subtracted has
-        rank one, and measuring one point for ever teaches one direction only.  It goes
-        to zero where the rows, summed as c^T c, grow without bound in every direction.
+        Only a scalar is inverted. The report concludes that the covariance goes to zero because the
+        matrices of 6.26 are positive definite; the subtracted one has rank one, and repeating one
+        measurement teaches one direction only. The covariance goes to zero where the rows, summed
+        as c^T c, grow without bound in every direction.
         """
         gain = self.covariance @ row
         spread = variance + float(row @ gain)
@@ -43,7 +43,7 @@ class StateEstimate:
         return StateEstimate(state, 0.5 * (covariance + covariance.T), self.measurements + 1)
 
     def replayed(self, rows: Array, values: Array, variances: npt.ArrayLike) -> "StateEstimate":
-        """The estimate after many measurements, one after another; rows (n, m)."""
+        """The estimate of a state after many scalar measurements in sequence; rows (n, m)."""
         estimate = self
         for row, value, variance in zip(
             rows, values, np.broadcast_to(variances, values.shape), strict=True
@@ -53,13 +53,13 @@ class StateEstimate:
 
 
 def diffuse(sigmas: Iterable[float]) -> StateEstimate:
-    """The start that knows nothing: zero, give or take `sigmas`."""
+    """An initial estimate of a zero state with large prior sigmas, one per component."""
     spread = np.asarray(tuple(sigmas), dtype=np.float64)
     return StateEstimate(np.zeros(len(spread)), np.diag(spread**2))
 
 
 def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> StateEstimate:
-    """Weighted least squares of all at once: (C^T Q C)^-1 C^T Q R with Q of 1/variance (6.13).
+    """Least-squares estimate from all measurements: (C^T Q C)^-1 C^T Q R, Q of 1/variance (6.13).
 
     Raises `numpy.linalg.LinAlgError` where the rows leave a direction unknown.
     """
@@ -75,10 +75,10 @@ def batch(rows: Array, values: Array, variances: npt.ArrayLike) -> StateEstimate
 
 
 def least_norm(rows: Array, values: Array, norm: Array) -> Array:
-    """The state of least A^T Q A that fits fewer measurements than unknowns exactly (6.11).
+    """The state of least A^T Q A that exactly fits fewer measurements than unknowns (6.11).
 
-    Q^-1 C^T (C Q^-1 C^T)^-1 R: what the recursion gives that starts at zero with the
-    covariance Q^-1 and is told that the measurements have no noise.
+    Computed as Q^-1 C^T (C Q^-1 C^T)^-1 R, the result of the recursion that starts at zero with the
+    covariance Q^-1 and takes measurements without noise.
     """
     spread = np.linalg.solve(norm, rows.T)
     return np.asarray(spread @ np.linalg.solve(rows @ spread, values))

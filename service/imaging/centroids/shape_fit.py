@@ -1,10 +1,9 @@
-"""The matched centroid: where the derivative of the correlation with the star's shape is zero.
+"""The matched centroid: the zero of the derivative of the correlation with the star's shape.
 
-The report locates by the peak of a correlation, or by the zero of the correlation
-with the derivative (part III).  Weighted by the noise of each pixel, the second is the
-condition of greatest likelihood, and its slope the Fisher information: the predicted
-sigmas are the Cramér-Rao bound.  It is found by Gauss-Newton steps, the square of
-pixels moving with the star.
+The report locates by the peak of a correlation, or by the zero of the correlation with the
+derivative (part III). Weighted by the noise of each pixel, the second is the condition of maximum
+likelihood, and its slope is the Fisher information: the predicted sigmas are the Cramér-Rao bound.
+Gauss-Newton steps solve for the zero; the square of pixels moves with the star.
 """
 
 import math
@@ -17,18 +16,20 @@ from service.imaging.centroids.window import Array, Mask, Region, Window, square
 
 MOST_STEPS = 30
 ENOUGH_SIGMAS = 0.01
-"""A step this small against its own uncertainty is the last; the next would be its square."""
+"""Convergence limit: largest last step of a fit, in sigmas of its place."""
 LONGEST_STEP_PX = 0.7
 MOVE_BEYOND_PX = 0.75
-"""More than half a pixel, so that a star between two pixels does not move the square to and fro."""
+"""Distance of a star from the middle of its square at which the square moves; above half a pixel,
+so that a star between two pixels does not move the square to and fro.
+"""
 FARTHEST_IN_HALF_WIDTHS = 2.0
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Place (pixels of the window) and light of the shape that fits best, with covariance.
+    """The best-fitting place (pixels of the window) and light of a star's shape, with covariance.
 
-    `covariance` is of (u, v, light) and holds what the error of the background level adds.
+    `covariance` is of (u, v, light) and includes the error of the background level.
     """
 
     u_px: float
@@ -41,17 +42,17 @@ class Fit:
 
     @property
     def signal_ratio(self) -> float:
-        """The light over its own noise."""
+        """The ratio of the star's fitted light to its own sigma."""
         return self.flux_counts / math.sqrt(self.covariance[2, 2])
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """Pixels of a square against the shape at a presumed place and light.
+    """A star's image linearised about a presumed place and light, on the pixels of a square.
 
-    `good` are the pixels used; `rows` (n, 3) are the changes with u, v and light; `left` is what
-    the shape does not explain; `variance` per pixel is that of the model, never of the noisy
-    counts, which would favour pixels that happened to be low.
+    `good` are the pixels used; `rows` (n, 3) are the changes with u, v and light; `left` is the
+    residual light; `variance` per pixel is computed from the model, since the noisy counts would
+    favour pixels that happened to be low.
     """
 
     good: Mask
@@ -60,12 +61,12 @@ class Linearised:
     variance: Array
 
     def sigmas_of(self, step: Array) -> float:
-        """The length of a step in its own standard deviations."""
+        """The length of a fit's step in its own standard deviations."""
         return math.sqrt(float(((self.rows @ step) ** 2 / self.variance).sum()))
 
 
 def linearised(region: Region, psf: Psf, u_px: float, v_px: float, flux: float) -> Linearised:
-    """The usable pixels about a presumed place, (u, v) in pixels of the window."""
+    """The image of a star linearised about a presumed place (u, v) in pixels of the window."""
     du, dv = region.du - (u_px - region.column), region.dv - (v_px - region.row)
     image = psf.pixel(du, dv)
     u_slope, v_slope = psf.slopes(du, dv)
@@ -79,9 +80,9 @@ def linearised(region: Region, psf: Psf, u_px: float, v_px: float, flux: float) 
 
 
 def first_flux(region: Region, psf: Psf, u_px: float, v_px: float) -> float:
-    """The light of a star at a presumed place, by the sum of the pixels that may be believed.
+    """The first estimate of a star's light at a presumed place, from the sum of the usable pixels.
 
-    Where that sum is not above zero, its noise: the first step then finds the light.
+    Where that sum is not positive, the estimate is its noise; the first step then finds the light.
     """
     image = psf.pixel(region.du - (u_px - region.column), region.dv - (v_px - region.row))
     held = float(image[region.usable].sum())
@@ -93,7 +94,7 @@ def first_flux(region: Region, psf: Psf, u_px: float, v_px: float) -> float:
 def fit(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int, recentre: bool = True
 ) -> Fit | None:
-    """The best place from a start in pixels of the window; None where there is none to be had."""
+    """The place and light of a star by Gauss-Newton from a start in window pixels, or None."""
     u, v = start
     region = square_about(window, round(u), round(v), half_width_px)
     if region is None:
@@ -120,18 +121,20 @@ def fit(
 
 
 TYPICAL_RED_SHARE, RED_SHARE_SIGMA = 0.5, 0.4
-"""The colours of stars to V 9, as shares of the red one."""
+"""Mean and sigma of the colours of stars down to V 9, as the share of the red image in a
+mixture.
+"""
 LEAST_RED_SHARE, MOST_RED_SHARE = -0.2, 1.3
-"""The colours of single stars: light that looks bluer or redder is blended."""
+"""Least and largest colours of single stars, as red shares: bluer or redder light is blended."""
 
 
 def fit_in_its_colour(
     window: Window, psf: Psf, start: tuple[float, float], half_width_px: int
 ) -> tuple[Fit | None, Psf]:
-    """The best place with the image of the colour that the star itself shows, and that image.
+    """The best fit of a star with a PSF of the star's own measured colour, and that PSF.
 
-    The spread of colours among stars counts as a measurement.  Images of all colours are even and
-    their slopes odd, so that the colour's own error hardly moves a star.
+    The known distribution of star colours is used as a prior. Images of all colours are even and
+    their slopes odd, so that an error of the colour hardly moves the star.
     """
     found = fit(window, psf, start, half_width_px)
     if found is None or not isinstance(psf, ColouredPsf):
@@ -161,9 +164,9 @@ def region_after_step(
     half_width_px: int,
     recentre: bool,
 ) -> Region | None:
-    """The region of the next step: another one where a step led far from the middle of this one.
+    """The square of pixels for a fit's next step: moved where the star is far from the middle.
 
-    None where the place is too far from the start, or its region not within the window.
+    None where the place is too far from the start, or its square is outside the window.
     """
     u, v = place
     if math.hypot(u - start[0], v - start[1]) > FARTHEST_IN_HALF_WIDTHS * half_width_px:
@@ -174,10 +177,11 @@ def region_after_step(
 
 
 def stepped(u: float, v: float, flux: float, step: Array) -> tuple[float, float, float]:
-    """Place and light after a step, which is shortened where it leaves the linear range."""
+    """The star's place and light after one step of a fit, shortened to stay in the linear range."""
     length = math.hypot(step[0], step[1])
     shorten = min(1.0, LONGEST_STEP_PX / length) if length > 0.0 else 1.0
-    # Light cannot be negative; a star that fades on the way is too faint at its end.
+    # Light cannot be negative; a star that fades during the steps is refused as too faint at the
+    # end.
     flux = max(flux + shorten * float(step[2]), 0.1 * flux)
     return u + shorten * float(step[0]), v + shorten * float(step[1]), flux
 
@@ -201,6 +205,6 @@ def _covariance(seen: Linearised, level_sigma: float) -> Array | None:
 
 
 def with_level_error(covariance: Array, seen: Linearised, level_sigma: float) -> Array:
-    """The covariance with what an error of the background, common to all pixels, adds."""
+    """Covariance of a fit, enlarged by an error of the background level common to all pixels."""
     response = covariance @ (seen.rows / seen.variance[:, None]).sum(axis=0)
     return np.asarray(covariance + level_sigma**2 * np.outer(response, response))

@@ -1,8 +1,8 @@
-"""Images of stars drawn out along a line or a bow, and many of them placed at once.
+"""Trailed images of stars, along a line or an arc, and the fit of many of them at once.
 
-While the shutter is open a star runs along a path; at mid exposure it stands in the middle of
-it.  An even path shows where it begins and ends, so that the place along it is known from its two
-ends, and the place across it from its whole length.
+While the shutter is open a star moves along a path; at mid exposure it is in the middle of the
+path. The two ends of an evenly lit path give the place along the path, its whole length the place
+across it.
 """
 
 import math
@@ -15,22 +15,22 @@ from service.imaging.centroids.window import Array, Mask
 
 ROUNDS = 7
 MARGIN_PX = 2.0
-"""Further pixels kept about a path, so that it may move to the star."""
+"""Margin of pixels kept about a path, so that the path may move to the star during the fit."""
 REACH_SIGMAS = 3.5
-"""Pixels farther from a path, in widths of a still star's image, are left out of its fit."""
+"""Largest distance of a fitted pixel from a trail's path, in sigmas of a still star's image."""
 LONGEST_STEP = 0.6
-"""A step of the fit in widths of a still star's image."""
+"""Longest step of a trail fit, in sigmas of a still star's image."""
 CONVERGED_PX = 2e-3
 CHUNK_PIXELS = 1_000_000
 
 
 @dataclass(frozen=True)
 class TrailImage:
-    """The image (a `Psf`) of a star that runs evenly along a chord (`trail_u_px`, `trail_v_px`).
+    """The image (a `Psf`) of a star that moves evenly along an arc, given by its chord.
 
-    `bow_px` is how far the middle of the path lies beyond that of the chord, to the right of the
-    chord where v points down.  `sigma_px` is that of a still star on the pixels: of a Gaussian
-    with the pixel in it.  Every value may be an array, one for each star, that broadcasts.
+    `bow_px` is the distance of the path's middle from the chord's middle, to the right of the chord
+    where v points down. `sigma_px` is the width of a still star's Gaussian image, the pixel
+    included. Every value may be an array, one for each star, that broadcasts.
     """
 
     sigma_px: float
@@ -40,12 +40,12 @@ class TrailImage:
 
     @property
     def length_px(self) -> Array:
-        """The length of the chord."""
+        """The length of the trail's chord, in pixels."""
         return np.maximum(np.hypot(self.trail_u_px, self.trail_v_px), 1e-6)
 
     @property
     def fwhm_px(self) -> float:
-        """The still image's width together with the trail's length, as standard deviations add."""
+        """The width of a trailed image (px): still image and trail combined in quadrature."""
         spread = float(np.max(self.length_px)) / math.sqrt(12.0)
         return 2.0 * math.sqrt(2.0 * math.log(2.0)) * math.hypot(self.sigma_px, spread)
 
@@ -54,13 +54,13 @@ class TrailImage:
         return self.with_slopes(du_px, dv_px)[0]
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """The derivatives of `pixel` with respect to du and dv, per pixel."""
+        """The derivatives of a pixel's share of light with respect to du and dv, per pixel."""
         _, by_u, by_v = self.with_slopes(du_px, dv_px)
         return by_u, by_v
 
     def with_slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array, Array]:
-        """The share of the light and its derivatives with respect to du and dv."""
-        # Loaded with the first frame: nothing else that is served asks for it.
+        """Share of the star's light on pixels, and its derivatives with respect to du and dv."""
+        # Imported at the first frame: no other request needs scipy.special.
         from scipy.special import erf
 
         along, across, cos, sin = self.along_and_across(du_px, dv_px)
@@ -73,7 +73,7 @@ class TrailImage:
         box_slope = (np.exp(-(ends[0] ** 2)) - np.exp(-(ends[1] ** 2))) / (
             math.sqrt(math.pi) * scale * length
         )
-        # Where the path is steep against its chord, a section across the chord is wider.
+        # Where the path is oblique to its chord, a section across the chord is wider.
         slope = 2.0 * bend * along
         steep = np.sqrt(1.0 + slope**2)
         profile = np.exp(-((off / (scale * steep)) ** 2)) / (math.sqrt(math.pi) * scale * steep)
@@ -85,7 +85,7 @@ class TrailImage:
     def along_and_across(
         self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike
     ) -> tuple[Array, Array, Array, Array]:
-        """Coordinates along and across the chord, and the cosine and sine of its direction."""
+        """Pixels' coordinates along and across a trail's chord, and the chord's cosine and sine."""
         du, dv = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         cos = np.asarray(self.trail_u_px) / self.length_px
         sin = np.asarray(self.trail_v_px) / self.length_px
@@ -94,12 +94,12 @@ class TrailImage:
 
 @dataclass(frozen=True)
 class TrailPlaces:
-    """Stars (n) placed by the images of their trails.
+    """The places of stars (n) fitted with the images of their trails.
 
-    `covariance` (n, 3, 3) is of u, v (pixels) and light (counts), for the noise given.
-    `chi_square` (n,) is of the residuals, over their degrees of freedom.
-    `unexplained` is the share of the light's squares that the image does not explain beyond
-    noise: 0 for a star that fits, 1 for light of another shape.
+    `covariance` (n, 3, 3) is of u, v (pixels) and light (counts), for the stated noise.
+    `chi_square` (n,) is of the residuals, over their degrees of freedom. `unexplained` is the share
+    of the squared light that neither the image nor noise explains: 0 for a star that fits, 1 for
+    light of another shape.
     """
 
     u_px: Array
@@ -111,9 +111,10 @@ class TrailPlaces:
 
     @property
     def sigma_px(self) -> Array:
-        """One standard deviation (n,) per axis: the root of the mean of both variances.
+        """One standard deviation (n,) per axis of trailed stars' places: root of the mean variance.
 
-        What the image leaves unexplained, as of a star whose trail another crosses, widens it.
+        Light that the image does not explain, such as another trail that crosses, enlarges the
+        sigma.
         """
         variance = 0.5 * (self.covariance[:, 0, 0] + self.covariance[:, 1, 1])
         return np.asarray(np.sqrt(variance * np.maximum(self.chi_square, 1.0)))
@@ -139,7 +140,7 @@ class TrailPixels:
         noise: npt.NDArray[np.floating] | float,
         usable: Mask | None,
     ) -> "TrailPixels":
-        """The pixels near the paths of stars (n) at places, with light and noise of the frame.
+        """The pixels near the paths of stars (n), cut from a frame's light and noise.
 
         The values of `image` are of the shape (n, 1).
         """
@@ -171,7 +172,7 @@ class TrailPixels:
 
 
 def _near(image: TrailImage, du_px: Array, dv_px: Array, reach_px: float) -> Mask:
-    """True for pixels (n, k) within a reach of the path."""
+    """True for pixels (n, k) within a given distance of a trail's path."""
     along, across, *_ = image.along_and_across(du_px, dv_px)
     near = np.abs(across) < reach_px + np.abs(image.bow_px)
     return np.asarray(near & (np.abs(along) < 0.5 * image.length_px + reach_px))
@@ -180,10 +181,11 @@ def _near(image: TrailImage, du_px: Array, dv_px: Array, reach_px: float) -> Mas
 def fit_trails(
     pixels: TrailPixels, image: TrailImage, u_px: Array, v_px: Array, gain_e_per_count: float
 ) -> TrailPlaces:
-    """Stars (n) placed where their trails fit best, from places that are near.
+    """Least-squares places and light of stars (n) from their trails, starting at approximate
+    places.
 
-    The values of `image` are of the shape (n, 1).  An infinite gain leaves the noise of the
-    stars' own photons out.
+    The values of `image` are of the shape (n, 1). With an infinite gain the photon noise of the
+    stars is left out.
     """
     u, v = np.array(u_px, dtype=np.float64), np.array(v_px, dtype=np.float64)
     flux = np.zeros_like(u)
@@ -220,14 +222,14 @@ def fit_trails(
 
 
 def _light_of(light: Array, value: Array, used: Mask) -> Array:
-    """The light (n,) of each image where it stands, by least squares; positive."""
+    """The least-squares light (n,) of trails at fixed places; positive."""
     held = np.where(used, value**2, 0.0).sum(axis=1)
     seen = np.where(used, value * light, 0.0).sum(axis=1)
     return np.asarray(np.maximum(seen / np.maximum(held, 1e-30), 1e-6))
 
 
 def _inverse(normal: Array) -> Array:
-    """The inverses (n, 3, 3) of normal matrices; of one that has none, a vague covariance."""
+    """The inverses (n, 3, 3) of normal matrices; a singular matrix gives a vague covariance."""
     scale = np.sqrt(np.maximum(np.einsum("nii->ni", normal), 1e-300))
     unit = normal / (scale[:, :, None] * scale[:, None, :])
     unit = unit + 1e-9 * np.eye(3)

@@ -1,8 +1,8 @@
 """A cutout of a frame about one star, its noise, and the record of a centroid in it.
 
-The record is the result of every centroid method: a place with its errors, or why there is none.
-Pixels are counted from 0; the centre of the frame's first pixel is (0.0, 0.0).
-u runs along columns and v along rows, so that counts[row, column] = counts[v, u].
+The record is the result of every centroid method: a place with its errors, or the reason for having
+none. Pixels are counted from 0; the centre of the frame's first pixel is (0.0, 0.0). u runs along
+columns and v along rows, so that counts[row, column] = counts[v, u].
 """
 
 import math
@@ -32,14 +32,14 @@ class Flag(StrEnum):
 
 @dataclass(frozen=True)
 class CentroidRecord:
-    """One star on the sensor.
+    """The measured centroid of one star on the sensor, or the reason why it has none.
 
-    `u_px`, `v_px` count along columns and rows of the frame, the centre of its first
-    pixel at (0, 0); `sigma_*` are predicted, one standard deviation per axis, and
-    `correlation_uv` ties them.  `signal_ratio` is the light that the method sums over
-    the noise of that sum.  `truncation_*_px` is the shift that light outside the
-    window (and sampling) leaves in a plain moment: already taken off where the method
-    knew the PSF.  Where `refused` says why, place and sigmas are NaN.
+    `u_px`, `v_px` count along columns and rows of the frame, the centre of its first pixel at (0,
+    0); `sigma_*` are predicted, one standard deviation per axis, and `correlation_uv` is their
+    correlation. `signal_ratio` is the light that the method sums over the noise of that sum.
+    `truncation_*_px` is the bias of a plain moment by light outside the window and by sampling,
+    already corrected where the method knew the PSF. Where `refused` holds a reason, place and
+    sigmas are NaN.
     """
 
     method: str
@@ -59,7 +59,7 @@ class CentroidRecord:
 
     @property
     def usable(self) -> bool:
-        """True if there is a place."""
+        """True if a centroid was found."""
         return self.refused is None
 
 
@@ -72,7 +72,7 @@ def refusal(
     signal_ratio: float = math.nan,
     iterations: int = 1,
 ) -> CentroidRecord:
-    """A record without a place."""
+    """A centroid record without a place, with the reason why."""
     nan = math.nan
     return CentroidRecord(
         method, nan, nan, nan, nan, nan, flux_counts, sigma_flux_counts, signal_ratio,
@@ -83,7 +83,7 @@ def refusal(
 def too_faint(
     method: str, flux_counts: float, sigma_flux_counts: float, flags: tuple[Flag, ...]
 ) -> CentroidRecord:
-    """The refusal of light below the breakdown ratio."""
+    """Centroid record that refuses a star whose light is below the breakdown ratio to its noise."""
     ratio = flux_counts / sigma_flux_counts if sigma_flux_counts > 0.0 else 0.0
     why = f"its light is {ratio:.2f} times the noise, below {BREAKDOWN_RATIO:g}"
     return refusal(method, why, (*flags, Flag.TOO_FAINT), flux_counts, sigma_flux_counts, ratio)
@@ -95,7 +95,7 @@ Mask = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Detector:
-    """The properties of a detector: gain, the noise of reading (and of dark current), full well."""
+    """A detector's gain, readout noise (including dark current) and saturation level."""
 
     gain_e_per_count: float = 1.0
     read_noise_e: float = 0.0
@@ -117,7 +117,7 @@ class Detector:
             )
 
     def variance(self, light_counts: npt.ArrayLike) -> Array:
-        """The variance of a pixel (counts²) at a level of light; negative light has no noise."""
+        """Variance of pixels (counts²) at a level of light; negative light adds no photon noise."""
         light = np.maximum(np.asarray(light_counts, dtype=np.float64), 0.0)
         gain = self.gain_e_per_count
         return np.asarray((self.read_noise_e / gain) ** 2 + light / gain)
@@ -125,11 +125,11 @@ class Detector:
 
 @dataclass(frozen=True)
 class Window:
-    """A cutout, (rows, columns) of counts with the background in them.
+    """A cutout of a frame about one star: counts (rows, columns) that still include the background.
 
-    `background_counts` is the level below the star, a number or an array of the
-    same shape; its photon noise is counted.  `good` is False where a pixel is not
-    to be believed.  `cut` says that the frame's edge cut the window that was wanted.
+    `background_counts` is the level below the star, a number or an array of the same shape; its
+    photon noise is included. `good` is False for unusable pixels. `cut` is true if the frame's edge
+    made the window smaller.
     """
 
     counts: Array
@@ -160,23 +160,23 @@ class Window:
 
     @cached_property
     def usable(self) -> Mask:
-        """The pixels that hold a believable number below saturation."""
+        """True for pixels that hold a finite, unmasked count below saturation."""
         finite = np.isfinite(self.counts) & (self.counts < self.detector.saturation_counts)
         return finite if self.good is None else finite & self.good
 
     @cached_property
     def saturated(self) -> Mask:
-        """The pixels that are full."""
+        """True for saturated pixels."""
         return np.asarray(self.counts >= self.detector.saturation_counts)
 
     @cached_property
     def light_counts(self) -> Array:
-        """Counts above the background; zero where a pixel is not usable."""
+        """Counts above the background; zero for unusable pixels."""
         return np.where(self.usable, self.counts - self.background_counts, 0.0)
 
     @cached_property
     def floor_variance(self) -> Array:
-        """The variance of every pixel (counts²) without the star."""
+        """The variance (counts²) of every pixel without the star's photon noise."""
         level = np.broadcast_to(self.background_counts, self.counts.shape)
         return self.detector.variance(level)
 
@@ -191,10 +191,10 @@ def cutout(
     background_sigma_counts: float = 0.0,
     good: Mask | None = None,
 ) -> Window:
-    """The window of 2 half_width + 1 pixels about (u, v), clipped at the frame's edge.
+    """The window of 2 half_width + 1 pixels a side about (u, v), clipped at the frame's edge.
 
-    `background_counts` and `good` may be arrays of the frame's shape.  Raises
-    `BadInput` where fewer than three rows or columns of it lie in the frame.
+    `background_counts` and `good` may be arrays of the frame's shape. Raises `BadInput` where fewer
+    than three rows or columns of the window lie in the frame.
     """
     if not (math.isfinite(u_px) and math.isfinite(v_px)):
         raise BadInput(Fault("u_px, v_px", "must be finite", f"{u_px}, {v_px}"))
@@ -220,9 +220,9 @@ def cutout(
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle of a window about its whole pixel (column, row).
+    """A rectangle of pixels in a window about one of its pixels (column, row).
 
-    `left`, `right`, `above`, `below` count the pixels on each side of that one.
+    `left`, `right`, `above`, `below` count the pixels on each side of that pixel.
     """
 
     window: Window
@@ -235,7 +235,7 @@ class Region:
 
     @cached_property
     def inside(self) -> tuple[slice, slice]:
-        """The rectangle's slices of the window's arrays."""
+        """The index slices that cut a rectangle out of the arrays of its window."""
         return (
             slice(self.row - self.above, self.row + self.below + 1),
             slice(self.column - self.left, self.column + self.right + 1),
@@ -243,31 +243,31 @@ class Region:
 
     @cached_property
     def du(self) -> Array:
-        """Distance of its columns from the middle pixel, a row that broadcasts."""
+        """Distances of the rectangle's columns from its middle pixel, as a row that broadcasts."""
         return np.arange(-self.left, self.right + 1, dtype=np.float64)[None, :]
 
     @cached_property
     def dv(self) -> Array:
-        """Distance of its rows from the middle pixel, a column that broadcasts."""
+        """Distances of the rectangle's rows from its middle pixel, as a column that broadcasts."""
         return np.arange(-self.above, self.below + 1, dtype=np.float64)[:, None]
 
     @cached_property
     def light(self) -> Array:
-        """Counts above the background, zero where not usable."""
+        """Counts above the background in the rectangle; zero for unusable pixels."""
         return self.window.light_counts[self.inside]
 
     @cached_property
     def floor_variance(self) -> Array:
-        """Variance without the star, counts²."""
+        """The variance (counts²) of the rectangle's pixels without the star's photon noise."""
         return self.window.floor_variance[self.inside]
 
     @cached_property
     def usable(self) -> Mask:
-        """The pixels that may be believed."""
+        """True for the rectangle's pixels that hold a finite, unmasked count below saturation."""
         return self.window.usable[self.inside]
 
     def flags(self, wanted_half: int) -> tuple[Flag, ...]:
-        """The flags of the pixels themselves: full, masked, cut by the edge of the frame."""
+        """Warnings about a rectangle's pixels: saturated, masked, or cut by the frame's edge."""
         saturated = self.window.saturated[self.inside]
         reach = min(self.left, self.right, self.above, self.below)
         named = (
@@ -279,9 +279,9 @@ class Region:
 
 
 def square_about(window: Window, column: int, row: int, half: int) -> Region | None:
-    """The square of 2 half + 1 pixels about a pixel, cut where the window ends.
+    """The square of 2 half + 1 pixels a side about a pixel, clipped at the edge of the window.
 
-    None where that pixel itself is outside.
+    None where that pixel is outside the window.
     """
     rows, columns = window.counts.shape
     if not (0 <= column < columns and 0 <= row < rows):
@@ -298,9 +298,9 @@ def square_about(window: Window, column: int, row: int, half: int) -> Region | N
 
 
 def symmetric_square_about(window: Window, column: int, row: int, half: int) -> Region | None:
-    """The square about a pixel, shrunk on all sides to what the window holds.
+    """Largest square, of at most 2 half + 1 pixels a side, centred on a pixel within the window.
 
-    A moment needs both sides.  None where not even the neighbours are there.
+    A moment needs both sides. None where not even the neighbours of the pixel are inside.
     """
     cut = square_about(window, column, row, half)
     if cut is None:
@@ -310,13 +310,15 @@ def symmetric_square_about(window: Window, column: int, row: int, half: int) -> 
 
 
 def brightest_pixel(window: Window) -> tuple[int, int]:
-    """(column, row) of the brightest 3 x 3 pixels, by their middle; a full pixel counts as full."""
-    # The service starts with this module, and without scipy.
+    """(column, row) of the middle of the brightest 3 x 3 pixels; counts are cut off at
+    saturation.
+    """
+    # This module is imported at the service's start, which avoids scipy.
     from scipy.ndimage import correlate
 
     counts = np.minimum(window.counts, window.detector.saturation_counts) - window.background_counts
     known = np.isfinite(counts) if window.good is None else np.isfinite(counts) & window.good
     summed = correlate(np.where(known, counts, 0.0), np.ones((3, 3)), mode="constant")
-    # The rim lacks a side.
+    # The rim of the window has no full 3 x 3 neighbourhood.
     row, column = divmod(int(np.argmax(summed[1:-1, 1:-1])), summed.shape[1] - 2)
     return column + 1, row + 1

@@ -1,1 +1,1 @@
-"""From the counts of a frame to measured stars."""
+"""Detection of stars: from the counts of a frame to candidates and measured stars."""

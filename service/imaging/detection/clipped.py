@@ -1,8 +1,8 @@
 """Stars that are cut off at the largest count, as on stretched pictures of 8 bits.
 
-Such a star is a flat disc: it has no peak, and the filter for points ranks it by its edge.  Its
-place is the centre of the light up to the level where it is cut off, to which only its flanks
-contribute unevenly, and the size of the disc ranks it among the others.
+Such a star is a flat disc: it has no peak, and the point filter ranks it by its edge. Its place is
+the centroid of the light below the clipping level, to which only its flanks contribute unevenly,
+and the size of the disc ranks it among the other stars.
 """
 
 import math
@@ -16,25 +16,26 @@ from service.imaging.frames.frame import CountArray
 from service.vectors import Vector
 
 LEVEL_SHARE = 0.94
-"""Level of a flat top, as a share of the largest count: compression rounds the tops of discs."""
+"""Threshold of a clipped disc, as a share of the largest count; compression rounds tops."""
 LEAST_PIXELS, LEAST_DISCS = 6, 8
-"""The pixels of a disc, and the discs from which a picture counts as stretched: a camera cuts off
-a few bright stars."""
+"""Least pixels of a clipped disc, and least discs in a stretched picture: a few bright stars
+saturate in any.
+"""
 MOST_DISCS = 300
 MOST_SHARE = 0.2
-"""Largest share of all pixels in flat tops; more is the sky itself."""
+"""Largest share of a picture's pixels that clipped stars may fill; more is a bright sky."""
 MOST_RADIUS_SHARE = 0.03
-"""Largest radius of a disc, as a share of the shorter side; a larger one is no star."""
+"""Largest radius of a clipped star's disc, as a share of the picture's shorter side."""
 MOST_STRETCH = 2.5
-"""The longer side of a disc over the width of a round one."""
+"""Largest elongation of a clipped star's disc: its longer side over the width of a round one."""
 FLANK_PX = 3.0
 LEAST_SIGMA_PX, SIGMA_SHARE, STRETCH_SHARE = 0.05, 0.015, 0.25
-"""A place is no surer than these shares of the radius of its disc, and of its lack of roundness."""
+"""Least sigma of a disc's place: in pixels, and as shares of its radius and elongation."""
 _ROUNDS = 4
 
 
 class ClippedStars(NamedTuple):
-    """Places, sigmas, light up to the level, and radii of discs (n,), the largest light first."""
+    """Clipped stars (n,), the largest first: places, sigmas, light below clipping, radii."""
 
     u_px: Vector
     v_px: Vector
@@ -45,7 +46,7 @@ class ClippedStars(NamedTuple):
     def are_outside(
         self, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]
     ) -> npt.NDArray[np.bool_]:
-        """True for peaks (n,) that lie outside of all discs and their flanks."""
+        """True for peaks (n,) that lie outside of all clipped discs and their flanks."""
         outside = np.ones(len(u), dtype=bool)
         reach = self.radius_px + FLANK_PX
         for u_px, v_px, away in zip(self.u_px, self.v_px, reach, strict=True):
@@ -54,7 +55,7 @@ class ClippedStars(NamedTuple):
 
 
 def clipped_stars(light: CountArray) -> ClippedStars | None:
-    """The discs on light above its background (rows, columns); None where there are few."""
+    """The clipped stars on light above its background (rows, columns); None where there are few."""
     level = LEVEL_SHARE * float(light.max(initial=0.0))
     full = light >= level
     pixels = int(np.count_nonzero(full))
@@ -93,7 +94,7 @@ def _placed(
     middle: tuple[float, float],
     radius_px: float,
 ) -> tuple[float, float, float, float, float]:
-    """One row of `ClippedStars`: a disc by its number, about the middle of its box."""
+    """Centroid, sigma, light and radius of one clipped star, from its label and bounding box."""
     reach = radius_px + FLANK_PX
     half = math.ceil(reach) + 2
     first_u, first_v = max(round(middle[0]) - half, 0), max(round(middle[1]) - half, 0)
@@ -103,7 +104,7 @@ def _placed(
     rows, columns = np.indices(weight.shape)
     u, v = middle[0] - first_u, middle[1] - first_v
     for _ in range(_ROUNDS):
-        # A soft edge, so that pixels do not jump in and out.
+        # A soft edge, so that pixels do not enter and leave abruptly between rounds.
         inside = np.clip(reach + 0.5 - np.hypot(columns - u, rows - v), 0.0, 1.0) * weight
         total = float(inside.sum())
         u, v = float((inside * columns).sum()) / total, float((inside * rows).sum()) / total

@@ -1,7 +1,7 @@
-"""Telling stars from hot pixels and cosmic rays, and stars that either of these spoils.
+"""Separation of stars from hot pixels and cosmic rays, and recovery of the stars that these hit.
 
-Some are found again only once the pixels that were struck are taken off; others are
-placed, and what stands out from their own image is then no longer believed.
+Some hit stars are detected again after the hit pixels are removed; others are located first, and
+pixels that stand out from the fitted image are then masked.
 """
 
 from dataclasses import dataclass
@@ -18,20 +18,22 @@ HALF_PX = 5
 ROUNDS = 6
 _CORE = np.arange(-1.0, 2.0)
 MARGIN = 1.4
-"""How much brighter than the image of a point could be over its neighbours a pixel is hot."""
+"""Least sharpness of a hot pixel: its ratio to its neighbours over that of a star's image."""
 LEAST_SIGMAS = 5.0
 CERTAIN_SIGMAS = 12.0
-"""Sigmas of what is left of a star that was struck, so that the rest of a track is none."""
+"""Least signal to noise of a star that remains behind removed hot pixels, so that the remnant of a
+cosmic-ray track is not taken for a star.
+"""
 
 HIT_SHARE = 0.1
-"""The share of a star's brightest pixel: less may be a shape that is not quite as presumed."""
+"""Least height of a cosmic-ray hit over a star's brightest pixel; less may be a PSF error."""
 
 _ASIDE = ((-1, 0), (1, 0), (0, -1), (0, 1))
 
 
 @dataclass(frozen=True)
 class Behind:
-    """Stars (n,) that were hidden, and every pixel (m,) that hid them."""
+    """Stars (n,) recovered behind hot pixels, and every hot pixel (m,) that covered them."""
 
     u_px: Vector
     v_px: Vector
@@ -43,11 +45,10 @@ class Behind:
 def stars_behind(
     light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float, noise_counts: Vector
 ) -> Behind:
-    """The stars behind candidates (k,) that are sharper than a star, each with its own noise.
+    """The stars recovered behind candidates (k,) that are sharper than a star's image.
 
-    About each, pixel by pixel, what stands out from its four neighbours more than the
-    middle of a star's image can is taken off, the brightest first, until nothing does.
-    Where a star is left, it was struck.
+    Each candidate has its own noise. Pixels that exceed their four neighbours by more than a star's
+    image can are removed, brightest first, until none is left. If a star remains, it was hit.
     """
     core = GaussianPsf(psf_sigma_px).pixel(_CORE[None, :], _CORE[:, None])
     patches = patches_of(light, u_px, v_px, HALF_PX)
@@ -75,10 +76,11 @@ def stars_behind(
 
 
 def hits_under(window: Window, psf: Psf, star: CentroidRecord) -> Mask:
-    """Pixels (rows, columns) of a window that stand out from a placed star as no light can.
+    """True for pixels (rows, columns) of a window hit by a cosmic ray, found after a star was
+    located.
 
-    The star is taken off at the place that it was given; a pixel was hit where more is
-    left of it than of its neighbours by a factor that no image of a point reaches.
+    The star's model is subtracted; a pixel was hit where its residual exceeds those of its
+    neighbours by a factor that no point image reaches.
     """
     rows, columns = window.counts.shape
     du = np.arange(columns)[None, :] + window.corner_u_px - star.u_px
@@ -97,10 +99,10 @@ def _hot(
     peak_over_next: float,
     noise_counts: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.bool_]:
-    """Pixels of (k, rows, columns) that stand out from their neighbours more than a star's can."""
+    """True for pixels of (k, rows, columns) that exceed their neighbours more than a star's can."""
     hot = np.zeros(patches.shape, dtype=np.bool_)
     for _ in range(ROUNDS):
-        # What is hot already says nothing of its neighbours.
+        # A pixel known to be hot tells nothing about its neighbours.
         known = np.pad(~hot, ((0, 0), (1, 1), (1, 1))).astype(np.float64)
         light = np.pad(np.where(hot, 0.0, patches), ((0, 0), (1, 1), (1, 1)))
         count = sum(_aside(known, *step) for step in _ASIDE)
@@ -114,7 +116,7 @@ def _hot(
 
 
 def _aside(padded: npt.NDArray[np.float64], rows: int, columns: int) -> npt.NDArray[np.float64]:
-    """The inner part of padded patches, moved."""
+    """Padded patches without their padding, shifted by whole rows and columns."""
     height, width = padded.shape[1:]
     return padded[:, 1 + rows : height - 1 + rows, 1 + columns : width - 1 + columns]
 
@@ -122,7 +124,7 @@ def _aside(padded: npt.NDArray[np.float64], rows: int, columns: int) -> npt.NDAr
 def _best(
     patches: npt.NDArray[np.float64], core: npt.NDArray[np.float64], noise_counts: Vector
 ) -> tuple[Vector, Vector, Vector]:
-    """The place (row, column) in each patch of the most starlike light, and its ratio to noise."""
+    """The best match (row, column) with a star's core in each patch, and its signal to noise."""
     size = patches.shape[1] - 2
     filtered = np.zeros((len(patches), size, size))
     for row in range(3):
@@ -131,31 +133,31 @@ def _best(
             filtered += core[row, column] * moved
     flat = filtered.reshape(len(patches), size * size)
     at = flat.argmax(axis=1)
-    # The filter lacks the rim.
+    # The filter has no values on the rim.
     row, column = (each.astype(np.float64) + 1.0 for each in np.divmod(at, size))
     best = flat[np.arange(len(flat)), at]
     return row, column, best / (np.sqrt((core**2).sum()) * noise_counts)
 
 
-# Telling stars from hot pixels and cosmic rays: nothing that came through the lens is sharper
-# than the image of a point.
-#
-# Blends and trails are wider than that image and pass; a hot pixel is narrow both ways,
-# a cosmic ray's track across itself.
+# Separation of stars from hot pixels and cosmic rays: light through the lens is never sharper than
+# the image of a point. Blends and trails are wider than that image and pass; a hot pixel is narrow
+# in both directions, a cosmic ray's track across its length.
 
 PATCH_HALF_PX = 3
 SHARP = 0.5
-"""Smallest width, as a variance, that is still a star's, in that of a point's image."""
+"""Smallest variance of a star's image along any direction, as a share of that of a point's
+image.
+"""
 _ROUNDS = 2
 
 
 def is_sharp(
     light: CountArray, u_px: Vector, v_px: Vector, psf_sigma_px: float
 ) -> npt.NDArray[np.bool_]:
-    """The candidates (n,) that are narrower, along some direction, than a point's image can be.
+    """True for candidates (n,) that are narrower, along some direction, than the image of a point.
 
-    Second moments under a Gaussian weight as wide as that image; the smaller axis of
-    each is held against what the image itself gives.
+    Computed from second moments under a Gaussian weight as wide as that image; the smaller axis is
+    compared with that of a point's image.
     """
     if len(u_px) == 0:
         return np.zeros(0, dtype=np.bool_)
@@ -170,7 +172,7 @@ def is_sharp(
             dv = steps[None, :, None] - at_v[:, None, None]
             weighted = patches * np.exp(-(du**2 + dv**2) / (2.0 * psf_sigma_px**2))
             total = weighted.sum(axis=(1, 2))
-            # A weighted moment goes half of the way to where the star stands.
+            # A weighted moment gives half of the star's offset.
             at_u = np.clip(at_u + 2.0 * (weighted * du).sum(axis=(1, 2)) / total, -1.0, 1.0)
             at_v = np.clip(at_v + 2.0 * (weighted * dv).sum(axis=(1, 2)) / total, -1.0, 1.0)
         du = steps[None, None, :] - at_u[:, None, None]
@@ -181,13 +183,13 @@ def is_sharp(
             (weighted * each).sum(axis=(1, 2)) / total for each in (du * du, dv * dv, du * dv)
         )
     smaller = (uu + vv) / 2.0 - np.hypot((uu - vv) / 2.0, uv)
-    # Two Gaussians multiplied: the image, widened by the pixel, and the weight.
+    # Product of two Gaussians: the image, widened by the pixel, and the weight.
     expected = 1.0 / (1.0 / (psf_sigma_px**2 + 1.0 / 12.0) + 1.0 / psf_sigma_px**2)
     return np.asarray(~(smaller >= SHARP * expected))
 
 
 def patches_of(light: CountArray, u_px: Vector, v_px: Vector, half: int) -> npt.NDArray[np.float64]:
-    """Squares (n, 2 half + 1, 2 half + 1) about the nearest pixels; dark beyond the frame."""
+    """Squares (n, 2 half + 1, 2 half + 1) of light about given places; zero beyond the frame."""
     padded = np.pad(light, half)
     windows = np.lib.stride_tricks.sliding_window_view(padded, (2 * half + 1, 2 * half + 1))
     row, column = (np.round(each).astype(np.intp) for each in (v_px, u_px))

@@ -1,13 +1,13 @@
-"""From counts to candidates: background, threshold, detection by SEP, what is no star left out.
+"""Detection of star candidates in a frame: background, threshold, SEP, hot pixels.
 
-The search itself is that of SExtractor (Bertin & Arnouts 1996), in SEP: a mesh of
-clipped medians for the background, a filter of the shape of a star's image, a
-threshold in the noise behind that filter, and deblending.
+The search is SExtractor's (Bertin & Arnouts 1996), in SEP: a mesh of clipped medians for the
+background, a filter of the shape of a star's image, a threshold in the noise behind that filter,
+and deblending.
 
-The level of the background is a mesh of clipped modes, by SEP.  Where stray light leaves more
-than that mesh can follow (a limb, a bright corner), medians of finer meshes are taken off too,
-between which the level is linear, so that it does not swing beside a step.  The noise is
-measured on what is left: a slope within a mesh is no noise, the photons of stray light are.
+The level of the background is a mesh of clipped modes, by SEP. Where stray light (a limb, a bright
+corner) varies faster than that mesh can follow, medians of finer meshes are subtracted too, with
+linear interpolation, so that the level does not overshoot beside a step. The noise is measured on
+the residual: a slope within a mesh is no noise, the photons of stray light are.
 """
 
 import math
@@ -32,22 +32,23 @@ from service.vectors import Vector, read_only
 MESH_PX = 64
 FINE_MESH_PX = 16
 FINE_MESH_SIGMAS = 12.0
-"""The least side of a fine mesh, in widths of a star's image: a star fills little of it."""
+"""Least side of a fine background mesh, in widths of a star's image."""
 MOST_FINE_MESH_PX = 32
 FINE_ROUNDS = 2
 UNEVEN, UNEVEN_SHARE = 0.5, 0.005
-"""In sigmas of noise, the level that stray light leaves in a coarse mesh, and the least share of
-such meshes.  On even frames a few have 0.3 sigmas."""
+"""Residual level of a coarse mesh, in sigmas of noise, that is taken for stray light, and the least
+share of such meshes that starts the fine meshes. On even frames a few meshes have 0.3 sigmas.
+"""
 SURE_SIGMAS = 6.0
-"""A multiple of the error of a fine mesh's level."""
+"""Least level of a fine mesh that is subtracted, in multiples of its own error."""
 MEDIAN_ERROR = 1.25
-"""The error of a median over that of a mean."""
+"""Ratio of the standard error of a median to that of a mean."""
 MAD_SIGMAS = 1.48
 CLIP_SIGMAS = 3.0
 CROSSED = 1.5
-"""The spread of a square over that of its neighbours from which a limb crosses it."""
+"""Ratio of a square's spread to that of its neighbours above which a limb crosses the square."""
 CLIPPED_SHARE = 0.987
-"""The standard deviation of Gaussian noise that is cut at three sigmas."""
+"""Standard deviation of unit Gaussian noise after clipping at three sigmas."""
 
 Mask = npt.NDArray[np.bool_]
 
@@ -55,10 +56,11 @@ Mask = npt.NDArray[np.bool_]
 def take_background_off(
     light: CountArray, mask: Mask | None, psf_sigma_px: float, step_counts: float = 1.0
 ) -> tuple[CountArray, CountArray]:
-    """Subtract the level from light (rows, columns) in place; returns level and noise.
+    """Subtract the background from light (rows, columns) in place; returns the level and the noise
+    per pixel.
 
-    `mask` is True where a pixel holds no number.  Images of stars that are too wide for a fine
-    mesh keep the coarse one.  `step_counts` is the difference of neighbouring counts.
+    `mask` is True where a pixel holds no number. If images of stars are too wide for a fine mesh,
+    only the coarse mesh is subtracted. `step_counts` is the difference of neighbouring counts.
     """
     level = sep.Background(light, mask=mask, bw=MESH_PX, bh=MESH_PX).back(dtype=light.dtype)
     light -= level
@@ -70,16 +72,17 @@ def take_background_off(
         for _ in range(FINE_ROUNDS):
             level += _take_fine_off(light, mask, fine)
         noise = _noise_by_blocks(light, mask, fine, step_counts)
-    # Where most pixels are equal, as in a frame cut off at its background, a count is the least
-    # step.
+    # Where most pixels are equal, as in a frame clipped at its background, the noise is set to one
+    # count step.
     noise[~(noise > 0.0)] = step_counts
     return level, noise
 
 
 def _left(light: CountArray, mask: Mask | None) -> tuple[CountArray, CountArray, float]:
-    """The level that is left in each mesh, the noise of each pixel, and that of the whole.
+    """The residual background of each coarse mesh, the noise of each pixel, and the noise of the
+    whole frame.
 
-    Every other pixel shows them.
+    Computed from every other pixel.
     """
     coarse = np.ascontiguousarray(light[::2, ::2])
     hidden = None if mask is None else np.ascontiguousarray(mask[::2, ::2])
@@ -92,11 +95,11 @@ def _left(light: CountArray, mask: Mask | None) -> tuple[CountArray, CountArray,
 
 
 def _take_fine_off(light: CountArray, mask: Mask | None, side: int) -> CountArray:
-    """Subtract the level of fine meshes where it is more than their noise; returns it."""
+    """Subtract the level of fine meshes where it is significant; returns the subtracted level."""
     blocks = _blocks(light, mask, side)
     middle = _median(blocks)
     spread = MAD_SIGMAS * _median(np.abs(blocks - middle[:, :, None]))
-    # A mesh that a limb crosses has a great spread, unlike those beside it.
+    # A mesh that a limb crosses has a larger spread than its neighbours.
     noise = np.minimum(spread, median_filter(spread, 3, mode="nearest"))
     sure = np.abs(middle) > SURE_SIGMAS * MEDIAN_ERROR * noise / side
     level = _between(np.where(sure, middle, 0.0), side, light.shape).astype(light.dtype)
@@ -107,9 +110,10 @@ def _take_fine_off(light: CountArray, mask: Mask | None, side: int) -> CountArra
 def _noise_by_blocks(
     light: CountArray, mask: Mask | None, side: int, step_counts: float
 ) -> CountArray:
-    """One standard deviation of each pixel, from squares without what stands out in them.
+    """One standard deviation of the noise of each pixel, from clipped squares of the frame.
 
-    Of a square that a limb crosses the light of the limb is noise, so that no star is seen in it.
+    In a square that a limb crosses, the limb's light counts as noise, so that no star is detected
+    there.
     """
     blocks = _blocks(light, mask, side)
     away = np.abs(blocks - _median(blocks)[:, :, None])
@@ -126,7 +130,7 @@ def _noise_by_blocks(
 
 
 def _blocks(light: CountArray, mask: Mask | None, side: int) -> CountArray:
-    """Squares (down, across, pixels); the last ones of an uneven frame reach back into it."""
+    """Squares of a frame (down, across, pixels); the last ones may overlap their neighbours."""
     rows, columns = light.shape
     tops, lefts = _starts(rows, side), _starts(columns, side)
     if mask is not None:
@@ -136,7 +140,7 @@ def _blocks(light: CountArray, mask: Mask | None, side: int) -> CountArray:
 
 
 def _median(blocks: CountArray) -> CountArray:
-    """The median of each square (down, across), of numbers alone; zero where there is none."""
+    """The median of each square (down, across) over its finite numbers; zero without any."""
     if np.isfinite(blocks[:, :, 0]).all() and not np.isnan(blocks.sum(dtype=np.float64)):
         return np.asarray(np.median(blocks, axis=2))
     with warnings.catch_warnings():
@@ -150,13 +154,13 @@ def _starts(length: int, side: int) -> npt.NDArray[np.intp]:
 
 
 def _between(values: CountArray, side: int, shape: tuple[int, ...]) -> CountArray:
-    """Values at the middles of squares, linear between them and beyond the outer ones."""
+    """Values at the middles of squares, interpolated linearly (and extrapolated) to pixels."""
     down, across = (_weights(length, side) for length in shape)
     return np.asarray(down @ values @ across.T, dtype=np.float32)
 
 
 def _weights(length: int, side: int) -> CountArray:
-    """How much of each square's value a pixel has (pixels, squares)."""
+    """Linear interpolation weights (pixels, squares) of squares' values along one axis."""
     middles = _starts(length, side) + 0.5 * (side - 1)
     at = np.arange(length, dtype=np.float64)
     place = np.clip(np.searchsorted(middles, at) - 1, 0, max(len(middles) - 2, 0))
@@ -177,17 +181,19 @@ HOT_SIGMAS = 5.0
 TRACK_PIXELS = 9
 BEHIND_SIGMAS = 15.0
 EXTENDED_SIGMAS = 60.0
-"""The side of what is too wide for a star, in widths of a star's image."""
+"""Largest side of a star candidate, in widths of a star's image; a wider one is an extended
+source.
+"""
 _CLOSE_PX = 6.0
 
 
 @dataclass(frozen=True)
 class Detections:
-    """Candidates, the most light first, and what they stand on.
+    """The star candidates of a frame, those with the most light first, with background and noise.
 
-    `light` is the frame above its background, `background` the level below it with the
-    bias taken off, `noise_counts` one standard deviation of a pixel of it.  `good` is
-    False where a pixel holds no number or something sharper than a star.
+    `light` is the frame above its background, `background_counts` that background without the bias,
+    `noise_counts` one standard deviation of a pixel of `light`. `good` is False where a pixel holds
+    no number or is part of a hot pixel or cosmic ray.
     """
 
     light: CountArray
@@ -197,30 +203,30 @@ class Detections:
     u_px: Vector
     v_px: Vector
     flux_counts: Vector
-    """The light above the threshold: somewhat less than all of it."""
+    """The light of each candidate above the threshold: somewhat less than its total."""
     sharp_u_px: Vector
     sharp_v_px: Vector
-    """Hot pixels and cosmic rays: what was found and is no star."""
+    """Places of hot pixels and cosmic rays: detections that are not stars."""
     images: StarImages | None
-    """The images of the brighter candidates, of a camera whose images of stars reach far."""
+    """The subtracted images of bright stars, for a camera whose PSF reaches far; else None."""
     image_of: npt.NDArray[np.intp]
-    """The index of each candidate's image (n,); -1 where none is."""
+    """The index of each candidate's image (n,); -1 for a candidate without one."""
 
     @property
     def count(self) -> int:
-        """How many candidates there are."""
+        """The number of candidates."""
         return len(self.u_px)
 
 
 def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detections:
-    """The candidates on a frame; raises `BadFile` for one that is bright nearly everywhere.
+    """Star candidates on a frame; raises `BadFile` for a frame that is bright nearly everywhere.
 
-    `psf_at` tells the images of stars that move; without it they stand still.  Only a camera
-    whose images reach far needs it.
+    `psf_at` gives the images of moving stars; by default stars stand still. Only a camera whose
+    images reach far needs it.
     """
     light = frame.counts - np.asarray(camera.bias_counts, dtype=frame.counts.dtype)
     known = np.isfinite(light)
-    # SEP takes a mask of what to pass by; without one it is quicker.
+    # SEP takes a mask of pixels to ignore; without a mask it is faster.
     mask = None if known.all() else ~known
     if mask is not None:
         light[mask] = 0.0
@@ -233,7 +239,8 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
         found = _extracted(signal, 1.0, mask, camera)
         wide = found["npix"] > (EXTENDED_SIGMAS * camera.psf_sigma_px) ** 2
         if wide.any():
-            # Its supposed wings would hide faint stars all over the frame.
+            # The wings that SEP assumes for an extended source would hide faint stars all over the
+            # frame.
             known &= ~_footprint(signal, mask, camera, wide)
             mask = ~known
             found = _extracted(signal, 1.0, mask, camera)
@@ -248,7 +255,7 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
     u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
     sharp = is_sharp(left, u, v, camera.psf_sigma_px)
     good = _good(left, known, noise_map, found[~sharp], found[sharp])
-    # Light beside the brightest pixel: without it no star can be behind.
+    # A star can be behind a hot pixel only if there is light beside the brightest pixel.
     local = noise_map[found["ypeak"], found["xpeak"]]
     dense = sharp & (found["flux"] - found["peak"] > BEHIND_SIGMAS * local)
     behind = stars_behind(left, u[dense], v[dense], camera.psf_sigma_px, local[dense])
@@ -280,7 +287,7 @@ def detect(frame: Frame, camera: Camera, psf_at: PsfAt | None = None) -> Detecti
 
 
 def detector_of(frame: Frame, level: CountArray, noise_counts: float, camera: Camera) -> Detector:
-    """The detector with the noise that the frame itself shows beyond that of its light."""
+    """The detector of a camera, with readout noise from the frame's noise beyond photon noise."""
     gain = camera.gain_e_per_count
     light = max(float(np.median(level)), 0.0)
     variance_e = (noise_counts * gain) ** 2 - light * gain
@@ -289,9 +296,9 @@ def detector_of(frame: Frame, level: CountArray, noise_counts: float, camera: Ca
 
 
 def detection_kernel(camera: Camera) -> npt.NDArray[np.float32]:
-    """The filter: the core of a star's image, pixel by pixel.
+    """The convolution kernel for detection: the core of a star's image on whole pixels.
 
-    A wider one finds no more, and fills the gap between a star and a bright neighbour.
+    A wider kernel finds no more stars, and fills the gap between a star and a bright neighbour.
     """
     half = max(1, round(1.2 * camera.psf_sigma_px))
     steps = np.arange(-half, half + 1, dtype=np.float64)
@@ -305,7 +312,7 @@ def _footprint(
     camera: Camera,
     chosen: npt.NDArray[np.bool_],
 ) -> npt.NDArray[np.bool_]:
-    """The pixels (rows, columns) of the chosen ones of the candidates that are extracted."""
+    """The pixels (rows, columns) covered by chosen candidates of an extraction."""
     _, segments = sep.extract(signal, err=1.0, segmentation_map=True, **_options(1.0, mask, camera))
     return np.asarray(np.isin(segments, np.flatnonzero(chosen) + 1))
 
@@ -313,10 +320,10 @@ def _footprint(
 def _options(
     noise: float | CountArray, mask: npt.NDArray[np.bool_] | None, camera: Camera
 ) -> dict[str, Any]:
-    """Options of SEP: the threshold is in the noise behind the filter.
+    """Options of an extraction by SEP, with the threshold in the noise of the filtered image.
 
-    SEP itself means the noise before it, unless it is given that of each pixel, with which it
-    takes three times as long.
+    SEP itself takes the noise before the filter, unless it has a noise map, with which it takes
+    three times as long.
     """
     kernel = detection_kernel(camera)
     is_map = np.ndim(noise) > 0
@@ -340,7 +347,7 @@ def _extracted(
     try:
         found: npt.NDArray[np.void] = sep.extract(light, err=noise, **_options(noise, mask, camera))
     except Exception as error:
-        # SEP has one exception for all: its buffers are full of bright pixels.
+        # SEP raises one plain exception: its buffers are full of bright pixels.
         raise bad_frame(f"is bright nearly everywhere: {str(error)[:100]}") from None
     return found
 
@@ -352,10 +359,10 @@ def _good(
     stars: npt.NDArray[np.void],
     others: npt.NDArray[np.void],
 ) -> npt.NDArray[np.bool_]:
-    """The pixels that may be believed: bright ones that are no star's are not."""
+    """True for pixels usable for stars: finite, and no part of hot pixels, cosmic rays, tracks."""
     good = known.copy()
     good[others["ypeak"], others["xpeak"]] = False
-    # Of a track all pixels, unless a star is among them.
+    # All pixels of a track are masked, unless a star is among them.
     tracks = others[others["npix"] > TRACK_PIXELS]
     away = np.hypot(tracks["x"][:, None] - stars["x"], tracks["y"][:, None] - stars["y"])
     for each in tracks[away.min(axis=1, initial=np.inf) > _CLOSE_PX]:

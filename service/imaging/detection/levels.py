@@ -1,7 +1,7 @@
-"""The levels of a picture's counts: the step between them, and a scale for single precision.
+"""The quantisation of a picture's counts: the step between levels, and scaling to single precision.
 
-Counts may be integers, the same divided by 65535, rates in electrons per second, or sums of
-several frames.  Nothing that is found on a picture may depend on their unit or their zero.
+Counts may be integers, integers divided by 65535, rates in electrons per second, or sums of several
+frames. No result may depend on their unit or their zero.
 """
 
 import math
@@ -15,14 +15,14 @@ _SAMPLES = 1 << 16
 _FEW_LEVELS = 4
 _LEVELS_OF_8_BITS = 255.0
 _ROUNDING_BITS = 20
-"""Transforms in single precision leave errors of about this many bits below the largest count."""
+"""Rounding error of single-precision transforms: so many bits below the largest count."""
 _LEAST_RANGE, _MOST_RANGE = 2.0**-10, 2.0**40
 _WHOLE_BITS = 16
 
 
 @dataclass(frozen=True)
 class CountLevels:
-    """The step between neighbouring levels of counts, and how they fit into single precision.
+    """The step between levels of counts, and a linear scaling of counts to single precision.
 
     Scaled counts are (counts - `zero_counts`) times `factor`, a power of two.
     """
@@ -33,11 +33,11 @@ class CountLevels:
 
     @property
     def is_as_it_is(self) -> bool:
-        """True if counts fit into single precision as they are."""
+        """True if counts need no scaling for single precision."""
         return self.zero_counts == 0.0 and self.factor == 1.0
 
     def scaled(self, counts: CountArray) -> CountArray:
-        """The scaled counts, in single precision."""
+        """The counts after scaling, in single precision."""
         if self.is_as_it_is:
             return np.array(counts, dtype=np.float32)
         with np.errstate(invalid="ignore"):
@@ -46,16 +46,16 @@ class CountLevels:
 
 
 def count_step(counts: CountArray) -> float:
-    """The least difference between levels of counts (rows, columns); 0 where all are equal.
+    """The least difference between levels of counts (rows, columns); 0 where all counts are equal.
 
-    Of a picture of fewer than four levels it is that of 8 bits over its range.  It is at least what
-    single precision leaves of the largest difference.
+    A picture of fewer than four levels gets the step of 8 bits over its range. The step is at least
+    the rounding error of single precision at the largest difference.
     """
     return _step(*_sampled(counts))
 
 
 def levels_of(counts: CountArray) -> CountLevels:
-    """The levels of counts (rows, columns), NaN and infinite ones left out."""
+    """The step and single-precision scaling of counts (rows, columns), not-finite ones ignored."""
     levels, least, most = _sampled(counts)
     step, span = _step(levels, least, most), most - least
     zero, factor = 0.0, 1.0
@@ -69,9 +69,9 @@ def levels_of(counts: CountArray) -> CountLevels:
 
 
 def _sampled(counts: CountArray) -> tuple[CountArray, float, float]:
-    """Rising levels of a sample of counts, and the least and the most of all."""
+    """Distinct levels of a sample of counts, rising, and the least and largest of all counts."""
     flat = counts.ravel()
-    # An odd stride meets all columns.
+    # An odd stride samples all columns.
     sample = flat[:: max(flat.size // _SAMPLES, 1) | 1]
     levels = np.unique(sample[np.isfinite(sample)]).astype(np.float64)
     least, most = float(np.min(flat)), float(np.max(flat))

@@ -1,4 +1,4 @@
-"""From candidates to stars: place with predicted errors, flags, light and magnitude."""
+"""Measurement of star candidates: centroids with predicted errors, flags, light and magnitude."""
 
 import dataclasses
 import math
@@ -20,14 +20,14 @@ from service.missions.mission import Tracker
 from service.vectors import Vector
 
 MARGIN_PX = 2
-"""The margin about the square that a centroid sums, so that the square may follow the star."""
+"""Margin of pixels about the square of a centroid, so that the square may follow the star."""
 FAINT_SHARE = 0.4
-"""Light above the threshold of the faintest star that is wanted: the rest of it lies below."""
+"""Share of the faintest wanted star's light that is above the threshold; the rest lies below it."""
 
 
 @dataclass(frozen=True)
 class MeasuredStar:
-    """One candidate: its centroid, its instrument magnitude, and why it is in no batch, if so."""
+    """One measured candidate: centroid, instrument magnitude, and the reason if in no batch."""
 
     record: CentroidRecord
     magnitude_mag: float
@@ -43,10 +43,10 @@ def measure(
     method: CentroidMethod,
     faintest_mag: float,
 ) -> list[MeasuredStar]:
-    """The candidates bright enough to matter, the brightest first.
+    """The candidates brighter than a magnitude, measured, the brightest first.
 
-    Each is placed alone; those with others in their window are then placed once more
-    with the light of the others taken away, and those on pixels that were hit without these.
+    Each is measured alone first. Candidates with others in their window are measured again with the
+    light of the others subtracted, and those hit by cosmic rays without the hit pixels.
     """
     exposure_s = frame.exposure_s or camera.exposure_s
     detector = detector_of(frame, found.background_counts, found.noise_counts, camera)
@@ -101,9 +101,10 @@ def measure(
 
 
 def _neighbours(found: Detections, count: int, reach_px: float) -> list[list[int]]:
-    """For each of the first `count` candidates, the others whose light falls into its window.
+    """For each of the first `count` candidates, the indices of the others whose light falls into
+    its window.
 
-    Without those whose images are part of its background.
+    Bright stars whose images are already part of the background are not counted.
     """
     u, v = found.u_px, found.v_px
     whole = found.image_of < 0
@@ -126,7 +127,7 @@ def _without(
     found: Detections,
     psfs: Sequence[Psf],
 ) -> Window:
-    """The window with the images of other stars taken off."""
+    """The window of one star with the images of other stars subtracted."""
     rows, columns = window.counts.shape
     u = np.arange(columns)[None, :] + window.corner_u_px
     v = np.arange(rows)[:, None] + window.corner_v_px
@@ -147,7 +148,7 @@ def chosen_stars(
     faintest_mag: float,
     most: int,
 ) -> list[MeasuredStar]:
-    """The stars by magnitude; those that a batch takes come first."""
+    """The measured stars by magnitude; stars used in the batch come first."""
     used: list[MeasuredStar] = []
     left: list[MeasuredStar] = []
     for record, magnitude in sorted(
@@ -166,7 +167,7 @@ def chosen_stars(
 
 
 def _by_magnitude_else_light(magnitude_mag: float, flux_counts: float) -> tuple[bool, float]:
-    """The sort key of a star: those without a magnitude last, the most light first."""
+    """The sort key of a star: by magnitude, and those without one last, by decreasing light."""
     if math.isnan(magnitude_mag):
         return True, -flux_counts if flux_counts > 0.0 else math.inf
     return False, magnitude_mag

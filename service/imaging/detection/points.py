@@ -1,8 +1,8 @@
-"""Points of light on a picture of which nothing is known, by signal to noise alone.
+"""Detection of points of light in a picture from an unknown camera, by signal to noise alone.
 
-The picture is filtered with the image of a star less what is about it, so that
-what is wider than a star (a tree, the Moon, a cloud, the horizon) leaves little; each
-place is compared with the noise of its own neighbourhood behind the same filter.
+The picture is filtered with the image of a star minus its surroundings, so that objects wider than
+a star (a tree, the Moon, a cloud, the horizon) leave little signal; each place is compared with the
+local noise of the filtered picture.
 """
 
 import math
@@ -30,43 +30,47 @@ from service.vectors import Vector, read_only
 
 MESH_PX = 32
 GUESSED_PSF_PX = 1.2
-"""The width of the first look, from which the width of a star's image is measured."""
+"""Sigma of a star's image assumed in the first detection, which measures the actual width."""
 LIKE_PSF = 1.35
-"""A filter that is no more than this too wide or too narrow loses hardly any signal."""
+"""Largest ratio of an assumed to an actual image width at which a filter loses hardly any
+signal.
+"""
 LEAST_PSF_PX, MOST_PSF_PX = 0.7, 5.0
 SURROUND = 3.0
-"""The width of what is taken off, in widths of a star's image."""
+"""Width of the subtracted surroundings in the filter, in widths of a star's image."""
 FILTER_REACH = 4.0
-"""Widths of the surround at which the filter ends."""
+"""Radius at which the filter ends, in widths of its surroundings."""
 STRIP_ROWS = 256
 MAX_WORKING_PIXELS = 4_000_000
-"""Larger pictures are binned; a star's image is then narrower and no fainter."""
+"""Largest number of pixels processed unbinned; binning makes star images narrower."""
 MAX_POINTS = 300
 FIRST_THRESHOLD, SECOND_THRESHOLD = 5.0, 3.5
 FULL_SHARE = 0.9
-"""The share of the largest count above which a peak may be cut off, and its width unknown."""
+"""Share of the largest count above which a peak may be clipped, so that its width is unknown."""
 HOT_SHARE = 0.25
-"""Light of the four neighbours over that of the brightest pixel: a star has more down to an image
-of a third of a pixel, one standard deviation."""
+"""Least ratio of the light of the four neighbours to that of the brightest pixel for a star:
+reached by images with a sigma of a third of a pixel or more.
+"""
 PLACE_NOISE = 1.34
-"""The error of a place times the signal to noise, in widths of a star's image.
+"""Error of a place times the signal to noise, in widths of a star's image.
 
-The least that there can be is the root of 2 behind a filter with the image of a star alone; the
-surround takes 5 % off the ratio.
+The theoretical least is the root of 2, for a filter with the image of a star alone; the subtracted
+surroundings take 5 % off the signal to noise.
 """
 TRAIL_PEAKS, TRAIL_WEIGHT_PX, TRAIL_ROUNDS = 30, 3.0, 2
-"""The clearest peaks, the width of the weight, and its rounds, by which trails are noticed."""
+"""Number of the clearest peaks, width of the weight, and centroid rounds, used to detect trails."""
 _LEAST_SIGMA_PX = 0.05
 _CENTROID_ROUNDS = 6
 
 
 @dataclass(frozen=True)
 class PointSources:
-    """Candidates for stars (n), the clearest first, and the picture that they stand on.
+    """Candidates for stars (n) in a picture, the clearest first, and the background-subtracted
+    picture.
 
     Places and sigmas are in pixels of the picture, the centre of its first being (0, 0).
-    `signal_ratio` is of the filtered light to the noise about it.  `light` is the picture
-    above its background, each of its pixels `binning` a side.
+    `signal_ratio` is the ratio of the filtered light to the local noise. `light` is the picture
+    above its background, binned by `binning` a side.
     """
 
     u_px: Vector
@@ -78,27 +82,27 @@ class PointSources:
     noise_counts: float
     background_counts: float
     clipped_share: float
-    """The share of pixels at the lowest count: where it is large, the background was cut off."""
+    """Share of pixels at the lowest count: a large share means that the background was clipped."""
     light: CountArray
     binning: int
     width_px: int
     height_px: int
     hot_pixels: int = 0
-    """Single bright pixels, which no star makes."""
+    """The number of single bright pixels, which no star makes."""
     clipped_stars: int = 0
-    """The first candidates, so many, are cut off at the largest count: see `clipped`."""
+    """The number of stars clipped at the largest count, first among candidates; see `clipped`."""
     trail_px: float | None = None
-    """The typical length of the trails along which stars moved; None where they stand still."""
+    """The typical length of star trails in pixels; None for stars that do not trail."""
     trailed: str | None = None
-    """Why the places at mid exposure cannot be told of stars that moved; None where they can."""
+    """The reason why places at mid exposure cannot be told for trailing stars; None if they can."""
 
     @property
     def count(self) -> int:
-        """How many candidates there are."""
+        """The number of candidates."""
         return len(self.u_px)
 
     def mirrored(self, by_rows: bool) -> "PointSources":
-        """The same on the picture with its rows, or else its columns, in reverse order."""
+        """The candidates on the picture with its rows, or else its columns, in reverse order."""
         if by_rows:
             v_px = read_only(self.height_px - 1 - self.v_px)
             return replace(self, v_px=v_px, light=self.light[::-1])
@@ -109,15 +113,16 @@ class PointSources:
 def find_points(
     counts: CountArray, threshold: float = FIRST_THRESHOLD, keep_hot: bool = False
 ) -> PointSources:
-    """The candidates on a picture (rows, columns); their images are measured on it first.
+    """The candidates for stars on a picture (rows, columns); the width of a star's image is
+    measured first.
 
-    Single bright pixels are hot ones, not stars, and are left out unless `keep_hot`.
+    Single bright pixels are hot pixels, not stars, and are left out unless `keep_hot`.
     """
     height, width = counts.shape
     binning = max(1, math.ceil(math.sqrt(counts.size / MAX_WORKING_PIXELS)))
     levels = levels_of(counts)
     working = _filled(_binned(levels.scaled(counts), binning))
-    # Means of counts are finer than these.
+    # The mean of several counts has finer steps.
     step = levels.step_counts * levels.factor / binning
     background = sep.Background(working, bw=MESH_PX, bh=MESH_PX)
     light = working
@@ -175,7 +180,7 @@ def find_points(
 
 @dataclass(frozen=True)
 class _Places:
-    """Places and their sigmas (n) in working pixels, signal to noise, and light in counts."""
+    """Measured places with sigmas (n) in working pixels, signal to noise, and light in counts."""
 
     u_px: Vector
     v_px: Vector
@@ -191,12 +196,12 @@ def _still_places(
     v: npt.NDArray[np.int64],
     ratio: Vector,
 ) -> _Places:
-    """The centroids of the clearest peaks."""
+    """The centroids of the clearest peaks of stars that do not trail."""
     order = np.argsort(-ratio, kind="stable")[:MAX_POINTS]
     u, v, ratio = u[order], v[order], ratio[order]
     weight = max(psf, 1.0)
     shapes = image_moments(light, u, v, weight)
-    # A place between two dark pixels may stand out behind the filter without any light of its own.
+    # The filter may respond between two dark pixels, where there is no light.
     lit = shapes.weighted > 0.0
     ratio = ratio[lit]
     return _Places(
@@ -209,7 +214,7 @@ def _still_places(
 
 
 def _behind(discs: ClippedStars, places: _Places, noise_counts: float) -> _Places:
-    """The places behind discs that are cut off, which are brighter than all of them."""
+    """Clipped stars followed by the other places, since clipped stars are the brightest."""
 
     def joined(first: Vector, second: Vector) -> Vector:
         return np.concatenate([first, second])[:MAX_POINTS]
@@ -231,7 +236,7 @@ def _trails(
     v: npt.NDArray[np.int64],
     ratio: Vector,
 ) -> Trails | None:
-    """The trails of the stars, if the clear peaks are drawn out alike."""
+    """The trails of the stars if the clearest peaks are elongated alike; else None."""
     clear = np.argsort(-ratio, kind="stable")[:TRAIL_PEAKS]
     clear = clear[ratio[clear] > 2.0 * FIRST_THRESHOLD]
     u, v = u[clear], v[clear]
@@ -242,14 +247,14 @@ def _trails(
 
 
 def _below_full(light: CountArray) -> npt.NDArray[np.bool_]:
-    """The pixels (rows, columns) that are not cut off at the largest count."""
+    """True for pixels (rows, columns) that are not clipped at the largest count."""
     return np.asarray(light < FULL_SHARE * light.max(initial=0.0))
 
 
 def _middles_of_trails(
     light: CountArray, noise_counts: float, trails: Trails, threshold: float
 ) -> _Places:
-    """The middles of the clearest trails, without what has another shape."""
+    """The middles of the clearest star trails, without objects of another shape."""
     u, v, ratio = find_trails(light, noise_counts, trails, threshold, MAX_POINTS)
     placed = placed_trails(light, noise_counts, _below_full(light), trails, u, v)
     alike = (placed.unexplained < MOST_UNEXPLAINED) | (ratio < CLEAR_RATIO)
@@ -264,10 +269,10 @@ def _middles_of_trails(
 
 @dataclass(frozen=True)
 class ImageShapes:
-    """Every image's place, width, lack of roundness (0 to 1), and light under the weight.
+    """The place, width, ellipticity (0 to 1) and weighted light of each image.
 
-    `drawn_out` has the ellipticity as its size, and twice the direction of the longer axis from
-    u towards v as its angle.
+    `drawn_out` is complex: its size is the ellipticity, its angle twice the direction of the longer
+    axis from u towards v.
     """
 
     u_px: Vector
@@ -279,7 +284,7 @@ class ImageShapes:
 
 
 def _binned(counts: CountArray, binning: int) -> CountArray:
-    """The means of blocks; an incomplete one at the edge is left out."""
+    """Counts averaged over blocks of pixels; incomplete blocks at the edge are left out."""
     if binning == 1:
         return counts
     rows, columns = (side // binning for side in counts.shape)
@@ -289,7 +294,7 @@ def _binned(counts: CountArray, binning: int) -> CountArray:
 
 
 def _filled(counts: CountArray) -> CountArray:
-    """Pixels without a number at the median of the others."""
+    """Counts with pixels that hold no number replaced by the median of the others, in place."""
     unknown = ~np.isfinite(counts)
     if unknown.any():
         counts[unknown] = np.median(counts[~unknown]) if not unknown.all() else 0.0
@@ -299,28 +304,28 @@ def _filled(counts: CountArray) -> CountArray:
 def _is_hot(
     light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]
 ) -> npt.NDArray[np.bool_]:
-    """True for peaks (n,) that are one bright pixel: its four neighbours hold hardly any light."""
+    """True for peaks (n,) of a single bright pixel, whose four neighbours hold hardly any light."""
     beside = sum(_beside(light, u, v))
     brightest = np.maximum.reduce([light[v, u], *_beside(light, u, v)])
     return np.asarray((light[v, u] == brightest) & (beside < HOT_SHARE * brightest))
 
 
 def _fill(light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]) -> None:
-    """Replace pixels by the median of their four neighbours."""
+    """Replace pixels by the median of their four neighbours, in place."""
     light[v, u] = np.median(_beside(light, u, v), axis=0)
 
 
 def _beside(
     light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64]
 ) -> list[CountArray]:
-    """The light of the neighbours of pixels that are not on the edge, each (n,)."""
+    """The light of the four neighbours, each (n,), of pixels that are not on the edge."""
     return [light[v + down, u + across] for down, across in ((-1, 0), (1, 0), (0, -1), (0, 1))]
 
 
 def _measured_psf(
     light: CountArray, u: npt.NDArray[np.int64], v: npt.NDArray[np.int64], ratio: Vector
 ) -> float:
-    """One standard deviation of a star's image: the median of clear, round, whole ones."""
+    """One standard deviation of a star's image: the median over clear, round, unclipped stars."""
     order = np.argsort(-ratio)[:60]
     u, v, ratio = u[order], v[order], ratio[order]
     shapes = image_moments(light, u, v, GUESSED_PSF_PX)
@@ -335,16 +340,16 @@ def _measured_psf(
 
 
 def _filtered(light: CountArray, psf: float) -> CountArray:
-    """The light behind the image of a star less its surround.
+    """The light filtered with the image of a star minus its surroundings.
 
-    Through spectra, which is six times as quick as two passes of a Gaussian, and in strips
-    of rows, whose spectra stay in the processor's cache.
+    By Fourier transforms, six times as fast as two Gaussian filters, in strips of rows whose
+    spectra fit into the processor's cache.
     """
     height, width = light.shape
     reach = math.ceil(FILTER_REACH * SURROUND * psf)
     strips = math.ceil(height / (STRIP_ROWS - 2 * reach))
     rows = math.ceil(height / strips)
-    # What lies beyond one edge must not come in at the other.
+    # Padding keeps light at one edge from wrapping around to the other.
     down = fft.next_fast_len(rows + 2 * reach, real=True)
     across = fft.next_fast_len(width + reach, real=True)
     response = _star_less_surround(fft.fftfreq(down), fft.rfftfreq(across), psf)
@@ -359,7 +364,7 @@ def _filtered(light: CountArray, psf: float) -> CountArray:
 
 
 def _star_less_surround(down: Vector, across: Vector, psf: float) -> CountArray:
-    """The response to frequencies in cycles a pixel (rows, columns) of the filter."""
+    """Filter's frequency response (rows, columns), cycles per pixel: star minus surroundings."""
 
     def gaussian(frequency: Vector, width: float) -> CountArray:
         return np.exp(-2.0 * (math.pi * width * frequency) ** 2).astype(np.float32)
@@ -373,12 +378,12 @@ def _star_less_surround(down: Vector, across: Vector, psf: float) -> CountArray:
 def _peaks(
     light: CountArray, psf: float, threshold: float, step: float
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], Vector]:
-    """Columns and rows of local maxima behind the filter, and their signal to noise."""
+    """Columns and rows of local maxima of the filtered light, and their signal to noise."""
     filtered = _filtered(light, psf)
-    # Neighbours have the same noise behind the filter: every other pixel shows it.
+    # Filtered noise is correlated between neighbours: every other pixel suffices.
     coarse = np.ascontiguousarray(filtered[::2, ::2])
     noise = sep.Background(coarse, bw=MESH_PX // 2, bh=MESH_PX // 2).rms(dtype=np.float32)
-    # Rounding alone makes this much noise, however flat the counts look.
+    # Rounding of counts alone makes this much noise, however flat the counts look.
     np.maximum(noise, 0.7 * step / (2.0 * math.sqrt(math.pi) * psf), out=noise)
     height, width = filtered.shape
     limit = np.repeat(threshold * noise, 2, axis=1)[:, :width]
@@ -389,7 +394,7 @@ def _peaks(
     edge = int(2.0 * psf) + 1
     inside = (v >= edge) & (v < height - edge) & (u >= edge) & (u < width - edge)
     v, u = v[inside], u[inside]
-    # Only few pixels are that bright: each is compared with those about it.
+    # Few pixels are that bright, so each is compared with its neighbours one by one.
     value, highest = filtered[v, u], np.ones(len(u), dtype=bool)
     reach = min(math.ceil(1.5 * psf), edge)
     for down in range(-reach, reach + 1):
@@ -406,7 +411,7 @@ def image_moments(
     weight_px: float,
     rounds: int = _CENTROID_ROUNDS,
 ) -> ImageShapes:
-    """Centroids and second moments under a Gaussian weight that follows each image."""
+    """Centroids and second moments of images under a Gaussian weight that follows each image."""
     half = max(3, math.ceil(3.0 * weight_px))
     steps = np.arange(-half, half + 1)
     rows = np.clip(v[:, None] + steps, 0, light.shape[0] - 1)
@@ -424,7 +429,7 @@ def image_moments(
         over_v, over_u = weighted.sum(axis=2), weighted.sum(axis=1)
         mean_u = (over_u * along_u).sum(axis=1) / safe
         mean_v = (over_v * along_v).sum(axis=1) / safe
-        # The weight holds a centroid back: by a half where it is as wide as the image.
+        # The weight shortens the centroid's shift: by half where it is as wide as the image.
         x = np.clip(x + 1.5 * mean_u, -reach, reach)
         y = np.clip(y + 1.5 * mean_v, -reach, reach)
     uu = (over_u * along_u**2).sum(axis=1) / safe - mean_u**2
@@ -432,7 +437,7 @@ def image_moments(
     both = weighted * along_v[:, :, None] * along_u[:, None, :]
     uv = both.sum(axis=(1, 2)) / safe - mean_u * mean_v
     size = np.maximum(0.5 * (uu + vv), 0.04)
-    # What the weight took from the width.
+    # The width without the narrowing by the weight.
     sigma = np.sqrt(1.0 / np.clip(1.0 / size - 1.0 / weight_px**2, 0.01, 25.0))
     stretch = np.hypot(uu - vv, 2.0 * uv) / (2.0 * size)
     drawn_out = (uu - vv + 2j * uv) / (2.0 * size)
@@ -440,11 +445,11 @@ def image_moments(
 
 
 HOT_SIGMAS = 8.0
-"""Above the median of a dark frame: such a pixel's own noise hides what falls on it."""
+"""Least height of a hot pixel above the median of a dark frame, in sigmas."""
 
 
 def without_dark(frame: Frame, dark: Frame) -> Frame:
-    """A frame less its dark frame, of the same exposure; hot pixels hold no number.
+    """A frame minus its dark frame of the same exposure; hot pixels become NaN.
 
     Raises `BadFile` for a dark frame of another size.
     """
@@ -461,15 +466,15 @@ DARK_REMARK = "dark_frame: it was taken off, and its hot pixels are ignored"
 
 
 def has_dark(frame: Frame) -> bool:
-    """True for a frame whose dark frame was taken off."""
+    """True for a frame from which a dark frame was subtracted."""
     return DARK_REMARK in frame.remarks
 
 
 def hot_pixels(dark: CountArray) -> CountArray:
-    """The pixels (rows, columns) of a dark frame that stand out, or hold no number."""
+    """True for pixels (rows, columns) of a dark frame that are hot or hold no number."""
     middle = np.nanmedian(dark)
-    # A quiet sensor may have a spread of none: its counts differ by whole steps.
+    # The spread of a quiet sensor may be zero; its counts differ by whole steps.
     spread = max(1.48 * float(np.nanmedian(np.abs(dark - middle))), 0.5 * count_step(dark))
-    # Of counts that are all equal none stands out.
+    # If all counts are equal, none is hot.
     spread = spread or 1.0
     return np.asarray(~(dark < middle + HOT_SIGMAS * spread))

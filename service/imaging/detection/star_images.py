@@ -1,10 +1,10 @@
-"""The images of stars that a camera makes: still, drawn out by the body's rates, and far-reaching.
+"""The images that a camera makes of stars: still, trailed by the body's rates, or with far-reaching
+tails.
 
-Stars whose images reach far, as those of an aperture do, are found one behind the other.
-The tails of a bright star are broken into pieces that look like faint stars, and hide those
-that stand there.  So stars are taken off the frame, the brightest first, each at its best
-place; what is still seen then is searched again.  A piece of a tail is gone by the time that
-its turn comes.
+Stars with far-reaching images, such as diffraction by an aperture, are found one after another. The
+tails of a bright star break into pieces that look like faint stars and hide faint stars. So stars
+are subtracted from the frame, the brightest first, each at its best-fitting place, and the residual
+is searched again. A piece of a tail has disappeared by the time that its turn comes.
 """
 
 import math
@@ -35,24 +35,24 @@ from service.observations.scans.lines import BREAKDOWN_RATIO
 from service.vectors import Matrix, Vector, rotate_about
 
 PsfAt = Callable[[Vector, Vector], list[Psf]]
-"""The image of a star at each of (n,) places of a frame."""
+"""A function from places (n,) on a frame to the image of a star at each place."""
 
 AIRY_OVER_SIGMA = 2.29
-"""lambda f / D over the sigma of the Gaussian that is as wide at half of its height."""
+"""Ratio of lambda f / D to the sigma of the Gaussian with the same full width at half maximum."""
 REACH_OVER_AIRY = 45.0
-"""How far the image of an aperture is known, in lambda f / D: two nulls of a wire of a tenth."""
+"""Radius of a computed diffraction image, in lambda f / D: two nulls of a wire a tenth wide."""
 LEAST_REACH_PX, MOST_REACH_PX = 48, 160
 GAUSSIAN_REACH_PX = 8
 CORE_SIGMAS = 3.0
 COLOURS = 61
-"""Wavelengths that a band is summed over."""
+"""Number of wavelengths in the sum over a band."""
 BLUE_BV_MAG, RED_BV_MAG = -0.2, 1.6
-"""Colour indices of the two stars that the images of all others are mixed of."""
+"""Colour indices B-V of the two stars whose images are mixed for stars of any colour."""
 SHORT_TRAIL_PX = 0.1
 
 
 def reach_px(camera: Camera) -> int:
-    """How far from a star its image is drawn and taken off, in whole pixels."""
+    """The radius in whole pixels to which a star's image is drawn and subtracted."""
     if camera.psf == "gaussian":
         return GAUSSIAN_REACH_PX
     reach = math.ceil(REACH_OVER_AIRY * AIRY_OVER_SIGMA * camera.psf_sigma_px)
@@ -60,7 +60,7 @@ def reach_px(camera: Camera) -> int:
 
 
 def still_psf(camera: Camera) -> Psf:
-    """The image of a star that does not move; that of an aperture is kept once it is computed."""
+    """The image of a star that does not move; a computed diffraction image is cached."""
     if camera.psf != "gaussian" and camera.band_nm is not None:
         blue, red = psfs_of_colours(camera, (BLUE_BV_MAG, RED_BV_MAG))
         return ColouredPsf(blue, red)
@@ -68,7 +68,7 @@ def still_psf(camera: Camera) -> Psf:
 
 
 def psfs_of_colours(camera: Camera, bv_mag: tuple[float, ...]) -> Sequence[Psf]:
-    """The still images of stars of some colour indices B-V, in the band of a camera.
+    """The still images of stars with given colour indices B-V, in the band of a camera.
 
     Stars shine as black bodies (Ballesteros 2012), the detector counts photons.
     """
@@ -110,7 +110,7 @@ def _psf(kind: PsfKind, sigma_px: float, wires: tuple[Wire, ...], reach: int) ->
 
 
 def core_share(camera: Camera) -> float:
-    """The share of a star's light that its core holds; the rest is in tails and rings."""
+    """The share of a star's light in the core of its image; the rest is in tails and rings."""
     if camera.psf == "gaussian":
         return 1.0
     half = math.ceil(CORE_SIGMAS * camera.psf_sigma_px)
@@ -124,7 +124,7 @@ def psf_of(
     rates_deg_per_s: Vector | None = None,
     exposure_s: float = 0.0,
 ) -> PsfAt:
-    """The images of stars on a tracker whose body turns, in body axes; else they stand still."""
+    """A function that gives the images of stars, still or trailed by the body's rates."""
     still = still_psf(camera)
 
     def at(u_px: Vector, v_px: Vector) -> list[Psf]:
@@ -142,13 +142,15 @@ def psf_of(
 
 
 STEP_PX = 0.3
-"""A trail of steps this short differs from a smooth one by less than a thousandth of its peak."""
+"""Step of a sum of still images along a trail: within a thousandth of the peak of a smooth
+trail.
+"""
 MOST_STEPS = 400
 
 
 @dataclass(frozen=True)
 class TrailPsf:
-    """A star's image drawn out evenly along (`trail_u_px`, `trail_v_px`), about its middle."""
+    """A star's image smeared evenly along the chord (`trail_u_px`, `trail_v_px`)."""
 
     psf: Psf
     trail_u_px: float
@@ -156,19 +158,19 @@ class TrailPsf:
 
     @property
     def fwhm_px(self) -> float:
-        """The widths of the still image and of the trail, added in quadrature."""
-        # An even stretch of length l has the variance l^2 / 12.
+        """The full widths of the still image and of the trail, added in quadrature, in pixels."""
+        # A uniform distribution over the length l has the variance l^2 / 12.
         spread = math.hypot(self.trail_u_px, self.trail_v_px) / math.sqrt(12.0)
         return math.hypot(self.psf.fwhm_px, 2.0 * math.sqrt(2.0 * math.log(2.0)) * spread)
 
     def pixel(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> Array:
-        """See `Psf`."""
+        """The share of the light on pixels at (du, dv) from the star; see `Psf`."""
         du, dv = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         parts = [self.psf.pixel(du - u, dv - v) for u, v in self._steps()]
         return np.asarray(sum(parts[1:], parts[0]) / len(parts))
 
     def slopes(self, du_px: npt.ArrayLike, dv_px: npt.ArrayLike) -> tuple[Array, Array]:
-        """See `Psf`."""
+        """The derivatives of that share with respect to du and dv; see `Psf`."""
         du, dv = np.asarray(du_px, dtype=np.float64), np.asarray(dv_px, dtype=np.float64)
         parts = [self.psf.slopes(du - u, dv - v) for u, v in self._steps()]
         along_u, along_v = (np.stack(each).mean(axis=0) for each in zip(*parts, strict=True))
@@ -184,7 +186,7 @@ class TrailPsf:
 
 
 def _drawn_out(psf: Psf, u_px: float, v_px: float) -> Psf:
-    """The image with a trail; that of a band stays one of two colours."""
+    """A star's image smeared along a trail; a mixture of two colours stays one."""
     if isinstance(psf, ColouredPsf):
         blue, red = TrailPsf(psf.blue, u_px, v_px), TrailPsf(psf.red, u_px, v_px)
         return replace(psf, blue=blue, red=red)
@@ -199,10 +201,10 @@ def trails_px(
     v_px: Vector,
     exposure_s: float,
 ) -> tuple[Vector, Vector]:
-    """How far (n,) along u and v stars move over an exposure of a turning body.
+    """The shift (n,) along u and v of stars during an exposure while the body turns, in pixels.
 
-    Places are those of mid exposure; rates are of the body relative to inertial, in
-    body axes, in which a star that stands still moves with -w x v.
+    Places are those of mid exposure; rates w are of the body relative to inertial, in body axes,
+    where an inertially fixed star moves with -w x v.
     """
     turn = np.radians(rates_deg_per_s) @ body_from_tracker * (exposure_s / 2.0)
     middle = camera.directions(u_px, v_px)
@@ -213,31 +215,35 @@ def trails_px(
 
 ROUNDS = 4
 FAR_FWHMS = 1.2
-"""The distance beyond which light is that of the tails."""
+"""Distance from a star, in widths of its image, beyond which light belongs to the tails."""
 TAIL_NOISES = 0.5
-"""A star is taken off where the brightest pixel of its tails has so many sigmas of noise."""
+"""A star is subtracted if the brightest pixel of its tails is above this many sigmas of noise."""
 DOUBT = 0.03
-"""The share of the light taken off that an image unlike the presumed one may leave."""
+"""Error of a subtracted image from an inexact PSF, as a share of its light."""
 SAME_PX = 2.5
 LEAST_SHARE = 0.5
-"""Light left of a candidate after brighter stars are taken off: less may be a piece of a tail.
+"""Least share of a candidate's light that must remain once brighter stars are subtracted; with
+less, the candidate may be a piece of a tail.
 
-A star that stands on a brighter tail shows in the next round."""
+A star on a brighter tail is found in the next round.
+"""
 SEEN_SHARE = 0.3
-"""The share of a star's light that must be seen as that of its candidate."""
+"""Least ratio of a candidate's detected light to the fitted light of its star."""
 MOST_IMAGES, MOST_TRIED = 400, 800
-"""Stars taken off, and candidates tried in a round: the work is bounded on any frame."""
+"""Largest numbers of stars subtracted, and of candidates tried in one round: a bound on the
+work.
+"""
 MARGIN_PX = 2
 FAINTEST_DRAWN = 0.01
-"""Light of a pixel, in sigmas of noise, at which an image may end."""
+"""Light of a pixel, in sigmas of noise, below which an image is cut off."""
 
 Extract = Callable[[CountArray, CountArray, "Mask | None", Camera], npt.NDArray[np.void]]
-"""SEP's search of light (rows, columns), with the noise of each of its pixels."""
+"""A function that detects sources by SEP in light (rows, columns) with a noise map."""
 
 
 @dataclass(frozen=True)
 class StarImage:
-    """One star as it was taken off: place, all of its light, and its image on the frame."""
+    """One subtracted star: its place, its total light, and its image on the frame."""
 
     u_px: float
     v_px: float
@@ -249,18 +255,18 @@ class StarImage:
 
 @dataclass(frozen=True)
 class StarImages:
-    """The stars that were taken off, and the sum of their light on the frame."""
+    """The subtracted stars of a frame, and the sum of their images."""
 
     stars: list[StarImage]
     light: CountArray
 
     def places_and_light(self) -> Array:
-        """U, v and counts of the stars (3, n)."""
+        """Columns, rows and counts of the subtracted stars (3, n)."""
         rows = [(star.u_px, star.v_px, star.flux_counts) for star in self.stars]
         return np.array(rows, dtype=np.float64).reshape(-1, 3).T
 
     def behind(self, window: Window, number: int | None) -> Window:
-        """The window with the light of all stars but one as part of its background."""
+        """A window with the images of all subtracted stars but one as part of its background."""
         rows, columns = window.counts.shape
         v, u = window.corner_v_px, window.corner_u_px
         light = self.light[v : v + rows, u : u + columns].astype(np.float64)
@@ -273,7 +279,7 @@ class StarImages:
 
 
 def put_into(whole: Array, part: Array, row: int, column: int) -> None:
-    """Add a part to the whole, its corner at (row, column), as far as it lies within."""
+    """Add a smaller array to a larger one at (row, column), clipped to the larger one."""
     rows, columns = whole.shape
     top, left = max(row, 0), max(column, 0)
     bottom, right = min(row + part.shape[0], rows), min(column + part.shape[1], columns)
@@ -285,9 +291,9 @@ def put_into(whole: Array, part: Array, row: int, column: int) -> None:
 
 @dataclass(frozen=True)
 class ImageSearch:
-    """The search of one frame.
+    """An iterative search for stars with far-reaching images in one frame.
 
-    `light` is above the background `level`, `noise` one sigma of a pixel of it.
+    `light` is above the background `level`; `noise` is one sigma of a pixel of `light`.
     """
 
     light: CountArray
@@ -300,7 +306,7 @@ class ImageSearch:
     extract: Extract
 
     def taken_off(self) -> tuple[StarImages, npt.NDArray[np.void], CountArray]:
-        """The stars taken off, what SEP finds behind them, and the light that is left."""
+        """The subtracted stars, the candidates found behind them by SEP, and the residual light."""
         images = StarImages([], np.zeros_like(self.light))
         limit = TAIL_NOISES * self.noise / max(_tail_share(still_psf(self.camera)), 1e-9)
         for round_ in range(ROUNDS + 1):
@@ -313,7 +319,9 @@ class ImageSearch:
         return images, _without_residue(images, found), left
 
     def _noise_behind(self, images: StarImages) -> CountArray:
-        """One sigma of each pixel where the images were: of their photons, and of their shape."""
+        """One sigma of each pixel after subtraction, with photon noise and shape error of the
+        images.
+        """
         light = np.maximum(images.light, 0.0)
         gain = self.detector.gain_e_per_count
         variance = self.noise**2 + light / gain + (DOUBT * light) ** 2
@@ -322,7 +330,7 @@ class ImageSearch:
     def _taken(
         self, images: StarImages, found: npt.NDArray[np.void], left: CountArray, limit: float
     ) -> int:
-        """Take off the stars among the candidates, the brightest first; how many."""
+        """Subtract the stars among the candidates, brightest first; returns their number."""
         u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
         sharp = is_sharp(left, u, v, self.camera.psf_sigma_px)
         psfs = self.psf_at(u, v)
@@ -344,7 +352,7 @@ class ImageSearch:
         return len(images.stars) - before
 
     def _refit(self, images: StarImages, number: int) -> None:
-        """Place a star once more, with all others taken off."""
+        """Fit one subtracted star again, with all others subtracted."""
         star = images.stars[number]
         at = star.u_px, star.v_px
         window = images.behind(self._cutout(*at), number)
@@ -356,7 +364,7 @@ class ImageSearch:
         images.stars[number] = placed
 
     def _placed(self, window: Window, at: tuple[float, float], psf: Psf) -> StarImage | None:
-        """The star of a window where it fits best; None where there is no light to fit."""
+        """The best fit of a star in a window; None where the light is too faint to fit."""
         start = at[0] - window.corner_u_px, at[1] - window.corner_v_px
         found, psf = fit_in_its_colour(window, psf, start, self._half)
         if found is None or not found.signal_ratio >= BREAKDOWN_RATIO:
@@ -367,12 +375,12 @@ class ImageSearch:
     def _cutout(self, u_px: float, v_px: float) -> Window:
         half = self._half + MARGIN_PX
         good = None if self.mask is None else ~self.mask
-        # The level is part of the counts, so that full pixels are known as such.
+        # The background level is added to the counts, so that saturated pixels are recognised.
         window = cutout(self.light, u_px, v_px, half, self.detector, self.level, good=good)
         return replace(window, counts=window.counts + window.background_counts)
 
     def _core(self, images: StarImages, u: float, v: float) -> float:
-        """The light about a place that is left now."""
+        """The residual light of the 3 x 3 pixels about a place, after subtraction."""
         return _core_of(self.light, u, v) - _core_of(images.light, u, v)
 
     def _put(self, images: StarImages, star: StarImage) -> None:
@@ -396,7 +404,9 @@ class ImageSearch:
 
     @cached_property
     def _rims(self) -> list[tuple[int, float]]:
-        """Half widths of an image, from the widest, and the share of light on the square's rim."""
+        """Half widths of a star's image, each with the largest share of light on the square's
+        rim.
+        """
         still, halves = still_psf(self.camera), [reach_px(self.camera)]
         while halves[-1] > 4 * self._half:
             halves.append(halves[-1] // 2)
@@ -404,7 +414,7 @@ class ImageSearch:
 
 
 def _tail_share(psf: Psf) -> float:
-    """The share of the light on the brightest pixel of the tails."""
+    """The share of a star's light in the brightest pixel of its tails."""
     far = FAR_FWHMS * psf.fwhm_px
     steps = np.arange(-32.0, 33.0)
     image = psf.pixel(steps[None, :], steps[:, None])
@@ -412,7 +422,7 @@ def _tail_share(psf: Psf) -> float:
 
 
 def _rim(psf: Psf, half: int) -> float:
-    """The share of the light on the brightest pixel of a square's rim."""
+    """The share of a star's light in the brightest pixel on the rim of a square."""
     along = np.arange(-half, half + 1, dtype=np.float64)
     end = np.full_like(along, float(half))
     return float(max(psf.pixel(along, end).max(), psf.pixel(end, along).max()))
@@ -423,12 +433,12 @@ def _near(images: StarImages, u: float, v: float) -> bool:
 
 
 def _core_of(light: CountArray, u: float, v: float) -> float:
-    """The light of the nearest 3 x 3 pixels."""
+    """The light of the 3 x 3 pixels nearest to a place."""
     column, row = max(round(u), 1), max(round(v), 1)
     return float(light[row - 1 : row + 2, column - 1 : column + 2].sum())
 
 
 def _without_residue(images: StarImages, found: npt.NDArray[np.void]) -> npt.NDArray[np.void]:
-    """The candidates that are not what is left of a star that was taken off."""
+    """The candidates that are not residuals of a subtracted star."""
     places = zip(found["x"].tolist(), found["y"].tolist(), strict=True)
     return found[np.array([not _near(images, u, v) for u, v in places], dtype=np.bool_)]

@@ -1,7 +1,8 @@
-"""Frames of a calibrated camera whose stars trail: noticed, and measured in the middle.
+"""Star trails on frames of a calibrated camera: their detection, and the places of stars at mid
+exposure.
 
-The images themselves tell how the stars moved.  Where too few of them are bright, the body's
-rates do.
+The images themselves show how the stars moved. If too few images are bright, the body's rates are
+used.
 """
 
 import math
@@ -37,11 +38,13 @@ from service.observations.scans.lines import BREAKDOWN_RATIO
 from service.vectors import Vector
 
 LEAST_FRAME_WIDTHS = 1.4
-"""The least length in widths of an image: sigmas of a calibrated camera are not scaled later."""
+"""Least trail length in widths of an image; sigmas of a calibrated camera are not rescaled
+later.
+"""
 PIXEL_VARIANCE = 1.0 / 12.0
-"""The variance that a pixel adds to the width of an image on it, in square pixels."""
+"""The variance that a pixel adds to the width of an image, in square pixels."""
 CONTRADICTED_SHARE = 0.3
-"""Rates that give trails of another length by more than this are said to contradict the frame."""
+"""Relative difference of trail lengths by rates and by frame that is a contradiction."""
 
 
 def trails_of_frame(
@@ -52,9 +55,9 @@ def trails_of_frame(
     rates_deg_per_s: Vector,
     exposure_s: float,
 ) -> Trails | None:
-    """The trails of the stars on a frame; None where they are short, or images reach far.
+    """Star trails on a frame; None where they are short, or where the camera's images reach far.
 
-    Raises `BadFile` where stars moved in a way that tells no place at mid exposure.
+    Raises `BadFile` where the motion of stars does not allow a place at mid exposure.
     """
     if camera.psf != "gaussian":
         return None
@@ -65,7 +68,7 @@ def trails_of_frame(
     expected = _by_rates(tracker, camera, rates_deg_per_s, exposure_s)
     if expected is None and not _may_trail(found, camera):
         return None
-    # Hot pixels and cosmic rays would outvote the stars.
+    # Hot pixels and cosmic rays would outnumber the stars.
     usable = usable_pixels(frame, camera) & found.good
     trails = measured_trails(found.light, found.noise_counts, usable, LEAST_FRAME_WIDTHS)
     if trails is None:
@@ -83,7 +86,7 @@ def _refusal(length_px: float, reason: str) -> str:
 
 
 def _may_trail(found: Detections, camera: Camera) -> bool:
-    """True if most of the brightest candidates are drawn out, in whatever direction."""
+    """True if most of the brightest candidates are elongated, in any direction."""
     u, v = (np.round(each[:TRAIL_PEAKS]).astype(np.int64) for each in (found.u_px, found.v_px))
     weight_px = max(TRAIL_WEIGHT_PX, 2.0 * camera.psf_sigma_px)
     shapes = image_moments(found.light, u, v, weight_px, TRAIL_ROUNDS)
@@ -93,8 +96,8 @@ def _may_trail(found: Detections, camera: Camera) -> bool:
 def _by_rates(
     tracker: Tracker, camera: Camera, rates_deg_per_s: Vector, exposure_s: float
 ) -> Trails | None:
-    """The trails that the body's rates make; None where they are short."""
-    # In tracker axes a star at rest moves against the body.
+    """The star trails predicted from the body's rates; None where they are short."""
+    # In tracker axes an inertially fixed star moves opposite to the body.
     turn = -np.radians(rates_deg_per_s) @ tracker.body_from_tracker * exposure_s
     f = camera.focal_length_px
     motion = Motion(
@@ -109,7 +112,7 @@ def _by_rates(
 
 
 def usable_pixels(frame: Frame, camera: Camera) -> CountArray:
-    """The pixels (rows, columns) that hold a number and are not full."""
+    """True for pixels (rows, columns) that hold a number below saturation."""
     full = min(camera.saturation_counts, frame.full_scale)
     return np.asarray(np.isfinite(frame.counts) & (frame.counts < full))
 
@@ -123,9 +126,10 @@ def measure_trails(
     faintest_mag: float,
     exposure_s: float,
 ) -> list[MeasuredStar]:
-    """The stars of a frame with trails, the brightest first, as `measure` gives them.
+    """The stars of a frame with trails, measured, the brightest first, in the form that `measure`
+    gives.
 
-    Whatever the method, each is placed by the best fit of its trail.
+    All methods place a star by the best fit of its trail.
     """
     light, noise = found.light, found.noise_counts
     u, v, ratio = find_trails(light, noise, trails, camera.threshold_sigma, 2 * camera.most_stars)
@@ -139,7 +143,7 @@ def measure_trails(
 
 
 def _record(placed: TrailPlaces, number: int, method: str) -> CentroidRecord:
-    """The record of one star; what its image leaves unexplained widens its sigmas."""
+    """The centroid record of one trailed star; unexplained light enlarges its sigmas."""
     covariance = placed.covariance[number] * max(float(placed.chi_square[number]), 1.0)
     flux = float(placed.flux_counts[number])
     sigma = math.sqrt(float(placed.covariance[number][2, 2]))
@@ -162,7 +166,7 @@ def _record(placed: TrailPlaces, number: int, method: str) -> CentroidRecord:
 def remarks_on_trails(
     trails: Trails, tracker: Tracker, camera: Camera, rates_deg_per_s: Vector, exposure_s: float
 ) -> list[str]:
-    """What is to be said of a frame whose stars trail, also where the rates contradict it."""
+    """Remarks for a frame with star trails, including a contradiction with the body's rates."""
     middles = (
         f"trailed: stars moved by about {trails.length_px:.0f} px during the exposure; the middles "
         "of their trails were taken, where they were at mid exposure"

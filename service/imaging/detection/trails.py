@@ -1,10 +1,10 @@
-"""Stars that trail: recognised by images that are all drawn out alike, and measured in the middle.
+"""Recognition and measurement of trailed stars, whose images are all elongated alike.
 
-A camera that turns while its shutter is open moves each star along a path that follows from its
-place and one small rotation.  That rotation is fitted to the brighter images; then stars are
-looked for behind a filter with the shape of the trail, and placed by its two ends and its length.
-Images that are drawn out alike but not evenly along such a path (two images of each star, a mount
-that stopped halfway) tell no place at mid exposure, and are refused.
+A camera that turns while its shutter is open moves each star along a path that follows from the
+star's place and one small rotation. That rotation is fitted to the brighter images; then stars are
+detected with a filter of the trail's shape, and placed by the two ends and the length of the trail.
+Images that are elongated alike but not even along such a path (two images of each star, a mount
+that stopped halfway) allow no place at mid exposure, and are refused.
 """
 
 import math
@@ -26,23 +26,23 @@ from service.imaging.frames.frame import CountArray
 from service.vectors import Vector, rotate_about
 
 LEAST_WIDTHS = 2.5
-"""The least length, in widths of a still star's image: a shorter trail is placed as a star is."""
+"""Least length of a trail, in widths of a still star's image; shorter ones count as still."""
 LONGEST_SHARE = 0.25
-"""The longest trail that is measured, as a share of the shorter side."""
+"""Longest trail that is measured, as a share of the picture's shorter side."""
 BRIGHT_SIGMAS, CLEAR_SIGMAS = 4.0, 8.0
-"""Least light at the edge and at the peak of a patch, in sigmas behind a filter of star size."""
+"""Least filtered light at the edge and at the peak of a patch, in sigmas, for fitting trails."""
 FILTER_PX = 1.2
 LEAST_PIXELS = 12
 COMPONENTS, LEAST_COMPONENTS, JUDGED = 80, 6, 30
 AGREEING_SHARE = 0.55
-"""The share of the brighter images that one motion must explain."""
+"""Least share of the brighter images that one common motion must explain."""
 TRIALS = 400
 FOCAL_SIDES = (math.inf, 3.0, 1.5, 1.0, 0.7, 0.5)
-"""Focal lengths, in longer sides, with which motions are tried."""
+"""Trial focal lengths of the common motion, in longer sides of the picture."""
 LONGEST_FOCAL_PX = 1e6
 FITTED_STARS = 24
 UNEVEN_SHARE = 0.06
-"""Largest share of a bright trail's squared light that its fitted path may leave beyond noise."""
+"""Largest share of a bright trail's squared light that its path leaves unexplained beyond noise."""
 LARGEST_BOW = 0.2
 """Largest distance of a path's middle from its chord's middle, as a share of the chord."""
 UNEVEN_LIGHT = 0.03
@@ -51,11 +51,11 @@ UNEVEN_LIGHT = 0.03
 
 @dataclass(frozen=True)
 class Motion:
-    """How stars move on the sensor over an exposure: a small rotation seen through a lens.
+    """The common motion of stars on a sensor: a small rotation seen through a lens.
 
-    `shift_u_px` and `shift_v_px` are the motion of a star in the middle, `turn_rad` the rotation
-    about the middle, u towards v, and `focal_px` the lens's focal length.  `bow_px` is added to
-    how far the middle of each path lies from its chord; see `TrailImage`.
+    `shift_u_px` and `shift_v_px` are the motion of a star in the middle, `turn_rad` is the rotation
+    about the middle, u towards v, and `focal_px` the focal length. `bow_px` is added to the bow of
+    every path; see `TrailImage`.
     """
 
     middle_u_px: float
@@ -67,7 +67,7 @@ class Motion:
     bow_px: float = 0.0
 
     def trails(self, u_px: Vector, v_px: Vector) -> tuple[Vector, Vector, Vector]:
-        """The chords along u and v, and the bows (n,), of stars at places of mid exposure."""
+        """Chords along u and v, and the bows (n,), of trails of stars at mid-exposure places."""
         f = self.focal_px
         x, y = (u_px - self.middle_u_px) / f, (v_px - self.middle_v_px) / f
         middle = np.stack([x, y, np.ones_like(x)], axis=-1)
@@ -83,10 +83,10 @@ class Motion:
 
 @dataclass(frozen=True)
 class Trails:
-    """The motion that the images of a picture show, and the width of a still star's image.
+    """The common motion in a picture of trailed stars, and the width of a still star's image.
 
-    `length_px` is the median length over the picture.  `refused` says why no place at mid
-    exposure can be told; None where it can.
+    `length_px` is the median length over the picture. `refused` is the reason why no place at mid
+    exposure can be told, or None.
     """
 
     motion: Motion
@@ -95,7 +95,7 @@ class Trails:
     refused: str | None = None
 
     def image_at(self, u_px: Vector, v_px: Vector) -> TrailImage:
-        """The images of stars (n) at places; its values have the shape (n, 1)."""
+        """The trailed images of stars (n) at given places; the values have the shape (n, 1)."""
         along_u, along_v, bow = self.motion.trails(u_px, v_px)
         return TrailImage(self.sigma_px, along_u[:, None], along_v[:, None], bow[:, None])
 
@@ -106,10 +106,9 @@ def measured_trails(
     usable: npt.NDArray[np.bool_] | None = None,
     least_widths: float = LEAST_WIDTHS,
 ) -> Trails | None:
-    """The trails of the stars on light (rows, columns) above its background.
+    """The star trails on light (rows, columns) above its background.
 
-    None where no common motion draws the images out: where stars stand still, or their images
-    are drawn out by the lens.
+    None where no common motion elongates the images: stars stand still, or the lens elongates them.
     """
     found = _components(light, noise_counts, usable)
     if len(found) < LEAST_COMPONENTS:
@@ -135,7 +134,7 @@ def measured_trails(
 def _components(
     light: CountArray, noise_counts: float, usable: npt.NDArray[np.bool_] | None
 ) -> npt.NDArray[np.void]:
-    """The brightest whole patches of light, those with the most light first."""
+    """The brightest connected patches of light wholly within the picture, most light first."""
     steps = np.arange(-2.0, 3.0)
     kernel = np.exp(-0.5 * (steps[None, :] ** 2 + steps[:, None] ** 2) / FILTER_PX**2)
     noise = noise_counts * float(np.sqrt((kernel**2).sum()) / kernel.sum())
@@ -149,12 +148,12 @@ def _components(
             clean=False,
         )
     except Exception:
-        # SEP has one exception for all: too much of the picture is bright.
+        # SEP raises one plain exception: too much of the picture is bright.
         return np.zeros(0, dtype=[("x", "f8")])
     rows, columns = light.shape
     whole = (found["xmin"] > 0) & (found["ymin"] > 0)
     whole &= (found["xmax"] < columns - 1) & (found["ymax"] < rows - 1)
-    # The edge of a patch cuts off what is fainter: clear ones show their own length.
+    # The threshold cuts off the faint ends of a patch; clear patches show their full length.
     clear = found["cpeak"] > CLEAR_SIGMAS * noise
     if usable is not None:
         clear &= usable[found["ypeak"], found["xpeak"]]
@@ -165,9 +164,9 @@ def _components(
 def _common_motion(
     u: Vector, v: Vector, square: npt.NDArray[np.complex128], width: float, rows: int, columns: int
 ) -> Motion | None:
-    """The motion that explains most trails, by trials with two of them.
+    """The common motion that explains most trails, found by random trials with two trails.
 
-    `square` (n,) is (t_u + i t_v)^2 of each trail t: its direction has no sense.
+    `square` (n,) is (t_u + i t_v)^2 of each trail t, since a trail's direction has no sign.
     """
     seen = np.sqrt(square)
     middle_u, middle_v = 0.5 * (columns - 1), 0.5 * (rows - 1)
@@ -200,7 +199,7 @@ def _common_motion(
 
 
 def _design(x: Vector, y: Vector, inverse: float) -> Vector:
-    """The motion along u and v (2, n, 3) for each unit of shift along u and v, and of turn."""
+    """Motions along u and v (2, n, 3) per unit of shift along u, shift along v, and turn."""
     k = inverse**2
     along_u = np.stack([1.0 + k * x * x, k * x * y, -y], axis=-1)
     along_v = np.stack([k * x * y, 1.0 + k * y * y, x], axis=-1)
@@ -208,7 +207,7 @@ def _design(x: Vector, y: Vector, inverse: float) -> Vector:
 
 
 def _solved(design: Vector, target: npt.NDArray[np.complex128]) -> Vector:
-    """The shift and turn (3,) that fit motions best; turns are held back a little."""
+    """The least-squares shift and turn (3,) for observed motions, slightly regularised."""
     rows = np.concatenate([design[0], design[1]])
     right = np.concatenate([target.real, target.imag])
     scale = np.maximum(np.sqrt((rows**2).mean(axis=0)), 1e-9)
@@ -229,7 +228,9 @@ def _fitted(
     usable: npt.NDArray[np.bool_] | None,
     found: npt.NDArray[np.void],
 ) -> Trails:
-    """The same with motion and width fitted to the pixels of bright trails, and judged by them."""
+    """Trails with motion and width refined on the pixels of bright trails, and with a reason for
+    refusal if the fit is bad.
+    """
     u, v = found["x"].astype(np.float64), found["y"].astype(np.float64)
     along_u, along_v, _ = trails.motion.trails(u, v)
     told = (along_u + 1j * along_v) ** 2
@@ -255,7 +256,7 @@ def _fitted(
 
 
 def _stepped(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Trails:
-    """Motion and width after a Gauss-Newton step in which every star keeps its best place."""
+    """Motion and width of trails after one Gauss-Newton step that eliminates the stars' places."""
     u, v, flux = placed.u_px, placed.v_px, placed.flux_counts[:, None]
     du, dv = pixels.u_px - u[:, None], pixels.v_px - v[:, None]
 
@@ -267,14 +268,14 @@ def _stepped(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Trails
     model = flux * value
     own = np.stack([-flux * by_u, -flux * by_v, value], axis=-1)
     usable = pixels.usable
-    # Every star counts alike; bright ones would decide alone.
+    # All stars have equal weight; otherwise bright ones would dominate.
     weight = np.where(usable, 1.0, 0.0) / np.maximum(flux, 1e-9) ** 2
     columns = np.stack(
         [(drawn(_changed(trails, name, step)) - model) / step for name, step in _STEPS.items()],
         axis=-1,
     )
     left = np.where(usable, pixels.light - model, 0.0)
-    # Those that the shape explains least, blends, pull little.
+    # Stars that the shape explains badly, such as blends, get little weight.
     share = (np.where(usable, left**2, 0.0)).sum(axis=1) / np.maximum((model**2).sum(axis=1), 1e-30)
     usual = max(float(np.median(share)), 1e-6)
     weight = weight / (1.0 + (share / (3.0 * usual)) ** 2)[:, None]
@@ -308,7 +309,7 @@ def _changed(trails: Trails, name: str, change: float) -> Trails:
 
 
 def _difference(one: Trails, other: Trails) -> float:
-    """The largest difference in pixels of two motions, with the turn taken at the edge."""
+    """The largest difference of two motions in pixels, with rotation measured at the edge."""
     a, b = one.motion, other.motion
     return max(
         abs(a.shift_u_px - b.shift_u_px),
@@ -320,7 +321,7 @@ def _difference(one: Trails, other: Trails) -> float:
 
 
 def _refusal(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> str | None:
-    """Why the stars' places at mid exposure are not told by their trails; None where they are."""
+    """The reason why trails do not give places at mid exposure; None if they do."""
     bow = np.abs(trails.motion.trails(placed.u_px, placed.v_px)[2])
     if float(np.median(bow)) > LARGEST_BOW * trails.length_px:
         return "too strongly bent"
@@ -333,7 +334,7 @@ def _refusal(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> str | 
 
 
 def _mean_light_px(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> Vector:
-    """The distance (n,) along each trail from its middle to the mean of its light, in pixels."""
+    """The distance (n,) along each trail from its middle to its mean light, in pixels."""
     u, v = placed.u_px, placed.v_px
     image = trails.image_at(u, v)
     along, across, *_ = image.along_and_across(pixels.u_px - u[:, None], pixels.v_px - v[:, None])
@@ -341,22 +342,24 @@ def _mean_light_px(trails: Trails, pixels: TrailPixels, placed: TrailPlaces) -> 
     inside = pixels.usable & (np.abs(across) < reach + np.abs(image.bow_px))
     inside &= np.abs(along) < 0.5 * image.length_px + reach
     light = np.where(inside, pixels.light, 0.0)
-    # Of an even trail the mean and the middle are one point; of a ramp or a step they are not.
+    # In an even trail the mean light is at the middle; in a ramp or a step it is not.
     total = np.maximum(light.sum(axis=1), 1e-9)
     return np.asarray((light * along).sum(axis=1) / total)
 
 
 LEAST_CLEAR, LEAST_DRAWN_OUT, LEAST_COHERENCE = 8, 0.15, 0.6
-"""Images that trail: their least number, ellipticity, and share of it smooth over the picture."""
+"""Criteria for trailed images: their least number, least ellipticity, and least share of it that is
+smooth over the picture.
+"""
 
 
 def may_trail(
     u_px: Vector, v_px: Vector, drawn_out: npt.NDArray[np.complex128], side_px: int
 ) -> bool:
-    """True if bright images (n) are drawn out alike, as far as their own middles show it.
+    """True if bright images (n) are elongated alike, judged by their central parts.
 
-    `drawn_out` has the ellipticity as its size, twice the direction as its angle.  Of stars that
-    stand still it differs from star to star.
+    `drawn_out` is complex: its size is the ellipticity, its angle twice the direction. It differs
+    randomly between stars that stand still.
     """
     if len(u_px) < LEAST_CLEAR or np.median(np.abs(drawn_out)) < LEAST_DRAWN_OUT:
         return False
@@ -373,9 +376,10 @@ TWIN_REACH_SHARE, TWIN_GATE_PX, TWIN_RATIO = 0.125, 1.0, 1.35
 
 
 def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> float | None:
-    """The distance of the two images that every star has; None where stars have one each.
+    """The distance in pixels of the two images that every star has; None where stars have single
+    images.
 
-    Stars (n), the clearest first.  The images stand apart alike, and share the light alike.
+    Stars (n) are given the clearest first. All pairs have the same displacement and ratio of light.
     """
     u_px, v_px, flux = (each[:TWIN_OTHERS] for each in (u_px, v_px, flux))
     count = min(len(u_px), TWIN_ANCHORS)
@@ -386,10 +390,10 @@ def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> 
     anchor, other = np.nonzero((apart > 0.0) & (apart < TWIN_REACH_SHARE * side_px))
     du, dv, apart = du[anchor, other], dv[anchor, other], apart[anchor, other]
     share = np.log(np.maximum(flux[other], 1e-9) / np.maximum(flux[anchor], 1e-9))
-    # So many anchors have a twin that one of the first ones has.
+    # At least this share of anchors must have a twin, so one of the first anchors has one.
     tried = np.flatnonzero(anchor < count - math.ceil(TWIN_SHARE * count) + 1)
     for k in tried.tolist():
-        # The twin of one star is to the right of it, or the star is that of its twin.
+        # A twin lies on either side: the star itself may be the twin of the other.
         same = np.zeros(len(du), dtype=bool)
         for sense in (1.0, -1.0):
             alike = (np.abs(du - sense * du[k]) < TWIN_GATE_PX) & (
@@ -404,7 +408,7 @@ def twin_distance_px(u_px: Vector, v_px: Vector, flux: Vector, side_px: int) -> 
 PEAK_WIDTHS = 1.5
 TILE_PX, LEAST_TILE_PX = 256, 48
 TILE_WIDTHS = 3.0
-"""Largest difference of trails within a tile, in widths of a star's image."""
+"""Largest difference of trails within one tile of the filter, in widths of a star's image."""
 SURROUND = 3.0
 FILTER_REACH = 4.0
 MOST_UNEXPLAINED = 0.5
@@ -414,9 +418,9 @@ CLEAR_RATIO = 20.0
 def find_trails(
     light: CountArray, noise: CountArray | float, trails: Trails, threshold: float, most: int
 ) -> tuple[Vector, Vector, Vector]:
-    """Places along u and v (n,) and signal to noise of trails, the clearest first.
+    """Places along u and v (n,) and signal to noise of star trails, the clearest first.
 
-    The light is seen behind a filter with the shape of a trail less what surrounds it.
+    The light is filtered with the shape of a trail minus its surroundings.
     """
     filtered = np.zeros(light.shape, dtype=np.float32)
     rows, columns = light.shape
@@ -430,7 +434,7 @@ def find_trails(
             )
     spread = sep.Background(np.ascontiguousarray(filtered[::2, ::2]), bw=32, bh=32)
     behind = spread.rms(dtype=np.float32)
-    # Where bright trails lie close, too little is left to show the noise.
+    # Where bright trails are dense, the local noise would be underestimated.
     np.maximum(behind, 0.5 * float(np.median(behind)) or 1e-12, out=behind)
     ratio = filtered / np.repeat(np.repeat(behind, 2, axis=0), 2, axis=1)[:rows, :columns]
     v, u = np.nonzero(ratio > threshold)
@@ -451,7 +455,7 @@ def find_trails(
 
 
 def _tile_px(trails: Trails, rows: int, columns: int) -> int:
-    """The side of tiles in which all trails are nearly alike."""
+    """The side of square tiles within which all trails are nearly alike, in pixels."""
     motion = trails.motion
     u, v = np.array([0.0, columns, 0.0, columns]), np.array([0.0, 0.0, rows, rows])
     along_u, along_v, _ = motion.trails(u, v)
@@ -463,7 +467,7 @@ def _tile_px(trails: Trails, rows: int, columns: int) -> int:
 def _filtered_tile(
     light: CountArray, trails: Trails, tile: tuple[int, int, int, int]
 ) -> CountArray:
-    """The light of a tile (top, left, bottom, right) behind the filter of its middle."""
+    """The light of a tile (top, left, bottom, right) filtered with the trail at its middle."""
     top, left, bottom, right = tile
     rows, columns = light.shape
     u, v = np.array([0.5 * (left + right - 1)]), np.array([0.5 * (top + bottom - 1)])
@@ -487,7 +491,7 @@ def _filtered_tile(
 
 
 def _alone(trails: Trails, u: Vector, v: Vector) -> npt.NDArray[np.intp]:
-    """The places (in order of their signal) that lie on no clearer star's trail."""
+    """The indices of places, in order of their signal, that lie on no clearer star's trail."""
     along_u, along_v, _ = trails.motion.trails(u, v)
     length = np.maximum(np.hypot(along_u, along_v), 1e-9)
     cos, sin = along_u / length, along_v / length
@@ -511,9 +515,9 @@ def placed_trails(
     v_px: Vector,
     gain_e_per_count: float = math.inf,
 ) -> TrailPlaces:
-    """The stars (n) whose trails lie about places, each with a covariance; see `fit_trails`."""
+    """Stars (n) fitted with their trails near given places, with covariances; see `fit_trails`."""
     placed = _placed(light, noise, usable, trails, u_px, v_px, gain_e_per_count)
-    # Once more, each without the light of all others.
+    # The second fit subtracts the light of all other stars.
     all_light = _drawn(trails, placed, light.shape)
     return _placed(
         light, noise, usable, trails, placed.u_px, placed.v_px, gain_e_per_count, all_light, placed
@@ -531,7 +535,7 @@ def _placed(
     all_light: CountArray | None = None,
     before: TrailPlaces | None = None,
 ) -> TrailPlaces:
-    """The stars placed in parts; given all their light, each has that of the others taken off."""
+    """The stars fitted in chunks with their trails; `all_light` has other stars to subtract."""
     longest = max(float(np.hypot(*trails.motion.trails(u_px, v_px)[:2]).max(initial=0.0)), 1.0)
     chunk = max(int(CHUNK_PIXELS / (longest + 12.0 * trails.sigma_px) ** 2), 1)
     parts = []
@@ -554,7 +558,7 @@ def _placed(
 
 
 def _drawn(trails: Trails, placed: TrailPlaces, shape: tuple[int, int]) -> CountArray:
-    """The light of all stars (rows, columns), drawn as far as it counts."""
+    """The modelled light of all stars (rows, columns), drawn as far as it is significant."""
     whole = np.zeros(shape)
     nothing = np.zeros(shape, dtype=np.float32)
     for first in range(0, len(placed.u_px), 40):

@@ -1,1 +1,1 @@
-"""Frames from image files: FITS, TIFF, PNG, JPEG, GIF, BMP, raw files and numpy arrays."""
+"""Readers of frames from files: FITS, TIFF, PNG, JPEG, GIF, BMP, raw files and numpy arrays."""

@@ -1,4 +1,4 @@
-"""The one reader of a frame's file: no place or size that a file states leads out of the file."""
+"""File reader for untrusted frames: no offset or size stated in the file leads out of the file."""
 
 import io
 import os
@@ -11,11 +11,12 @@ from service.imaging.frames.frame import bad_frame
 
 
 class BoundedFile(io.RawIOBase):
-    """A file read between its first and its last byte, whatever place or size is asked for.
+    """A binary file whose reads stay between its first and last byte, whatever offset or size is
+    asked for.
 
-    A place beyond the end is no error until bytes are read there: none are.  So a place of 2**62 in
-    a header costs nothing, and a read takes no more memory than the file has bytes left.
-    Libraries take it for a file that is open for reading alone.
+    An offset beyond the end is no error until bytes are read there, and none are. So an offset of
+    2**62 in a header costs nothing, and a read takes no more memory than the file has bytes left.
+    Libraries accept the object as a file open for reading.
     """
 
     mode = "rb"
@@ -28,23 +29,23 @@ class BoundedFile(io.RawIOBase):
 
     @property
     def stream(self) -> IO[bytes]:
-        """The same under the type that libraries ask for; they only read."""
+        """The same file, typed as the binary file object that libraries expect."""
         return cast("IO[bytes]", self)
 
     def readable(self) -> bool:
-        """True: it is there to be read."""
+        """Always true: the file can be read."""
         return True
 
     def seekable(self) -> bool:
-        """True: every place of it can be read."""
+        """Always true: the file allows random access."""
         return True
 
     def tell(self) -> int:
-        """The place of the next byte that is read; it may lie beyond the end."""
+        """The offset of the next byte to read, which may lie beyond the end."""
         return self._place
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        """Move to a place, also beyond the end; raises `BadFile` for one before the beginning."""
+        """Move to an offset, also beyond the end; raises `BadFile` for one before the beginning."""
         start = {os.SEEK_SET: 0, os.SEEK_CUR: self._place, os.SEEK_END: self.length}[whence]
         if start + offset < 0:
             raise bad_frame("states a place before its beginning", str(start + offset)[:40])
@@ -53,11 +54,11 @@ class BoundedFile(io.RawIOBase):
 
     @property
     def left(self) -> int:
-        """The number of bytes from here to the end."""
+        """The number of bytes from the present offset to the end of the file."""
         return max(self.length - self._place, 0)
 
     def read(self, size: int | None = -1) -> bytes:
-        """The next bytes, at most those that are left."""
+        """The next bytes of the file, at most as many as are left."""
         wanted = self.left if size is None or size < 0 else min(size, self.left)
         if wanted == 0:
             return b""
@@ -67,18 +68,18 @@ class BoundedFile(io.RawIOBase):
         return data
 
     def readall(self) -> bytes:
-        """All bytes from here to the end."""
+        """All bytes from the present offset to the end of the file."""
         return self.read()
 
     def readinto(self, buffer: Any) -> int:
-        """Fill a buffer with the next bytes, as far as there are any; returns their number."""
+        """Fill a buffer with the next bytes of the file; returns the number of bytes read."""
         view = memoryview(buffer).cast("B")
         data = self.read(len(view))
         view[: len(data)] = data
         return len(data)
 
     def exactly(self, count: int) -> bytes:
-        """The next bytes; raises `BadFile` where the file ends before, and reads nothing."""
+        """Exactly `count` bytes; raises `BadFile`, without reading, where the file ends earlier."""
         if self.left < count:
             message = f"{self.left} bytes of data where {count} are declared"
             raise bad_frame("is cut off", message[:80])
@@ -87,9 +88,9 @@ class BoundedFile(io.RawIOBase):
 
 @contextmanager
 def decoding(what: str) -> Iterator[None]:
-    """Turn whatever a decoder raises into `BadFile`: what it reads is no such file.
+    """A context manager that turns any exception of a decoder into `BadFile`.
 
-    A decoder that stumbles over what it reads does so in many ways.
+    Decoders raise many kinds of exceptions for damaged files.
     """
     try:
         yield

@@ -1,7 +1,8 @@
-"""EXIF of pictures, read only where it is small: their time, and the way a viewer turns them.
+"""EXIF of pictures, read only where it is small: the time, the exposure and the orientation for
+display.
 
-Pillow turns every number of an EXIF directory into an object, twenty times as large as the
-number in the file.
+Pillow turns every number of an EXIF directory into an object, twenty times as large as the number
+in the file.
 """
 
 import io
@@ -19,19 +20,21 @@ from service.imaging.frames.frame import AS_STORED, CountArray, Frame, bad_frame
 
 MAX_EXIF_BYTES = 1 << 20
 _TYPE_BYTES = (8, 1, 1, 2, 4, 8, 1, 1, 2, 4, 8, 4, 8, 4, 8, 8, 8, 8, 8)
-"""Bytes by the number of the type, of which 0 is none."""
+"""Sizes in bytes of the TIFF data types, indexed by type number; type 0 does not exist."""
 _EXIF, _EXPOSURE, _TAKEN, _OFFSET, _FRACTION = 0x8769, 33434, 36867, 36881, 37521
 _LONGEST_EXPOSURE_S = 3600.0
 _TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d):(\d\d):(\d\d)")
 _POINTERS = (_EXIF, 0x8825, 0xA005)
-"""Tags that lead to a directory of further ones: of EXIF, of GPS, of interoperability."""
+"""EXIF tags that point to a further directory: EXIF, GPS, interoperability."""
 _MARK = b"Exif\0\0"
 _MAX_SEGMENTS = MAX_EXIF_BYTES // 65536
 _BLOCK_BYTES = 1 << 20
 
 
 class Entry(NamedTuple):
-    """One tag of a directory of TIFF, with the bytes (4 or 8) that are its value or its place."""
+    """One tag of a TIFF directory, with the bytes (4 or 8) of its value or of the value's
+    offset.
+    """
 
     tag: int
     kind: int
@@ -40,19 +43,19 @@ class Entry(NamedTuple):
 
     @property
     def size_bytes(self) -> int:
-        """The size of all its numbers."""
+        """The size in bytes of all numbers of a tag."""
         known = self.kind < len(_TYPE_BYTES)
         return self.number * (_TYPE_BYTES[self.kind] if known else 8)
 
     def whole(self, order: str) -> int:
-        """The value of a tag of one whole number."""
+        """The value of a tag that holds one whole number."""
         is_long = len(self.value) == 8 and self.kind not in (3, 4)
         form = "H" if self.kind == 3 else "Q" if is_long else "L"
         return int(struct.unpack_from(order + form, self.value)[0])
 
 
 def directory(file: BoundedFile, order: str, at: int, big: bool = False) -> list[Entry]:
-    """The entries of a directory of TIFF; raises `struct.error` where the file ends before."""
+    """The entries of a TIFF directory at an offset; raises `struct.error` if the file ends."""
     file.seek(at)
     (count,) = struct.unpack(order + ("Q" if big else "H"), file.read(8 if big else 2))
     form, size = (order + "HHQ8s", 20) if big else (order + "HHL4s", 12)
@@ -64,9 +67,9 @@ def directory(file: BoundedFile, order: str, at: int, big: bool = False) -> list
 def bytes_beyond(
     file: BoundedFile, order: str, entries: list[Entry], depth: int = 2, big: bool = False
 ) -> int:
-    """The size of all tags in the directories to which entries lead, and these in turn."""
+    """The total size of the tags in all directories that entries point to, recursively."""
     total = 0
-    # The first of equal tags counts.
+    # Of several entries with one tag the first counts.
     for tag, entry in {entry.tag: entry for entry in reversed(entries)}.items():
         if tag in _POINTERS and entry.number == 1:
             with suppress(struct.error):
@@ -77,9 +80,10 @@ def bytes_beyond(
 
 
 def require_small_exif(file: BoundedFile) -> None:
-    """Raise `BadFile` for a JPEG with much EXIF, of which Pillow reads some on opening it.
+    """Raise `BadFile` for a JPEG with too much EXIF, which Pillow would partly read on opening the
+    file.
 
-    One piece has up to 64 KiB; Pillow joins all that there are.
+    One segment has up to 64 KiB; Pillow joins all segments.
     """
     file.seek(0)
     found, before = 0, b""
@@ -92,19 +96,19 @@ def require_small_exif(file: BoundedFile) -> None:
 
 
 def exif_of(image: Any) -> Mapping[int, Any]:
-    """The tags of an image's EXIF; none where there are none, or too many."""
+    """The EXIF tags of an image; empty if it has none or too many."""
     if not _is_small(image):
         return {}
     try:
         exif: Mapping[int, Any] = image.getexif()
     except Exception:
-        # Pillow raises many kinds of errors for broken EXIF. The picture is solved without it.
+        # Pillow raises many kinds of errors for broken EXIF. The picture is solved without EXIF.
         return {}
     return exif
 
 
 def timing_remarks(time: str | None, exposure_s: float | None) -> list[str]:
-    """Remarks that name the tags of a time and an exposure, as far as there are any."""
+    """Remarks that name the EXIF tags from which the time and the exposure of a picture come."""
     remarks = []
     if time is not None:
         source = "EXIF DateTimeOriginal (start of the exposure)"
@@ -115,9 +119,10 @@ def timing_remarks(time: str | None, exposure_s: float | None) -> list[str]:
 
 
 def exposure_of(image: Any) -> tuple[str | None, float | None]:
-    """The UTC of mid exposure and the exposure in seconds, each None where EXIF does not tell.
+    """The UTC of mid exposure and the exposure in seconds from EXIF, each None where EXIF does not
+    state it.
 
-    A camera's clock without its offset from UTC tells no time.
+    A camera's clock without its offset from UTC gives no time.
     """
     try:
         exif = exif_of(image).get_ifd(_EXIF)  # type: ignore[attr-defined]
@@ -129,7 +134,7 @@ def exposure_of(image: Any) -> tuple[str | None, float | None]:
 def exif_exposure(
     taken: object, offset: object, fraction: object, exposure: Any
 ) -> tuple[str | None, float | None]:
-    """UTC of mid exposure and exposure in seconds from the values of four tags of EXIF."""
+    """The UTC of mid exposure and the exposure in seconds from the values of four EXIF tags."""
     exposure_s = None
     with suppress(TypeError, ValueError, ZeroDivisionError, OverflowError):
         pair = exposure if isinstance(exposure, tuple) else (exposure, 1)
@@ -159,7 +164,7 @@ def _utc(taken: object, offset: object, fraction: object, exposure_s: float | No
 
 
 def _is_small(image: Any) -> bool:
-    """True if EXIF outside of the directories of a TIFF takes little memory."""
+    """True if an image's EXIF block is small enough to be parsed."""
     exif = image.info.get("exif", b"")
     if len(exif) > MAX_EXIF_BYTES:
         return False
@@ -184,13 +189,13 @@ _TURNS: Mapping[int, str] = {
     7: "rows and columns exchanged, then turned by 180 deg",
     8: "turned by 90 deg counterclockwise",
 }
-"""From the order of the stored pixels to the picture that is shown (EXIF 2.32, 4.6.4)."""
+"""EXIF orientations in words: from the stored to the shown picture (EXIF 2.32, 4.6.4)."""
 
 
 def as_shown(counts: CountArray, tag: object) -> tuple[CountArray, str]:
-    """Stored counts (rows, columns) as they are shown, and what was done, in words.
+    """Counts (rows, columns) turned for display by an EXIF orientation, and the turn in words.
 
-    A tag that is none of the eight counts as 1, as in viewers.
+    An unknown orientation counts as 1, as in viewers.
     """
     if not isinstance(tag, int) or tag not in _TURNS:
         return counts, AS_STORED
@@ -205,15 +210,15 @@ def as_shown(counts: CountArray, tag: object) -> tuple[CountArray, str]:
 
 
 def is_by_rows(frame: Frame) -> bool:
-    """True if the mirror image of a frame has its rows in reverse order, not its columns.
+    """True for a frame whose mirror image reverses the rows, false if it reverses the columns.
 
-    FITS files whose first row is the lowest one are mirrored by a reader that begins at the top.
+    FITS files store the lowest row first; readers that begin at the top mirror the picture.
     """
     return frame.file_format == "FITS"
 
 
 def mirrored(frame: Frame) -> Frame:
-    """The mirror image of a frame, which says so."""
+    """A frame with its mirror image, with a note in its orientation."""
     by_rows = is_by_rows(frame)
     counts = frame.counts[::-1] if by_rows else frame.counts[:, ::-1]
     how = "top and bottom" if by_rows else "left and right"

@@ -1,9 +1,9 @@
-"""Frames from files: FITS, pictures, raw files and numpy arrays, told apart by how they begin.
+"""The reader of frames from files: FITS, pictures, raw files and numpy arrays, recognised by first
+bytes.
 
-A file is not to be believed.  Every reader works on a `BoundedFile`; the size in pixels
-is read from the header and held against the limits before anything is decoded.  Whatever
-is wrong raises `BadFile` with the reason.
-Files of numpy and raw files are read here, the others in modules of their own.
+Files are untrusted. Every reader works on a `BoundedFile`; the size in pixels is read from the
+header and compared with the limits before any decoding. Any fault raises `BadFile` with the reason.
+This module reads numpy arrays and raw files; other formats have their own modules.
 """
 
 import gzip
@@ -36,9 +36,9 @@ COLOURS = 3
 
 
 def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
-    """A frame from a .npy file of (rows, columns), or of planes or three colours beside them.
+    """A frame from a .npy file of (rows, columns), of several planes, or of three colours.
 
-    Of colours the counts are the sums; of planes one has to be chosen.  Raises `BadFile`.
+    Colours are summed; one of several planes has to be chosen. Raises `BadFile`.
     """
     try:
         version = np.lib.format.read_magic(file)
@@ -48,12 +48,12 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
     except BadFile:
         raise
     except Exception as error:
-        # numpy reads its header as an expression of Python, which gives up in many ways.
+        # numpy evaluates its header as a Python expression, which fails in many ways.
         raise bad_frame(f"has no readable .npy header: {str(error)[:200]}") from None
     if dtype.kind not in "iuf" or dtype.itemsize > 8:
         raise bad_frame("must hold numbers of up to 64 bits", str(dtype)[:80])
     if any(type(side) is not int for side in shape):
-        # A truth value is a whole number of Python.
+        # In Python a bool is an int, too.
         raise bad_frame("must have a shape of whole numbers", str(shape)[:80])
     axis, plane, remarks = _chosen_plane(shape, limits.image)
     height_px, width_px = (side for k, side in enumerate(shape) if k != axis)
@@ -79,10 +79,10 @@ def read_npy(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
 def _chosen_plane(
     shape: tuple[int, ...], choice: str | None
 ) -> tuple[int | None, int | None, tuple[str, ...]]:
-    """The axis of the planes of an array, the plane that was chosen from 0, and remarks.
+    """The axis of an array's planes, the chosen plane counted from 0, and remarks.
 
-    Without a plane three of them are colours to sum.  Raises `BadFile` for another number of axes,
-    and for several planes of which none is chosen.
+    Without an explicit choice, three planes are colours to sum. Raises `BadFile` for another number
+    of axes, and for several planes without a choice.
     """
     number = None if choice is None else choice.removeprefix(":")
     if len(shape) == 2:
@@ -102,13 +102,13 @@ def _chosen_plane(
 
 
 def as_counts(values: npt.NDArray[Any]) -> CountArray:
-    """Numbers of any kind as counts: float32 where that is exact, in the machine's own order."""
+    """Pixel values as counts: float32 where that is exact, else float64, in native byte order."""
     exact = values.dtype.itemsize <= 2 or values.dtype.str[1:] == "f4"
     return np.ascontiguousarray(values, dtype=np.float32 if exact else np.float64)
 
 
 def full_scale_of(dtype: np.dtype[Any]) -> float:
-    """The largest number that integers of a kind can hold; infinite for floating ones."""
+    """The largest number of an integer type; infinite for floating-point types."""
     return float(np.iinfo(dtype).max) if dtype.kind in "iu" else math.inf
 
 
@@ -124,18 +124,18 @@ OTHERS: Mapping[bytes, str] = {
     b"CCSD3ZF": _PDS3,
     b"<?xml": "an XML label, as of PDS4; write its image as FITS, TIFF or .npy (with pdr)",
 }
-"""Formats that are known by their first bytes, and not read."""
+"""Advice on image formats that are recognised by their first bytes but not read."""
 MORE_BYTES, BYTES_PER_PIXEL = 64 << 20, 24
-"""The most that a compressed file may unfold into: three planes of 64 bits, and other units."""
+"""Margin in bytes, and bytes per pixel, in the size limit of a decompressed file."""
 _BLOCK_BYTES = 1 << 20
 _LONGEST_MAGIC = 16
 _GZIP = b"\x1f\x8b"
 
 
 def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) -> Frame:
-    """The frame in a file that can be read from any place of it; `digest` where it is known.
+    """The frame in a seekable file; `digest` is passed where it is known already.
 
-    Raises `BadFile` for what is no frame, or none that the limits allow.
+    Raises `BadFile` for a file that is no frame, or a frame beyond the limits.
     """
     digest = digest or frame_digest(file)
     bounded = BoundedFile(file)
@@ -152,7 +152,7 @@ def read_frame(file: IO[bytes], limits: FrameLimits, digest: str | None = None) 
 
 
 def _read_by_magic(file: BoundedFile, start: bytes, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a file that begins with `start`; raises `BadFile`."""
+    """The frame in a file whose first bytes are `start`; raises `BadFile`."""
     if is_raw(file, start):
         file.seek(0)
         return read_raw(file, limits, digest)
@@ -169,7 +169,7 @@ def _read_by_magic(file: BoundedFile, start: bytes, limits: FrameLimits, digest:
 
 @contextmanager
 def _unzipped(file: BoundedFile, limits: FrameLimits) -> Iterator[BoundedFile]:
-    """The content of a gzip file, in a temporary file; raises `BadFile` if larger than a frame."""
+    """Content of a gzip file, in a temporary file; raises `BadFile` if too large for a frame."""
     rows, columns = limits.shape or (limits.max_pixels, 1)
     most = MORE_BYTES + BYTES_PER_PIXEL * min(rows * columns, limits.max_pixels)
     file.seek(0)
@@ -186,13 +186,13 @@ def _unzipped(file: BoundedFile, limits: FrameLimits) -> Iterator[BoundedFile]:
 
 
 def frame_digest(file: IO[bytes]) -> str:
-    """`sha256:` of all that is in a file."""
+    """The SHA-256 digest of a file's content, with the prefix `sha256:`."""
     file.seek(0)
     return "sha256:" + hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
 
 
 def _later(name: str, *arguments: str) -> Reader:
-    """The reader of a name, imported when it is called: the service's start loads none."""
+    """A reader function imported by name at its first call, to keep the service's start fast."""
 
     def read(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         frame: Frame = resolve_name(f"service.imaging.frames.{name}")(
@@ -215,9 +215,8 @@ _READERS: Mapping[tuple[bytes, ...], Reader] = {
 }
 
 
-# Frames from the raw files of cameras, through LibRaw: the extra `raw` installs it.
-#
-# Pixels of a colour filter's pattern are summed, so that one count has light of all its colours.
+# Frames from the raw files of cameras, through LibRaw (installed by the extra `raw`). The pixels of
+# a colour filter array are summed, so that one count has light of all its colours.
 
 ABSENT = (
     "is a camera's raw file, which needs the package rawpy: install the extra `raw` "
@@ -230,7 +229,7 @@ _MAX_TAGS = 256
 
 
 def is_raw(file: BoundedFile, start: bytes) -> bool:
-    """True if a file, whose first bytes are `start`, is a camera's raw file, also as a TIFF."""
+    """True for a camera's raw file, also one based on TIFF; `start` are its first bytes."""
     if start.startswith(MAGICS) or start[4:12] == _CR3:
         return True
     if not start.startswith((b"II*\0", b"MM\0*")):
@@ -239,7 +238,7 @@ def is_raw(file: BoundedFile, start: bytes) -> bool:
 
 
 def _has_tags_of_raw(file: BoundedFile, order: str) -> bool:
-    """A DNG says so; other makers begin with a small picture and have the large one inside."""
+    """True for a TIFF with a DNG version, or with a reduced picture and the full one inside."""
     try:
         file.seek(4)
         file.seek(struct.unpack(order + "L", file.read(4))[0])
@@ -255,7 +254,7 @@ def _has_tags_of_raw(file: BoundedFile, order: str) -> bool:
 
 
 def read_raw(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a camera's raw file; raises `BadFile` with what is wrong with it."""
+    """The frame in a camera's raw file; raises `BadFile` with the reason if it cannot be read."""
     if limits.image not in (None, "1"):
         raise bad_frame("is a camera's raw file; there is no image to choose", limits.image)
     if not importlib.util.find_spec("rawpy"):

@@ -1,6 +1,6 @@
-"""Frames from FITS files (FITS Standard 4.0), and to them.
+"""Reader and writer of frames in FITS files (FITS Standard 4.0).
 
-The first image of a file is taken, of three planes their sum, unless another is chosen.
+By default the first image of a file is read, and three planes are summed as colours.
 """
 
 import math
@@ -22,13 +22,13 @@ ABSENT = (
     "(pip install '.[images]'), or unpack the file with funpack"
 )
 SAFE_METHODS = ("RICE_1", "RICE_ONE", "GZIP_1", "GZIP_2", "NOCOMPRESS")
-"""Decoders that a damaged file does not harm: that of HCOMPRESS_1 writes beyond its memory."""
+"""FITS compression methods with safe decoders; HCOMPRESS_1's writes beyond its memory."""
 COLOURS = 3
 MAX_NAMED = 8
 
 
 def read_fits(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a FITS file; raises `BadFile` with what is wrong with it."""
+    """The frame in a FITS file; raises `BadFile` with the reason if it cannot be read."""
     images, primary = _images(file)
     unit, plane, remarks = _chosen(images, limits.image)
     header = unit.header
@@ -58,9 +58,9 @@ def read_fits(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
 def write_fits(
     file: IO[bytes], counts: CountArray, cards: dict[str, bool | int | float | str]
 ) -> None:
-    """Write counts, unsigned 16-bit integers, with further cards, as a FITS file."""
+    """Write counts, unsigned 16-bit integers, as a FITS file with additional header cards."""
     height_px, width_px = counts.shape
-    # FITS has signed integers only: the zero lies in the middle (4.4.2.5).
+    # FITS has signed integers only: BZERO shifts them by half of the range (4.4.2.5).
     header: dict[str, bool | int | float | str] = {
         "SIMPLE": True, "BITPIX": 16, "NAXIS": 2, "NAXIS1": width_px, "NAXIS2": height_px,
         "BZERO": 32768, "BSCALE": 1, **cards,
@@ -71,7 +71,7 @@ def write_fits(
 
 
 def _images(file: BoundedFile) -> tuple[list[fits_header.Unit], fits_header.Header]:
-    """The units that hold images, and the primary header; raises `BadFile` where there is none."""
+    """The FITS units that hold images, and the primary header; raises `BadFile` if none does."""
     images: list[fits_header.Unit] = []
     primary: fits_header.Header | None = None
     try:
@@ -80,7 +80,7 @@ def _images(file: BoundedFile) -> tuple[list[fits_header.Unit], fits_header.Head
             if unit.header.is_image:
                 images.append(unit)
     except BadFile:
-        # What stands behind an image may be broken.
+        # Units after an image may be broken.
         if not images:
             raise
     if not images or primary is None:
@@ -91,7 +91,7 @@ def _images(file: BoundedFile) -> tuple[list[fits_header.Unit], fits_header.Head
 def _chosen(
     images: Sequence[fits_header.Unit], choice: str | None
 ) -> tuple[fits_header.Unit, int | None, tuple[str, ...]]:
-    """The unit that was chosen, its plane if one was, and remarks where there are others."""
+    """The chosen image unit, its chosen plane or None, and remarks that name the other images."""
     named = ", ".join(f"{each.number} {each.header.name}".strip() for each in images[:MAX_NAMED])
     if choice is None:
         if len(images) == 1:
@@ -110,7 +110,7 @@ def _chosen(
 
 
 def _planes(header: fits_header.Header, plane: int | None) -> tuple[list[int], bool]:
-    """The planes of a unit to sum, from 0, and whether its colours stand pixel by pixel."""
+    """The planes of an image to sum, from 0, and true if colours are interleaved by pixel."""
     axes = header.image_axes
     count = 1
     for length in axes[2:]:
@@ -137,7 +137,7 @@ def _scaling(header: fits_header.Header) -> tuple[float, float]:
 
 
 class _Plain:
-    """The numbers of a unit that is not compressed."""
+    """A reader of the pixel values of an uncompressed FITS image."""
 
     def __init__(self, file: BoundedFile, unit: fits_header.Unit) -> None:
         self._file, self._unit = file, unit
@@ -145,12 +145,14 @@ class _Plain:
         self._scaling = _scaling(unit.header)
 
     def plane(self, number: int) -> CountArray:
-        """One plane (rows, columns), from 0."""
+        """One plane (rows, columns) of counts of an uncompressed FITS image; planes count from
+        0.
+        """
         width, height = self._unit.header.image_axes[:2]
         return self._counts(self._read(number * width * height, width * height), (height, width))
 
     def interleaved(self) -> CountArray:
-        """The sums of the colours of each pixel (rows, columns)."""
+        """The sums of the colours of each pixel (rows, columns), for interleaved colours."""
         colours, width, height = self._unit.header.image_axes
         stored = self._read(0, colours * width * height)
         return np.asarray(self._counts(stored, (height, width, colours)).sum(axis=2))
@@ -165,7 +167,7 @@ class _Plain:
         counts = as_counts(stored)
         if (scale, zero) != (1.0, 0.0):
             if not (scale.is_integer() and zero.is_integer()):
-                # Single precision would leave little of small steps above a large zero.
+                # Single precision would lose small steps above a large zero.
                 counts = counts.astype(np.float64)
             counts = (counts * scale + zero).astype(counts.dtype, copy=False)
         if self._kind.kind in "iu" and "BLANK" in header.cards:
@@ -174,7 +176,7 @@ class _Plain:
 
 
 class _Compressed:
-    """The numbers of an image that is compressed by tiles, through astropy."""
+    """A reader of the pixel values of a tile-compressed FITS image, through astropy."""
 
     def __init__(self, file: BoundedFile, unit: fits_header.Unit) -> None:
         if find_spec("astropy") is None:
@@ -191,11 +193,11 @@ class _Compressed:
         self._table = fits_tiles.rewritten(file, unit)
 
     def plane(self, number: int) -> CountArray:
-        """One plane (rows, columns), from 0."""
+        """One plane (rows, columns) of counts of a tile-compressed FITS image; planes from 0."""
         return self._section(number)
 
     def interleaved(self) -> CountArray:
-        """The sums of the colours of each pixel (rows, columns)."""
+        """The sums of the colours of each pixel (rows, columns), for interleaved colours."""
         return np.asarray(self._section(None).sum(axis=2))
 
     def _section(self, number: int | None) -> CountArray:
@@ -217,7 +219,7 @@ class _Compressed:
 
 
 def _full_scale(header: fits_header.Header) -> float:
-    """The largest count of a plane, infinite for floating numbers."""
+    """The largest count that a FITS image can hold; infinite for floating-point numbers."""
     kind = np.dtype(fits_header.TYPES[header.bitpix])
     if kind.kind not in "iu":
         return float(np.inf)
@@ -226,7 +228,9 @@ def _full_scale(header: fits_header.Header) -> float:
 
 
 def _as_shown(counts: CountArray, header: fits_header.Header) -> tuple[CountArray, str]:
-    """The rows from the top down, by ROWORDER, and what was done."""
+    """Counts with their rows from the top down, by the keyword ROWORDER, and the change in
+    words.
+    """
     order = str(header.cards.get("ROWORDER") or "").strip().upper().replace("_", "-")
     if order != "BOTTOM-UP":
         return counts, AS_STORED

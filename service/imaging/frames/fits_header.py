@@ -1,4 +1,4 @@
-"""Headers of FITS files (FITS Standard 4.0): cards, and the images that they describe."""
+"""Headers of FITS files (FITS Standard 4.0): their cards, and the images that they describe."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,20 +18,20 @@ Value = bool | int | float | str | None
 
 @dataclass(frozen=True)
 class Header:
-    """The cards of one header, by keyword: values, and comments that are not empty."""
+    """A FITS header: the values of its cards by keyword, and the comments that are not empty."""
 
     cards: dict[str, Value]
     comments: dict[str, str] = field(default_factory=dict)
 
     def whole(self, key: str, default: int | None = None, least: int = 0) -> int:
-        """A whole number of the header; raises `BadFile` for anything else."""
+        """The whole number of a header keyword; raises `BadFile` for any other value."""
         value = self._value(key, default)
         if not isinstance(value, int) or isinstance(value, bool) or not least <= value < 1 << 40:
             raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
         return value
 
     def number(self, key: str, default: float) -> float:
-        """A finite number of the header."""
+        """The finite number of a header keyword; raises `BadFile` for any other value."""
         value = self._value(key, default)
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             raise bad_frame(f"has a FITS header with an impossible {key}", str(value)[:40])
@@ -40,27 +40,27 @@ class Header:
         return float(value)
 
     def _value(self, key: str, default: Value) -> Value:
-        # A card without a value says nothing (FITS 4.0, 4.1.2.3).
+        # A card without a value counts as absent (FITS 4.0, 4.1.2.3).
         value = self.cards.get(key)
         return default if value is None else value
 
     def behind(self, primary: "Header") -> "Header":
-        """The header with what it does not say itself from the primary one."""
+        """A header with the cards that it lacks taken from the primary header."""
         return Header(primary.cards | self.cards, primary.comments | self.comments)
 
     @property
     def is_compressed(self) -> bool:
-        """True for a table that holds an image in compressed tiles."""
+        """True for the header of a table that holds an image in compressed tiles."""
         return self.cards.get("ZIMAGE") is True
 
     @property
     def axes(self) -> list[int]:
-        """The lengths of its axes, the fastest first."""
+        """The lengths of the data's axes in a FITS header, the fastest axis first."""
         return self._axes("NAXIS")
 
     @property
     def image_axes(self) -> list[int]:
-        """The lengths of the axes of its image, without those of length one at the end."""
+        """The lengths of the image's axes in a FITS header, without trailing axes of length one."""
         axes = self._axes("ZNAXIS" if self.is_compressed else "NAXIS")
         while len(axes) > 2 and axes[-1] == 1:
             axes.pop()
@@ -74,7 +74,7 @@ class Header:
 
     @property
     def bitpix(self) -> int:
-        """Bits of a number of the image, negative for floating ones."""
+        """The bits per number of a FITS image, negative for floating-point numbers."""
         value = self.whole("ZBITPIX" if self.is_compressed else "BITPIX", least=-64)
         if value not in TYPES:
             known = ", ".join(str(each) for each in TYPES)
@@ -83,7 +83,7 @@ class Header:
 
     @property
     def is_image(self) -> bool:
-        """True for an image of two dimensions or more, compressed or not."""
+        """True for the header of an image of two or more dimensions, compressed or not."""
         kind = self.cards.get("XTENSION", "IMAGE")
         if not self.is_compressed and (kind != "IMAGE" or self.cards.get("GROUPS") is True):
             return False
@@ -91,18 +91,18 @@ class Header:
 
     @property
     def name(self) -> str:
-        """The name of the unit, in capitals; empty without one."""
+        """The name (EXTNAME) of a FITS unit, in capitals; empty without one."""
         return str(self.cards.get("EXTNAME") or "").strip().upper()
 
     @property
     def data_bytes(self) -> int:
-        """The length of its data (4.4.1.1)."""
+        """The length in bytes of a FITS unit's data (4.4.1.1)."""
         axes = self.axes
         if not axes:
             return 0
         numbers = 1
         for length in axes:
-            # A product of absurd lengths need not be exact to be beyond the file.
+            # For absurd lengths the product need not be exact to exceed the file's size.
             numbers = min(numbers * length, 1 << 60)
         numbers = self.whole("GCOUNT", 1) * (self.whole("PCOUNT", 0) + numbers)
         bits = self.whole("BITPIX", least=-64)
@@ -111,7 +111,7 @@ class Header:
 
 @dataclass(frozen=True)
 class Unit:
-    """One header and data unit of a file: its number from 0, its header, where its data begin."""
+    """One header and data unit of a FITS file: number from 0, header, and offset of the data."""
 
     number: int
     header: Header
@@ -119,11 +119,11 @@ class Unit:
 
 
 def units_of(file: BoundedFile) -> Iterator[Unit]:
-    """The units of a file one after another; raises `BadFile` for a broken header."""
+    """Header and data units of a FITS file in sequence; raises `BadFile` for a broken header."""
     at = 0
     for number in range(MAX_UNITS):
         file.seek(at)
-        # What follows the last unit is none (3.5).
+        # Other bytes after the last extension are no unit (3.5).
         if not file.left or (number and file.read(8) != b"XTENSION"):
             return
         file.seek(at)
@@ -134,7 +134,7 @@ def units_of(file: BoundedFile) -> Iterator[Unit]:
 
 
 def read_header(file: BoundedFile) -> Header:
-    """The header that begins here; the first of equal keywords counts."""
+    """The FITS header at the present offset of a file; the first of equal keywords counts."""
     header = Header({})
     for _ in range(MAX_HEADER_BLOCKS):
         block = file.read(BLOCK)
@@ -153,7 +153,7 @@ def read_header(file: BoundedFile) -> Header:
 
 
 def _value(text: str) -> tuple[Value, str]:
-    """The value of a card, None for what is no value, and its comment."""
+    """The value and the comment of a FITS header card; the value is None if it cannot be parsed."""
     text = text.strip()
     if text.startswith("'"):
         inner, at = "", 1
@@ -178,7 +178,7 @@ def _value(text: str) -> tuple[Value, str]:
 
 
 def write_header(file: IO[bytes], cards: Mapping[str, bool | int | float | str]) -> None:
-    """Write a header of these cards, in whole blocks."""
+    """Write a FITS header with the given cards, padded to whole blocks."""
     text = "".join(_card(key, value) for key, value in cards.items()) + "END".ljust(CARD)
     file.write(text.encode("latin-1").ljust(-(-len(text) // BLOCK) * BLOCK))
 

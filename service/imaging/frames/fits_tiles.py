@@ -1,7 +1,7 @@
-"""The table of a FITS image in compressed tiles, checked before a decoder follows it.
+"""Checks of tile-compressed FITS images before a decoder follows their table.
 
-astropy allocates what a descriptor of the table states, unfolds a tile of gzip whatever its size,
-and reads beyond its memory for some settings of Rice.  It is given a file of checked keywords.
+astropy allocates the size that a table's descriptor states, decompresses gzip tiles of any size,
+and reads beyond its memory for some settings of Rice. So it gets a file with checked keywords.
 Source: FITS Standard 4.0, 7.3.5 (variable-length arrays) and 10.1 (compressed images).
 """
 
@@ -20,29 +20,33 @@ from service.imaging.frames.fits_header import BLOCK, Header, Unit, write_header
 from service.imaging.frames.frame import bad_frame
 
 MAX_TILES = 1 << 16
-"""Each tile takes a decoder about 50 microseconds, however small it is."""
+"""Largest number of compressed tiles; a decoder takes about 50 microseconds for each, however
+small.
+"""
 MAX_DEPTH = 3
-"""The planes of a tile: of three colours.  A section of more is unpacked whole."""
+"""Largest number of planes in a compressed tile: three colours. A whole tile is decompressed at a
+time.
+"""
 _SETTINGS = {"BLOCKSIZE": range(1, 1 << 16), "BYTEPIX": (1, 2, 4, 8)}
 _COPIED = re.compile(
     r"(PCOUNT|GCOUNT|TFIELDS|THEAP|BSCALE|BZERO|BLANK|ZIMAGE|Z?(NAXIS|BITPIX)|Z?NAXIS\d+|"
     r"(TTYPE|TFORM|ZNAME|ZVAL)\d+|Z(CMPTYPE|QUANTIZ|DITHER0|BLANK|SCALE|ZERO))"
 )
 _NUMBER_BYTES = 8
-"""The bytes of the largest number of a picture."""
+"""Size in bytes of the largest number type in a picture."""
 _SPARE_BYTES = 4096
 _FORM = re.compile(r"(\d{0,9})([A-Z])(?:([A-Z])\(\d*\))?")
 _BYTES = dict(zip("LXBIJKAEDCMPQ", (1, 1, 1, 2, 4, 8, 1, 4, 8, 8, 16, 8, 16), strict=True))
 _DESCRIPTORS = {"P": ">i4", "Q": ">i8"}
 _GZIP = 31
-"""The window of zlib for data with gzip's header."""
+"""Window parameter of zlib for data with a gzip header."""
 _BLOCK_BYTES = 1 << 16
 
 
 def rewritten(file: BoundedFile, unit: Unit) -> io.BytesIO:
-    """A FITS file of one table in place of a unit's, under a header of checked keywords alone.
+    """A FITS file with the compressed table of one unit, under a header of checked keywords only.
 
-    Raises `BadFile` where a tile lies outside of the data, or unfolds into more than its pixels.
+    Raises `BadFile` where a tile lies outside of the data, or decompresses to more than its pixels.
     """
     header = unit.header
     file.seek(unit.start)
@@ -63,11 +67,11 @@ def rewritten(file: BoundedFile, unit: Unit) -> io.BytesIO:
 
 
 def tile_of(header: Header) -> list[int]:
-    """The lengths of the sides of a tile, none longer than the image's; raises `BadFile`."""
+    """The sides of an image's compressed tiles, none longer than the image; raises `BadFile`."""
     axes = header.image_axes
     sides = []
     for number, length in enumerate(axes, 1):
-        # One row of the image where nothing is said (10.1.1).
+        # The default tile is one row of the image (10.1.1).
         side = header.whole(f"ZTILE{number}", length if number == 1 else 1)
         sides.append(min(side, length) if side else length)
     if math.prod(sides[2:]) > MAX_DEPTH:
@@ -77,7 +81,7 @@ def tile_of(header: Header) -> list[int]:
 
 
 def _checked(header: Header) -> dict[str, bool | int | float | str]:
-    """The cards that a decoder follows into memory; raises `BadFile` for an impossible one."""
+    """The header cards that control a decoder's memory accesses; raises `BadFile` for bad ones."""
     cards: dict[str, bool | int | float | str] = {
         f"ZTILE{number}": side for number, side in enumerate(tile_of(header), 1)
     }
@@ -116,7 +120,7 @@ def _require_bounded(header: Header, data: bytes, tile_pixels: int) -> None:
 def _columns(
     header: Header, table: npt.NDArray[np.uint8]
 ) -> Iterator[tuple[str, int, npt.NDArray[np.int64]]]:
-    """Each column of arrays: its name, the bytes of a number, and count and place (rows, 2)."""
+    """Array columns of a compressed table: name, bytes per number, counts and offsets (rows, 2)."""
     at = 0
     for number in range(1, header.whole("TFIELDS") + 1):
         text = str(header.cards.get(f"TFORM{number}") or "").strip()
@@ -135,7 +139,7 @@ def _columns(
 
 
 def _require_unfolded(data: bytes, tile_pixels: int) -> None:
-    """Raise `BadFile` for data of gzip that unfold into more than the numbers of a tile."""
+    """Raise `BadFile` for gzip data that decompress to more than the numbers of a tile."""
     most, unfolded = tile_pixels * _NUMBER_BYTES + _SPARE_BYTES, 0
     while data:
         source = zlib.decompressobj(_GZIP)

@@ -1,9 +1,8 @@
-"""The time and the exposure that a FITS header tells (FITS Standard 4.0, section 9).
+"""The mid-exposure time and the exposure stated by a FITS header (FITS Standard 4.0, section 9).
 
-A time that may be wrong is none: keywords that contradict each other or their comments, dates
-without a time of day, local times and time scales that are not converted lead to no time, with the
-reason in words.  Comments are read for units, for the moment of the exposure and for zones: what
-one states clearly counts.
+A doubtful time is not used: keywords that contradict each other or their comments, dates without a
+time of day, local times and unknown time scales give no time, with the reason in words. Clear
+statements in comments are read: units, the moment of the exposure, and time zones.
 """
 
 import re
@@ -25,16 +24,18 @@ AVERAGES, STARTS, ENDS = (
 )
 NOTHING_STATED = "the header has none of"
 OBSERVED = ("DATE-OBS", "MJD-OBS")
-"""Keywords whose comment says which moment of the exposure they mean (9.5)."""
+"""FITS keywords of dates whose comments may name the moment: start, middle or end (9.5)."""
 TIMES_OF_DAY = ("TIME-OBS", "UT")
-"""The keywords of the time of day of a date without one."""
+"""FITS keywords of a time of day that completes a date without one."""
 UTC_OFFSETS = ("UTCOFFS", "UTC-OFFS", "UTCOFF", "UTC-OFF", "UTCOFFSE", "UTC_OFFS")
-"""Keywords of the hours by which local time is ahead of UTC."""
+"""FITS keywords of the hours by which local time is ahead of UTC."""
 LONGEST_EXPOSURE_S = 3600.0
 SAME_S = 1.0
-"""Moments that are farther apart contradict each other."""
+"""Largest difference, in seconds, between two times for the same moment of an exposure."""
 MOST_RATIO = 100.0
-"""The ratio of two exposures, of dead times and sums, from which one is in another unit."""
+"""Least ratio of two stated exposures from which one must be in another unit; dead times and sums
+of frames differ by less.
+"""
 MOST_OFFSET_H = 14.0
 _UNITS_S = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -55,7 +56,7 @@ _LESS_TAI_S = {
     "TDB": 32.184,
     "GPS": -19.0,
 }
-"""TDB differs from TT by 2 ms at most."""
+"""Seconds by which each time scale is ahead of TAI; TDB is taken for TT, at most 2 ms away."""
 _UTC = ("UTC", "GMT", "UT")
 _DATE = re.compile(r"(\d{4})-(\d\d)-(\d\d)(?:[T ](\S+))?")
 _OLD_DATE = re.compile(r"(\d\d)/(\d\d)/(\d\d)")
@@ -85,9 +86,10 @@ _OTHER_SIGN = re.compile(r"\b(add|added|minus|subtract|to utc|to ut)\b")
 
 @dataclass(frozen=True)
 class HeaderTime:
-    """UTC of mid exposure as text, exposure in seconds, and why there is no time.
+    """The UTC of mid exposure as text and the exposure in seconds from a FITS header, or the reason
+    for no time.
 
-    The sources name the keywords that each was taken from.
+    The sources name the keywords from which time and exposure were taken.
     """
 
     time: str | None
@@ -99,7 +101,7 @@ class HeaderTime:
 
 @dataclass(frozen=True)
 class HeaderExposure:
-    """The exposure that a header states, the keyword it is from, and what is wrong with it."""
+    """The exposure in seconds stated by a FITS header, its keyword, and any problem with it."""
 
     seconds: float | None
     source: str = ""
@@ -108,7 +110,7 @@ class HeaderExposure:
 
 
 def timing_remarks(timing: HeaderTime) -> list[str]:
-    """Remarks that name the keywords of a time and an exposure, as far as there are any."""
+    """Remarks that name the FITS keywords from which the time and the exposure of a frame come."""
     remarks = []
     if timing.time is not None:
         remarks.append(f"time_of_file: {timing.time}, mid exposure, from {timing.time_source}")
@@ -120,7 +122,7 @@ def timing_remarks(timing: HeaderTime) -> list[str]:
 
 
 def time_of_header(header: Header, primary: Header) -> HeaderTime:
-    """The time and exposure of an image's header, else of the primary header of its file."""
+    """Time and exposure from an image's FITS header, else from the primary header of the file."""
     own = [header, primary]
     dates = next((each for each in own if _has(each, AVERAGES + STARTS)), header)
     exposed = next((each for each in own if _has(each, EXPOSURES)), header)
@@ -137,7 +139,7 @@ def time_of_header(header: Header, primary: Header) -> HeaderTime:
 
 
 def exposure_of(header: Header) -> HeaderExposure:
-    """The exposure of the first keyword that states one, which no other one may contradict."""
+    """The exposure of a FITS header, from the first keyword, unless another contradicts it."""
     found: dict[str, tuple[float, str]] = {}
     problem = ""
     for key in EXPOSURES:
@@ -166,13 +168,13 @@ def exposure_of(header: Header) -> HeaderExposure:
 
 
 class _Contradictory(Exception):
-    """A value and its comment contradict each other; the message holds both."""
+    """An error: a header's value and its comment contradict each other. The message holds both."""
 
 
 def _seconds(header: Header, key: str) -> tuple[float, str]:
-    """An exposure in seconds, by the unit of its text or its comment, and its source in words.
+    """An exposure in seconds, with the unit of its text or its comment, and its source in words.
 
-    Raises `ValueError` for a value or unit that is not read.
+    Raises `ValueError` for a value or unit that cannot be read.
     """
     value, comment = header.cards[key], header.comments.get(key, "")
     match = _NUMBER.fullmatch(value) if isinstance(value, str) else None
@@ -203,7 +205,7 @@ def _scale_of_unit(unit: str, key: str) -> float:
 
 
 def _stated_scales(comment: str, key: str) -> set[float]:
-    """The units of time that a comment states, in seconds; of the standard's form that alone."""
+    """The units of time that a comment states, in seconds; a unit in brackets takes precedence."""
     brackets = _BRACKETS.search(comment)
     if brackets is not None:
         return {_scale_of_unit(brackets[1], key)}
@@ -214,12 +216,12 @@ def _stated_scales(comment: str, key: str) -> set[float]:
 
 
 class _NoTime(Exception):
-    """No time follows from a header; the message says why."""
+    """An error: no time follows from a FITS header; the message states the reason."""
 
 
 @dataclass(frozen=True)
 class _DateCards:
-    """The header with the dates, and the one with what holds for all of them."""
+    """Date cards of a FITS header, the header with its time scale and zone, and the exposure."""
 
     header: Header
     common: Header
@@ -227,7 +229,7 @@ class _DateCards:
     problems: list[str] = field(default_factory=list)
 
     def middle(self) -> tuple[Utc, str]:
-        """The moment of mid exposure and its source; raises `_NoTime` where none is certain."""
+        """UTC of mid exposure from a FITS header and its source; raises `_NoTime` if uncertain."""
         exposure_s = self.exposure.seconds
         roles = {key: self._role(key) for key in OBSERVED if key in self.header.cards}
         meant = {role: [key for key in roles if roles[key] == role] for role in _ROLES}
@@ -281,7 +283,7 @@ class _DateCards:
         return f"{NOTHING_STATED} {looked}"
 
     def _role(self, key: str) -> str:
-        """The moment that a keyword of `OBSERVED` means: the start, unless its comment differs.
+        """The moment that a date keyword means: the exposure's start, unless its comment differs.
 
         Raises `_NoTime` for a comment that names several moments, or one that is none of them.
         """
@@ -292,7 +294,7 @@ class _DateCards:
         return named[0] if named else "start"
 
     def _comment(self, key: str) -> str:
-        """The comment of a date, with that of its time of day if another card states it."""
+        """The comment of a date, joined with that of the separate card of its time of day."""
         value, clock = self.header.cards[key], self._clock_key()
         is_whole = not isinstance(value, str) or ":" in value or clock is None
         keys = [key] if is_whole or clock is None else [key, clock]
@@ -316,7 +318,7 @@ class _DateCards:
         return found
 
     def _moment(self, key: str) -> Utc | None:
-        """The moment of a keyword, None for what is no date; raises `_LocalTime`."""
+        """The UTC of a date keyword, None if its value is no date; raises `_LocalTime`."""
         value = self.header.cards[key]
         ahead_h, scale = self._ahead_h(key), self._scale(key)
         if ahead_h is not None and scale != "UTC":
@@ -336,9 +338,9 @@ class _DateCards:
         return shifted(moment, -3600.0 * ahead_h)
 
     def _ahead_h(self, key: str) -> float | None:
-        """The hours by which a local time is ahead of UTC, None for a time that is not local.
+        """The hours by which a local time is ahead of UTC; None for a time that is not local.
 
-        Raises `_LocalTime` where it is not known.
+        Raises `_LocalTime` for a local time with an unknown offset.
         """
         value, comment = self.header.cards[key], self._comment(key)
         zone = _ZONE.search(comment)
@@ -346,7 +348,7 @@ class _DateCards:
         if zone is None and not _LOCAL.search(comment):
             return None
         if own is not None and own[5] not in (None, "Z"):
-            # Its own zone is converted with it.
+            # A zone in the value itself is converted with the value.
             return None
         message = f"{key} is local time by its comment ({comment[:60]})"
         if own is not None and own[5] == "Z":
@@ -363,7 +365,7 @@ class _DateCards:
         raise _LocalTime(f"{message}, and no offset from UTC is known")
 
     def _offset_h(self, key: str) -> float | None:
-        """The hours of a keyword of `UTC_OFFSETS`; None for what is no number of hours."""
+        """Hours of local time ahead of UTC in a header keyword; None if it is no such number."""
         value, comment = self.common.cards.get(key), self.common.comments.get(key, "").lower()
         if isinstance(value, bool) or not isinstance(value, (int, float)):
             return None
@@ -372,14 +374,14 @@ class _DateCards:
         return None if _stated_scales(comment, "EXPTIME") - {3600.0} else float(value)
 
     def _scale(self, key: str) -> str:
-        """The time scale of a date; raises `_NoTime` for one that is not converted."""
+        """The time scale of a date keyword; raises `_NoTime` for an unsupported one."""
         stated = self.common.cards.get("TIMESYS")
         scale = str(stated or "UTC").strip().upper().partition("(")[0].strip()
         comment = self._comment(key)
         word = _SCALE_WORDS.search(comment)
         if word is not None and not _IS_UTC.search(comment) and word[1] != scale:
             if stated is not None or word[1] == "GPS":
-                # Receivers of GPS give UTC too.
+                # GPS receivers output UTC too.
                 told = "is not given" if stated is None else f"is {scale[:20]}"
                 raise _NoTime(f"TIMESYS {told}, and the comment of {key} says {comment[:60]}")
             scale = word[1]
@@ -391,7 +393,9 @@ class _DateCards:
 
 
 class _LocalTime(Exception):
-    """A keyword holds a local time whose offset from UTC is not known; the message says why."""
+    """An error: a keyword holds a local time with an unknown offset from UTC; the message has
+    details.
+    """
 
 
 def _has(header: Header, keys: Iterable[str]) -> bool:
@@ -399,7 +403,7 @@ def _has(header: Header, keys: Iterable[str]) -> bool:
 
 
 def _agreed(moments: dict[str, Utc]) -> Utc | None:
-    """The first of some moments; raises `_NoTime` if another one contradicts it."""
+    """First of several moments that must agree; raises `_NoTime` if another one contradicts it."""
     for key, moment in moments.items():
         first = next(iter(moments))
         apart_s = _seconds_between(moments[first], moment)
@@ -413,7 +417,7 @@ def _seconds_between(one: Utc, other: Utc) -> float:
 
 
 def _read(text: str, clock: str | None, scale: str) -> Utc | None:
-    """The moment of a date with its time of day, which may be another card's."""
+    """The UTC of a date and its time of day, which may come from another card; None for no date."""
     old, date = _OLD_DATE.fullmatch(text), _DATE.fullmatch(text)
     if old is not None:
         year, month, day = 1900 + int(old[3]), int(old[2]), int(old[1])
@@ -451,7 +455,7 @@ def _read(text: str, clock: str | None, scale: str) -> Utc | None:
 
 
 def _converted(jd1: float, jd2: float, scale: str) -> Utc:
-    """UTC of a two-part Julian date in a scale."""
+    """The UTC of a two-part Julian date in a given time scale."""
     if scale != "UTC":
         jd1, jd2, _ = map(float, ufunc.taiutc(jd1, jd2 - _LESS_TAI_S[scale] / DAY_S))
     return recorded_utc(Utc(jd1, jd2).text)

@@ -1,4 +1,4 @@
-"""A frame: the counts of one exposure, and what its file says of itself."""
+"""A frame of a star camera: the counts of one exposure, with the data stated by its file."""
 
 import math
 from dataclasses import dataclass
@@ -11,23 +11,22 @@ from service.errors import BadFile, Fault
 
 AS_STORED = "as stored"
 CountArray = npt.NDArray[Any]
-"""(rows, columns), float32 or float64; NaN where a pixel holds no number."""
+"""An image of counts (rows, columns), float32 or float64; NaN where a pixel holds no number."""
 
 LEAST_KNOWN, MOST_FULL = 0.5, 0.5
-"""Shares of a frame: of pixels with a number in them, and of full ones."""
+"""Least share of pixels with a number, and largest share of saturated pixels, in a frame."""
 LARGEST_COUNT = float(np.finfo(np.float32).max)
-"""Detection works in single precision: there a larger count is infinite."""
+"""Largest count that detection, in single precision, can represent."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Counts with the digest of their file.
+    """The counts of one exposure (rows, columns), with the digest, time and exposure of their file.
 
-    `full_scale` is the largest count that the file's numbers can hold, infinite for
-    floating ones.  `time` is the UTC of mid exposure as text and `exposure_s` the
-    exposure, each None where the file does not tell; `no_time` is then the reason.
-    `orientation` is how the counts were turned from the order in which the file stores
-    them, and `remarks` name what else was chosen.
+    `full_scale` is the largest count that the file's number type can hold, infinite for floating
+    point. `time` is the UTC of mid exposure as text and `exposure_s` the exposure, each None where
+    the file does not state it; `no_time` is then the reason. `orientation` states how the counts
+    were turned from the file's order, and `remarks` name other choices.
     """
 
     counts: CountArray
@@ -39,37 +38,37 @@ class Frame:
     no_time: str = "the file has no time of exposure"
     orientation: str = AS_STORED
     is_mirrored: bool = False
-    """True if the sky fits only the mirror image, which the counts then are."""
+    """True if only the mirrored image matches the sky; `counts` are mirrored then."""
     remarks: tuple[str, ...] = ()
 
     @property
     def is_turned(self) -> bool:
-        """True if the counts are in another order than in the file."""
+        """True if the counts are in another pixel order than in the file."""
         return self.orientation != AS_STORED
 
     @property
     def width_px(self) -> int:
-        """Columns."""
+        """The width of the frame: its number of columns."""
         return int(self.counts.shape[1])
 
     @property
     def height_px(self) -> int:
-        """Rows."""
+        """The height of the frame: its number of rows."""
         return int(self.counts.shape[0])
 
 
 @dataclass(frozen=True)
 class FrameLimits:
-    """What a file may unfold into: `max_pixels`, and the (rows, columns) that it must have."""
+    """Limits for a decoded file: `max_pixels`, and the (rows, columns) that it must have."""
 
     max_pixels: int
     shape: tuple[int, int] | None = None
     whose: str = "the tracker"
     image: str | None = None
-    """Which image of a file with several: `NAME`, `NUMBER`, or either with `:PLANE` of a cube."""
+    """The chosen image in a file of several: `NAME`, `NUMBER`, or with `:PLANE` of a cube."""
 
     def require(self, width_px: int, height_px: int) -> None:
-        """Raise `BadFile` for a size that is not to be decoded; asked before anything is."""
+        """Raise `BadFile` for a picture size beyond the limits; called before any decoding."""
         size = f"{width_px} x {height_px} px"
         if width_px < 1 or height_px < 1:
             raise bad_frame("has no pixels", size)
@@ -79,26 +78,26 @@ class FrameLimits:
         self.require_pixels(width_px, height_px)
 
     def require_pixels(self, width_px: int, height_px: int) -> None:
-        """Raise `BadFile` for more pixels than are allowed, whatever the sides."""
+        """Raise `BadFile` for a picture with more pixels than allowed, whatever its sides."""
         if width_px * height_px > self.max_pixels:
             size = f"{width_px} x {height_px} px"
             raise bad_frame(f"may have at most {self.max_pixels:,} pixels", size)
 
     def require_either_way(self, width_px: int, height_px: int) -> None:
-        """Raise `BadFile` for a size that does not fit, even turned by a quarter."""
+        """Raise `BadFile` for a picture size that does not fit, even if rotated by 90 degrees."""
         is_turned = self.shape == (width_px, height_px)
         self.require(*((height_px, width_px) if is_turned else (width_px, height_px)))
 
 
 def bad_frame(message: str, value: str | None = None) -> BadFile:
-    """The refusal of a frame as a whole."""
+    """An error that refuses a whole frame, with the message and the offending value."""
     return BadFile(Fault("frame", message, value))
 
 
 def require_light(frame: Frame, saturation_counts: float) -> None:
-    """Raise `BadFile` for counts in which no star can be: no numbers, no contrast, all full.
+    """Raise `BadFile` for counts without visible stars: no numbers, no contrast, or all saturated.
 
-    Also for a count that is too large to work with, of either sign.
+    Also for counts of either sign that are too large for single precision.
     """
     known = np.isfinite(frame.counts)
     share = np.count_nonzero(known) / known.size

@@ -1,4 +1,4 @@
-"""The check that JPEG data are whole: their codes must end where the data end.
+"""A check that JPEG data are complete: their codes must end where the data end.
 
 JPEG has no checksum.  A changed bit makes a decoder see one block of 8 x 8 pixels more or less, and
 everything after it lies 8 px from its place; libjpeg reports this only where more than about eight
@@ -23,13 +23,13 @@ _TABLES, _SCAN, _RESTARTS, _END = 0xC4, 0xDA, 0xDD, 0xD9
 _BASELINE, _EXTENDED, _PROGRESSIVE = 0xC0, 0xC1, 0xC2
 _OTHER_CODINGS = {*range(0xC3, 0xD0)} - {_TABLES}
 _BEYOND = 1024
-"""Bytes that a block may be read beyond its data before the walk stops."""
+"""Bytes by which a JPEG block may be read beyond its data before the check stops."""
 _WINDOW = 1 << 16
-"""Numbers of the 16 bits of the longest code."""
+"""Number of values of a 16-bit window, which the longest JPEG code fills."""
 
 
 class _Component(NamedTuple):
-    """A component of the picture: blocks of a unit, of its own size, and of the padded grid."""
+    """A JPEG colour component: blocks per unit, size in blocks, and width of the padded grid."""
 
     across: int
     down: int
@@ -37,11 +37,11 @@ class _Component(NamedTuple):
     rows: int
     grid_columns: int
     first: int
-    """The number of its first block among those of all components."""
+    """The index of the component's first block among the blocks of all components."""
 
 
 class _Picture(NamedTuple):
-    """What the header says: components by their id, units, and whether it is progressive."""
+    """A JPEG header: components by id, numbers of units, and true if the coding is progressive."""
 
     components: dict[int, _Component]
     unit_columns: int
@@ -53,7 +53,7 @@ class _Picture(NamedTuple):
 def require_whole(data: bytes, max_pixels: int) -> None:
     """Raise `BadFile` for JPEG data whose scans hold more or fewer bits than their blocks need.
 
-    Data that end too early, or whose segments are cut, raise IndexError or ValueError.
+    Truncated data or segments raise IndexError or ValueError.
     """
     at, interval = 2, 0
     tables = np.zeros((8, _WINDOW), np.uint16)
@@ -86,7 +86,7 @@ def require_whole(data: bytes, max_pixels: int) -> None:
 
 
 def _read_tables(segment: bytes, tables: npt.NDArray[np.uint16]) -> None:
-    """Fill in, for each number of 16 bits, the length of the code it begins with and its symbol."""
+    """Fill the JPEG code tables: for every 16-bit value, length and symbol of its first code."""
     while segment:
         counts, symbols = segment[1:17], segment[17 : 17 + sum(segment[1:17])]
         kind, name = divmod(segment[0], 16)
@@ -116,7 +116,7 @@ def _read_header(segment: bytes, is_progressive: bool, max_pixels: int) -> _Pict
     components: dict[int, _Component] = {}
     first = 0
     for part, (across, down) in zip(parts, sampling, strict=True):
-        # Sizes and blocks are rounded up, one after the other: T.81, A.1.1 and A.2.
+        # Sizes are rounded up first, then numbers of blocks: T.81, A.1.1 and A.2.
         columns = math.ceil(math.ceil(width * across / largest[0]) / 8)
         rows = math.ceil(math.ceil(height * down / largest[1]) / 8)
         grid_columns = unit_columns * across
@@ -128,7 +128,7 @@ def _read_header(segment: bytes, is_progressive: bool, max_pixels: int) -> _Pict
 
 
 def _parts(data: bytes, at: int) -> tuple[list[tuple[int, bytes]], int]:
-    """The coded data of a scan between restarts, each with the marker before, and their end."""
+    """The coded data of a JPEG scan between restart markers, with these, and the end offset."""
     parts: list[tuple[int, bytes]] = []
     before = -1
     for found in _MARKER.finditer(data, at):
@@ -147,7 +147,7 @@ def _is_whole(
     tables: npt.NDArray[np.uint16],
     known: npt.NDArray[np.uint64],
 ) -> bool:
-    """True if the data of one scan are as long as its blocks need, in each restart interval."""
+    """True if every restart interval of a JPEG scan has exactly the bits that its blocks need."""
     number = segment[0]
     chosen = [picture.components[segment[1 + 2 * k]] for k in range(number)]
     names = [divmod(segment[2 + 2 * k], 16) for k in range(number)]
@@ -158,7 +158,7 @@ def _is_whole(
         raise ValueError("a scan of no known kind")
     columns, rows = picture.unit_columns, picture.unit_rows
     if number == 1:
-        # Alone, a component has the blocks of its own size, a unit each.
+        # In a scan of its own, a component has only the blocks of its actual size, one per unit.
         columns, rows = chosen[0].columns, chosen[0].rows
         chosen = [chosen[0]._replace(across=1, down=1)]
     units = np.array(
@@ -184,13 +184,13 @@ def _is_whole(
 
 @njit_no_refcount
 def _walk(coded, ends, size, units, kind, tables, known, run):  # type: ignore[no-untyped-def]
-    """True if the blocks of each interval (bytes up to `ends`) end within its last byte.
+    """True if the blocks of every JPEG restart interval (bytes up to `ends`) end in its last byte.
 
-    `size`: units in a row, in all, in an interval.  `units` (n, 6): of each component of the
-    scan its blocks across and down, columns of its grid, first block, and rows of `tables`.
-    `kind`: first and last coefficient, whether the scan refines, whether it is progressive.
-    `known`: of each block the coefficients that are not zero, a bit each; one block more than
-    there are.  `run` (1,): blocks that are known to have no more coefficients.
+    `size`: units in a row, in all, in an interval. `units` (n, 6): for each component of the scan,
+    blocks across and down, columns of the grid, first block, and rows of `tables`. `kind`: first
+    and last coefficient, whether the scan refines, whether it is progressive. `known`: for each
+    block, a bit for every nonzero coefficient; with one spare block at the end. `run` (1,): number
+    of following blocks without further coefficients.
     """
     columns, total, step = size
     start = 0
@@ -211,7 +211,7 @@ def _walk(coded, ends, size, units, kind, tables, known, run):  # type: ignore[n
             return False
         rest = _bits(coded, at) >> (16 - (end - at))
         if rest != (1 << (end - at)) - 1 and not (kind[0] == 0 and kind[2]):
-            # The rest of the last byte is ones, or what is no block: one more was meant else.
+            # Padding is all ones; any other bits begin another block.
             spare = len(known) - 1
             after = _behind(coded, at, units[0], kind, tables, known, spare, run)
             if 0 <= after <= end:
@@ -221,7 +221,7 @@ def _walk(coded, ends, size, units, kind, tables, known, run):  # type: ignore[n
 
 @njit_no_refcount
 def _bits(coded, at):  # type: ignore[no-untyped-def]
-    """The 16 bits at a place, as a number."""
+    """The 16 bits of coded data at a bit offset, as a number."""
     k = at >> 3
     three = np.int64(coded[k]) << 16 | np.int64(coded[k + 1]) << 8 | np.int64(coded[k + 2])
     return three >> (8 - (at & 7)) & 0xFFFF
@@ -229,7 +229,7 @@ def _bits(coded, at):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _behind(coded, at, unit, kind, tables, known, block, run):  # type: ignore[no-untyped-def]
-    """The place of the bit behind a block; -1 where no code begins as the data do."""
+    """The bit offset after a coded JPEG block; -1 where the data begin with no valid code."""
     k, last, refines, progressive = kind
     if k == 0:
         if refines:
@@ -283,14 +283,14 @@ def _behind(coded, at, unit, kind, tables, known, block, run):  # type: ignore[n
 
 @njit_no_refcount
 def _corrected(coded, at, known, block, k, last):  # type: ignore[no-untyped-def]
-    """The place behind the bits that refine the coefficients of a block from `k` on."""
+    """The bit offset after the refinement bits of a block's coefficients from `k` on."""
     for j in range(k, last + 1):
         at += np.int64(known[block] >> np.uint64(j) & np.uint64(1))
     return at
 
 
 def compile_walk() -> None:
-    """Compile the kernel, or load it, before the first picture needs it."""
+    """Compile or load the JPEG check's kernel, before the first picture needs it."""
     from PIL import Image
 
     file = io.BytesIO()

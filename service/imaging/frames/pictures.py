@@ -1,4 +1,4 @@
-"""Frames from PNG, JPEG, GIF, BMP and PGM files: grey or colours of up to 16 bits."""
+"""Reader of frames from PNG, JPEG, GIF, BMP and PGM files: grey or colour, of up to 16 bits."""
 
 import re
 import sys
@@ -22,16 +22,17 @@ from service.imaging.frames.jpeg import require_whole
 from service.imaging.frames.several import part_of_jpeg, sought_frame
 
 GREY = ("L", "I;16", "I;16B", "I;16L", "F")
-"""Pillow's words for one channel of light."""
+"""Pillow's mode names for images of one channel."""
 _PILLOW_NAMES = {"PGM": "PPM"}
 COLORS = ("RGB", "RGBA", "RGBX", "LA", "P", "PA", "CMYK", "YCbCr")
-"""Modes that are turned into red, green and blue; how opaque a pixel is is not looked at."""
+"""Pillow's mode names for images that are converted to red, green and blue; opacity is ignored."""
 
 
 def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a file of one of these formats; raises `BadFile` with what is wrong with it.
+    """The frame in a PNG, JPEG, GIF, BMP or PGM file; raises `BadFile` with the reason if it cannot
+    be read.
 
-    Of a colour picture the counts are the sums of red, green and blue.
+    The counts of a colour picture are the sums of red, green and blue.
     """
     if file_format == "JPEG":
         file, remarks = _one_jpeg(file, limits)
@@ -41,7 +42,7 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
             number, remarks = sought_frame(image, file, limits)
             if number and image.mode not in (*COLORS, "L"):
                 raise bad_frame("is a moving picture of 16 bits, of which the first can be read")
-        # To look for EXIF may decode the picture, and takes the word of its depth away.
+        # Access to EXIF may decode the picture and so lose its depth; the depth is read first.
         deep, grey, plain = is_deep(image), is_deep_grey(image), _is_plain(image)
         tag = exif_of(image).get(TAG)
         time, exposure_s = exposure_of(image)
@@ -67,7 +68,7 @@ def read_picture(file: BoundedFile, file_format: str, limits: FrameLimits, diges
 
 
 def _one_jpeg(file: BoundedFile, limits: FrameLimits) -> tuple[BoundedFile, tuple[str, ...]]:
-    """The data of one image of a JPEG file, which may hold several (MPO), and remarks."""
+    """The data of the chosen image of a JPEG file, which may hold several (MPO), and remarks."""
     require_small_exif(file)
     with decoding("JPEG"), _opened(file, "JPEG") as image:
         part = part_of_jpeg(image, file, limits.image)
@@ -78,7 +79,7 @@ def _one_jpeg(file: BoundedFile, limits: FrameLimits) -> tuple[BoundedFile, tupl
 
 
 def _opened(file: BoundedFile, file_format: str) -> Any:
-    """A picture of a format, opened by Pillow and not decoded; raises `BadFile` for another one."""
+    """Picture opened by Pillow as one format, not decoded; raises `BadFile` for another format."""
     from PIL import Image, UnidentifiedImageError
 
     try:
@@ -88,9 +89,9 @@ def _opened(file: BoundedFile, file_format: str) -> Any:
 
 
 def _is_plain(image: Any) -> bool:
-    """True if an image is a binary PGM or PPM, which Pillow would scale to its own depths.
+    """True if an image is a binary PGM or PPM, whose numbers Pillow would rescale.
 
-    Raises `BadFile` for colours in text with more than 8 bits, of which Pillow keeps 8.
+    Raises `BadFile` for colours in text with more than 8 bits, since Pillow keeps 8 of them.
     """
     if image.format != "PPM" or not image.tile:
         return False
@@ -101,7 +102,7 @@ def _is_plain(image: Any) -> bool:
 
 
 def _plain_light(image: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
-    """The sums of the colours of a binary PGM or PPM, and the largest that there can be."""
+    """The colour sums of a binary PGM or PPM, and the largest possible sum."""
     _, _, at, arguments = image.tile[0]
     is_tuple = isinstance(arguments, tuple)
     mode, largest = (arguments[0], arguments[1]) if is_tuple else (arguments, 255)
@@ -119,40 +120,40 @@ def _plain_light(image: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float
 
 
 def _light(image: Any) -> tuple[npt.NDArray[Any], float]:
-    """The counts of an image and the largest that there can be."""
+    """The counts of an image, colours summed, and the largest possible count."""
     if image.mode in GREY:
         values = np.asarray(image)
         return values, full_scale_of(values.dtype)
     if image.mode == "I":
-        # A PGM in text, of more than 8 bits: Pillow scales it to 16.
+        # Pillow scales a PGM in text of more than 8 bits to 16 bits.
         return np.asarray(image), 65535.0
     if image.mode not in COLORS:
         raise bad_frame("must be grey or in colour, not of a bit a pixel", image.mode)
     channels = np.asarray(image if image.mode == "RGB" else image.convert("RGB"))
-    # Three bytes a pixel, summed into two.
+    # Three bytes per pixel are summed into a 16-bit number.
     return channels.sum(axis=2, dtype=np.uint16), 3.0 * 255.0
 
 
 _MAGICS = (b"P1", b"P2", b"P3", b"P4", b"P5", b"P6")
 _DEEP = re.compile(r"(RGB[AX]?;16)([BLN])")
 _DEEP_GREY, _FOUR_BYTES = "LA;16B", "RGBA"
-"""Both have four bytes a pixel; the second keeps them as they are."""
+"""Pillow's raw modes of 16-bit grey with opacity, and of a plain copy of four bytes per pixel."""
 _OTHER_BYTE = {"B": "L", "L": "B", "N": "B" if sys.byteorder == "little" else "L"}
-"""By the order of bytes in a file: the order in which the lower byte is taken for the upper."""
+"""For each byte order, the raw-mode letter that makes Pillow read the lower byte as the upper."""
 
 
 def is_deep(image: Any) -> bool:
-    """True if an image, opened and not yet decoded, has 16 bits a colour."""
+    """True if an image, opened and not yet decoded, has 16 bits per colour."""
     return bool(image.tile) and all(_DEEP.fullmatch(_raw_mode(tile)) for tile in image.tile)
 
 
 def is_deep_grey(image: Any) -> bool:
-    """True if an image, opened and not yet decoded, is grey of 16 bits with opacity."""
+    """True if an image, opened and not yet decoded, is 16-bit grey with opacity."""
     return bool(image.tile) and all(_raw_mode(tile) == _DEEP_GREY for tile in image.tile)
 
 
 def deep_grey(file: BoundedFile, file_format: str) -> npt.NDArray[np.uint16]:
-    """The greys (rows, columns) of a picture of 16 bits with opacity, which is not looked at."""
+    """The greys (rows, columns) of a 16-bit grey picture with opacity, which is ignored."""
     from PIL import Image
 
     file.seek(0)
@@ -163,7 +164,7 @@ def deep_grey(file: BoundedFile, file_format: str) -> npt.NDArray[np.uint16]:
 
 
 def deep_light(image: Any, file: BoundedFile, file_format: str) -> npt.NDArray[np.uint32]:
-    """The sums of red, green and blue (rows, columns), for which the file is decoded twice."""
+    """The sums of red, green and blue (rows, columns) in 16 bits; the file is decoded twice."""
     from PIL import Image
 
     light = _sums(image) * np.uint32(256)
@@ -184,7 +185,7 @@ def _raw_mode(tile: Any) -> str:
 
 
 def _lower(tile: Any) -> Any:
-    """The same piece of a picture, with the lower byte of each number in place of the upper."""
+    """A tile descriptor of Pillow, changed to read the lower byte of each number as the upper."""
     mode = _DEEP.sub(lambda found: found[1] + _OTHER_BYTE[found[2]], _raw_mode(tile))
     return _with_raw_mode(tile, mode)
 

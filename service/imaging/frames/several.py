@@ -1,7 +1,7 @@
-"""Files that hold several images: which of them is the frame, by a choice or because it is clear.
+"""The choice of the frame in a file of several images: explicit, or automatic where it is clear.
 
-None is taken in silence.  Images of one size are named, and one has to be chosen; smaller copies
-beside one image are named in a remark.
+Every automatic choice is reported. If several images have the same size, one has to be chosen;
+smaller copies beside one image are named in a remark.
 """
 
 import io
@@ -14,7 +14,7 @@ from service.imaging.frames.frame import FrameLimits, bad_frame
 
 MAX_IMAGES = 256
 MAX_DECODED = 16
-"""A moving picture is decoded from its beginning: so many times the pixels of a frame."""
+"""Limit for decoding an animation from its beginning, in multiples of a frame's pixels."""
 
 
 class Subfile(NamedTuple):
@@ -26,9 +26,9 @@ class Subfile(NamedTuple):
 
 
 def chosen_image(subfiles: list[Subfile], choice: str | None) -> tuple[int, tuple[str, ...]]:
-    """The number of the image that is the frame, from 0, and remarks on the choice.
+    """The index of the image that is the frame, counted from 0, and remarks on the choice.
 
-    Raises `BadFile` where several may be meant and none is chosen; choices count from 1.
+    Raises `BadFile` where several images qualify and none is chosen; choices count from 1.
     """
     if choice is not None:
         if choice.isdecimal() and len(choice) < 5 and 1 <= int(choice) <= len(subfiles):
@@ -51,7 +51,7 @@ def chosen_image(subfiles: list[Subfile], choice: str | None) -> tuple[int, tupl
 
 
 def require_few(count: int) -> None:
-    """Raise `BadFile` for more images than a file may hold."""
+    """Raise `BadFile` for a file of too many images."""
     if count > MAX_IMAGES:
         raise bad_frame(f"holds more than {MAX_IMAGES} images", str(count)[:20])
 
@@ -59,9 +59,9 @@ def require_few(count: int) -> None:
 def part_of_jpeg(
     image: Any, file: BoundedFile, choice: str | None
 ) -> tuple[BoundedFile, tuple[str, ...]] | None:
-    """The JPEG data of the image that is the frame, of a file of several (MPO), and remarks.
+    """The JPEG data of the chosen image in a file of several (MPO), and remarks.
 
-    None for a file of one image.  Images smaller than the first are previews or maps of it.
+    None for a file of one image. Images smaller than the first are its previews or maps.
     """
     count = int(getattr(image, "n_frames", 1))
     if count == 1:
@@ -81,7 +81,7 @@ def part_of_jpeg(
 
 
 def sought_frame(image: Any, file: BoundedFile, limits: FrameLimits) -> tuple[int, tuple[str, ...]]:
-    """Move a moving picture (PNG or GIF) to the image that is the frame; its number and remarks."""
+    """Move an animation (PNG or GIF) to the image of the frame; returns its index and remarks."""
     is_gif = image.format == "GIF"
     count = gif_images(file) if is_gif else int(getattr(image, "n_frames", 1))
     require_few(count)
@@ -94,7 +94,7 @@ def sought_frame(image: Any, file: BoundedFile, limits: FrameLimits) -> tuple[in
 
 
 def gif_images(file: BoundedFile) -> int:
-    """The number of images of a GIF, counted without decoding any (GIF89a, 17 to 27)."""
+    """The number of images in a GIF, counted without decoding (GIF89a, 17 to 27)."""
     file.seek(10)
     flags = file.exactly(3)[0]
     file.seek(_table_bytes(flags), io.SEEK_CUR)
@@ -120,9 +120,10 @@ _IMAGEJ = re.compile(rb"\AImageJ=.*?^images=(\d{1,9})\s*$", re.DOTALL | re.MULTI
 
 
 def planes_described(text: bytes, pixels: int) -> int:
-    """The images that the description of a TIFF with one directory states, at least one.
+    """The number of images stated by the description of a TIFF with one directory, at least one.
 
-    ImageJ writes `images=`, and tifffile the shape of all; each image has `pixels` pixels.
+    ImageJ writes `images=`, and tifffile the shape of the whole array; each image has `pixels`
+    pixels.
     """
     found = _IMAGEJ.search(text)
     if found is not None:

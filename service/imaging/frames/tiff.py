@@ -1,6 +1,7 @@
-"""Frames from TIFF and BigTIFF files: grey or colour, of any layout of samples, strips and tiles.
+"""Reader of frames from TIFF and BigTIFF files: grey or colour, in any layout of samples, strips
+and tiles.
 
-tifffile reads the tags and puts strips and tiles in their places.  libtiff, in Pillow, unpacks
+tifffile reads the tags and puts strips and tiles in their places. libtiff, in Pillow, decompresses
 them: it writes no more bytes than asked for, whatever a file holds.
 """
 
@@ -45,20 +46,20 @@ _DESCRIPTION, _SAMPLES, _META_MORPH = 270, 277, 33629
 _WHITE_IS_ZERO, _BLACK_IS_ZERO, _RGB, _FILTER_PATTERN, _LINEAR_RAW = 0, 1, 2, 32803, 34892
 _GREYS = (_WHITE_IS_ZERO, _BLACK_IS_ZERO, _FILTER_PATTERN)
 _BY_PILLOW = {3: "palette", 5: "CMYK", 6: "YCbCr"}
-"""Photometric interpretations of 8 bits that Pillow turns into red, green and blue."""
+"""Photometric interpretations of 8-bit TIFF pages that Pillow converts to red, green and blue."""
 _PLAIN, _JPEG, _PACK_BITS = 1, 7, 32773
 _UNPACKED = {5, 8, _PACK_BITS, 32946, 34925, 50000}
-"""LZW, deflate, PackBits, deflate, LZMA, Zstandard."""
+"""TIFF compression codes that are read: LZW, deflate, PackBits, deflate, LZMA, Zstandard."""
 _NO_PREDICTOR, _DIFFERENCES, _FLOAT_PREDICTOR = 1, 2, 3
 
 logging.getLogger("tifffile").setLevel(logging.CRITICAL)
-"""It logs what it finds wrong with a file; this module refuses such files in words."""
+"""Silence tifffile's logger: this module reports the faults of files as errors."""
 
 
 def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
-    """The frame in a TIFF file; raises `BadFile` with what is wrong with it, or not read of it.
+    """The frame in a TIFF file; raises `BadFile` with the reason if it cannot be read.
 
-    Of several samples a pixel the counts are the sums of the colours.
+    The colour samples of a pixel are summed.
     """
     from tifffile import TiffFile
 
@@ -78,7 +79,7 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
         if page.photometric in _BY_PILLOW or page.compression == _JPEG:
             if page.compression == _JPEG:
                 _require_whole_segments(page, file, limits)
-            # Pillow turns what it decodes by itself.
+            # Pillow applies the orientation while decoding.
             counts, full_scale = _by_pillow(file, 0 if planes > 1 else number)
             _, orientation = as_shown(np.zeros((1, 1)), tag)
         else:
@@ -93,7 +94,7 @@ def read_tiff(file: BoundedFile, limits: FrameLimits, digest: str) -> Frame:
 
 
 def _require_readable(page: Any, limits: FrameLimits) -> None:
-    """Raise `BadFile` for a page whose layout is not read, by its name, or that is too large."""
+    """Raise `BadFile` for a TIFF page with an unsupported layout or too many pixels."""
     limits.require_either_way(page.imagewidth, page.imagelength)
     bits, samples = page.bitspersample, page.samplesperpixel
     if page.tags.valueof(262) is None:
@@ -125,19 +126,19 @@ def _require_readable(page: Any, limits: FrameLimits) -> None:
     if page.predictor not in (_NO_PREDICTOR, _DIFFERENCES, _FLOAT_PREDICTOR):
         raise bad_frame("has a predictor that is not read", _word(page.predictor))
     if page.predictor != _NO_PREDICTOR and page.compression in (_PLAIN, _PACK_BITS):
-        # Some readers ignore it there, and some do not.
+        # Readers disagree on whether the predictor applies there.
         raise bad_frame("has a predictor with a compression that takes none", compression)
 
 
 def _move_to_plane(page: Any, number: int) -> None:
-    """Let a page of one directory be one of the planes that lie behind each other in the file.
+    """Redirect a TIFF page to one of several planes stored contiguously behind a single directory.
 
-    Raises `BadFile` where they are compressed, or their strips not one behind the other.
+    Raises `BadFile` where planes are compressed, or their strips not contiguous.
     """
     ends = [at + size for at, size in zip(page.dataoffsets, page.databytecounts, strict=True)]
     if page.compression != _PLAIN or list(page.dataoffsets[1:]) != ends[:-1]:
         raise bad_frame("holds several images in a layout that is not read; save them as pages")
-    # Some writers state the bytes of all planes for the first.
+    # Some writers state the bytes of all planes as those of the first.
     pixel_bytes = page.samplesperpixel * page.dtype.itemsize
     plane_bytes = page.imagewidth * page.imagelength * pixel_bytes
     if len(page.databytecounts) == 1:
@@ -150,17 +151,17 @@ def _word(value: Any) -> str:
 
 
 def _light(page: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
-    """The sums of the colours (rows, columns) of a page in stored order, and the largest one."""
+    """Colour sums (rows, columns) of a TIFF page in stored order, and the largest possible sum."""
     colours = _colours(page)
     unpredict = page.predictor == _FLOAT_PREDICTOR
     packed = page.compression if page.compression != _PLAIN else None
-    # What tifffile is handed is unpacked already.
+    # tifffile receives data that are decompressed already.
     page.compression = _PLAIN
     page.predictor = _NO_PREDICTOR if unpredict else page.predictor
     dtype = page.dtype
     whole = dtype.newbyteorder("=")
     if colours > 1:
-        # The sums of three numbers of 16 bits are exact in single precision's 24 bits too.
+        # Sums of three 16-bit numbers are exact in single precision's 24 bits too.
         whole = np.dtype("i4" if dtype.kind in "ui" and dtype.itemsize < 4 else "f8")
     light = np.zeros((page.imagelength, page.imagewidth), whole)
     for index, data in _segments(page, file, packed):
@@ -178,7 +179,7 @@ def _light(page: Any, file: BoundedFile) -> tuple[npt.NDArray[Any], float]:
 
 
 def _colours(page: Any) -> int:
-    """How many samples of a pixel, the first ones, are light: not how opaque it is."""
+    """The number of leading samples of a pixel that are light; opacity is not counted."""
     samples = int(page.samplesperpixel)
     if page.photometric in (_RGB, _LINEAR_RAW):
         if samples < 3:
@@ -192,10 +193,9 @@ def _colours(page: Any) -> int:
 
 
 def _segment_size(page: Any) -> tuple[int, int, int]:
-    """Rows and columns of a strip or tile, and how many stand below each other.
+    """Rows and columns of a strip or tile, and the number of them below each other.
 
-    Raises `BadFile` where there are more or fewer than the size of the page needs, or where
-    they lie over each other.
+    Raises `BadFile` where their number does not fit the size of the page, or where they overlap.
     """
     planes, _, rows, columns, _ = page.shaped
     tall, wide = (
@@ -212,7 +212,7 @@ def _segment_size(page: Any) -> tuple[int, int, int]:
 
 
 def _segments(page: Any, file: BoundedFile, packed: Any) -> Iterator[tuple[int, bytes]]:
-    """Each strip or tile by its number, unpacked; raises `BadFile` for one of another size."""
+    """Strips or tiles of a page, numbered and decompressed; raises `BadFile` for a wrong size."""
     _, _, rows, _, contiguous = page.shaped
     item = contiguous * page.dtype.itemsize
     tiled = page.is_tiled
@@ -232,9 +232,9 @@ def _segments(page: Any, file: BoundedFile, packed: Any) -> Iterator[tuple[int, 
 
 
 def _require_apart(page: Any) -> None:
-    """Raise `BadFile` where a strip or tile lies over another one, a tag's value or the directory.
+    """Raise `BadFile` where a strip or tile overlaps another one, a tag's value or the directory.
 
-    Its pixels would be out of their places, and an attitude from them wrong.
+    Overlapping pixels would be out of place, and an attitude from them wrong.
     """
     form = page.parent.tiff
     directory_bytes = form.tagnosize + len(page.tags) * form.tagsize + form.offsetsize
@@ -244,7 +244,7 @@ def _require_apart(page: Any) -> None:
         for tag in page.tags
         if tag.valuebytecount > form.offsetsize
     }
-    # Blank tiles may share their bytes.
+    # Identical offsets are allowed: blank tiles may share their bytes.
     pairs = zip(page.dataoffsets, page.databytecounts, strict=True)
     spans |= {(at, at + size, True) for at, size in pairs}
     tags_end = data_end = 0
@@ -258,7 +258,7 @@ def _require_apart(page: Any) -> None:
 
 
 def _unpacked(data: bytes, compression: int, row_bytes: int, rows: int) -> bytes:
-    """The bytes of rows, which libtiff unpacks as a grey picture of 8 bits."""
+    """Decompressed rows of a strip or tile; libtiff reads them as an 8-bit grey picture."""
     from PIL import Image
 
     entries = [(256, row_bytes), (257, rows), (258, 8), (259, int(compression)), (262, 1)]
@@ -270,7 +270,7 @@ def _unpacked(data: bytes, compression: int, row_bytes: int, rows: int) -> bytes
 
 
 def _undone(data: bytes, page: Any) -> bytes:
-    """The numbers of a strip or tile whose bytes were stored as differences, sign bytes first."""
+    """Floating-point numbers of a strip or tile after undoing the horizontal byte differences."""
     item, contiguous = page.dtype.itemsize, page.shaped[4]
     columns = page.tilewidth if page.is_tiled else page.shaped[3]
     stored = np.frombuffer(data, np.uint8).reshape(-1, columns * item, contiguous)
@@ -281,7 +281,7 @@ def _undone(data: bytes, page: Any) -> bytes:
 
 
 def _by_pillow(file: BoundedFile, number: int) -> tuple[CountArray, float]:
-    """The sums of red, green and blue of a page of 8 bits, turned by its orientation."""
+    """The sums of red, green and blue of an 8-bit page, rotated by its orientation."""
     from PIL import Image
 
     file.seek(0)
@@ -294,14 +294,14 @@ def _by_pillow(file: BoundedFile, number: int) -> tuple[CountArray, float]:
 
 
 def _require_whole_segments(page: Any, file: BoundedFile, limits: FrameLimits) -> None:
-    """Raise `BadFile` for a page whose strips or tiles of JPEG data are damaged or out of place."""
+    """Raise `BadFile` for a page with damaged JPEG data, or with strips or tiles of wrong size."""
     tables = page.jpegtables[:-2] if page.jpegtables else b"\xff\xd8"
     tall, wide, down = _segment_size(page)
     for index, (at, size) in enumerate(zip(page.dataoffsets, page.databytecounts, strict=True)):
         file.seek(at)
         data = tables + file.read(size)[2:]
         require_whole(data, limits.max_pixels)
-        # The last strip may be as tall as the others, or hold its own rows alone.
+        # The last strip may have the full height, or only its remaining rows.
         left = page.imagelength - index % down * tall
         if _jpeg_size(data) not in (
             (wide, tall),
@@ -313,7 +313,7 @@ def _require_whole_segments(page: Any, file: BoundedFile, limits: FrameLimits) -
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Columns and rows that the header of JPEG data states."""
+    """Columns and rows stated by the header of JPEG data."""
     at = 2
     while True:
         marker, length = struct.unpack_from(">HH", data, at)
@@ -324,7 +324,7 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
 
 
 def _page_exposure(page: Any) -> tuple[str | None, float | None]:
-    """Time and exposure of a page's EXIF."""
+    """The UTC of mid exposure and the exposure from the EXIF of a TIFF page."""
     exif = page.tags.valueof(34665)
     exif = exif if isinstance(exif, dict) else {}
     names = "DateTimeOriginal", "OffsetTimeOriginal", "SubsecTimeOriginal", "ExposureTime"
@@ -332,12 +332,11 @@ def _page_exposure(page: Any) -> tuple[str | None, float | None]:
 
 
 def _subfiles(file: BoundedFile) -> tuple[list[Subfile], int]:
-    """The images of a TIFF, and how many planes its only directory has; 1: each has its own.
+    """The images of a TIFF, and the number of planes behind its only directory (1 without planes).
 
-    Raises `BadFile` where tags alone would take much memory.
+    Raises `BadFile` where the tags alone would take too much memory.
 
-    Every tag is read whole before anything can be asked of it; many tags may
-    point to the same bytes of a file.
+    tifffile reads every tag whole; many tags may point to the same bytes of a file.
     """
     file.seek(0)
     start = file.read(16)
@@ -367,7 +366,7 @@ def _subfiles(file: BoundedFile) -> tuple[list[Subfile], int]:
 
 
 def _planes(file: BoundedFile, order: str, entries: list[Entry], image: Subfile) -> int:
-    """The images behind the only directory of a file, as ImageJ, tifffile and MetaMorph write."""
+    """The number of planes behind a TIFF's only directory, by ImageJ, tifffile or MetaMorph."""
     found = {entry.tag: entry for entry in reversed(entries)}
     planes = found[_META_MORPH].number if _META_MORPH in found else 1
     if _DESCRIPTION in found:
@@ -385,7 +384,9 @@ def _planes(file: BoundedFile, order: str, entries: list[Entry], image: Subfile)
 
 
 def _require_small(order: str, entries: list[Entry]) -> None:
-    """Raise `BadFile` for a directory of many or great tags, or with great tiles."""
+    """Raise `BadFile` for a TIFF directory of too many or too large tags, or with too large
+    tiles.
+    """
     if len(entries) > MAX_TAGS:
         raise bad_frame(f"has more than {MAX_TAGS} tags", str(len(entries)))
     tile = 1
