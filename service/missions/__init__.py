@@ -1,1 +1,1 @@
-"""Missions: what is fixed for a spacecraft, read from its TOML file."""
+"""Missions: the fixed properties of each spacecraft, read from its TOML file."""

@@ -1,6 +1,7 @@
-"""A tracker's camera: what turns a direction into a place on the sensor and light into counts.
+"""A star tracker's camera: the mapping of directions to pixels, and of magnitudes to counts.
 
-From its size and field of view follows the rest of a mission: a file of a few lines made whole.
+The module also completes a mission file of a few lines: the camera's size and field of view
+determine the default values of the rest.
 """
 
 import math
@@ -24,18 +25,19 @@ Wire = tuple[
     Annotated[float, Field(gt=-0.5, lt=0.5)],
     Annotated[float, Field(gt=0, le=0.5)],
 ]
-"""A wire before the aperture: the direction that it runs in, deg from u towards v; how far its
-middle is from the aperture's, across it; its width.  Both in diameters of the aperture."""
+"""A wire across the aperture: its direction, deg from u towards v; its distance from the middle of
+the aperture; its width. Distance and width are in diameters of the aperture.
+"""
 
 TWO_EACH_WAY: tuple[Wire, ...] = (
     (0.0, -0.25, 0.1), (0.0, 0.25, 0.1), (90.0, -0.25, 0.1), (90.0, 0.25, 0.1),
 )  # fmt: skip
 MOST_COVERED = 0.6
-"""Largest share of the aperture that wires may cover, counted one by one."""
+"""Largest share of the aperture that wires may cover; overlaps count twice."""
 MOST_SAMPLED_SIGMA_PX = 5.0
 
 WIDEST_BAND = 2.0
-"""The longest wavelength of a band over its shortest."""
+"""Largest ratio of the longest to the shortest wavelength of a band."""
 
 MAX_SIDE_PX = 20_000
 MOST_STARS = 250
@@ -43,13 +45,13 @@ MOST_STARS = 250
 _ROUNDS = 50
 _NEAR_ENOUGH = 1e-12
 UNKNOWN_FIELD_DEG = 40.0
-"""Field of view assumed if a file states neither that nor a focal length: room for most lenses."""
+"""Field of view in degrees assumed if a file states neither that nor a focal length."""
 UNKNOWN_LIMIT_MAG = 7.0
 ROOM = 1.3
-"""By so much a field that is told roughly may be wider."""
+"""Factor by which a roughly stated field of view may be too small."""
 WANTED_STARS = 40
 STARS_TO_MAG = ((4.0, 516), (5.0, 1610), (6.0, 4999), (7.0, 15495), (8.0, 45598), (9.0, 130172))
-"""How many stars of the sky are brighter than a magnitude."""
+"""Number of stars of the whole sky that are brighter than a magnitude."""
 SIGMA_PX, ROUGH_SIGMA_PX = 0.3, 1.0
 LARGEST_PAIR_DEG = 8.0
 REQUIRED_OF_CAMERAS = frozenset(
@@ -64,12 +66,12 @@ REQUIRED_OF_CAMERAS = frozenset(
         "saturation_counts",
     )
 )
-"""The keys without which a table `[trackers.camera]` gets the defaults of `camera_defaults`."""
+"""The camera keys without which a table `[trackers.camera]` gets defaults."""
 _SCALES = ("focal_length_px", "field_of_view_deg", "focal_length_mm", "pixel_um")
 
 
 class Camera(Strict):
-    """Geometry and light of one tracker's frames.
+    """The geometry and the photometry of one tracker's frames.
 
     u counts along columns and v along rows, in pixels; the centre of the first
     pixel is (0, 0).  Tracker X lies along +u, Y along +v and the boresight Z
@@ -81,51 +83,54 @@ class Camera(Strict):
     width_px: int = Field(ge=16, le=MAX_SIDE_PX)
     height_px: int = Field(ge=16, le=MAX_SIDE_PX)
     calibrated: bool = True
-    """False: focal length and zero point are rough, and are fitted on every frame anew."""
+    """False if focal length and zero point are rough, so that they are fitted on every frame."""
     focal_length_px: float = Field(ge=10, le=1e7)
     center_u_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
     center_v_px: float = Field(ge=-MAX_SIDE_PX, le=MAX_SIDE_PX)
-    """The point where the boresight meets the sensor."""
+    """The pixel coordinates of the boresight on the sensor."""
     u_terms: Terms = ()
     v_terms: Terms = ()
-    """Distortion, [i, j, c]: from the plane as measured to the true one."""
+    """Distortion terms [i, j, c], which turn the measured plane coordinates into true ones."""
     bias_counts: float = Field(default=0.0, ge=-1e6, le=1e6)
-    """The level of a pixel that has seen nothing."""
+    """The count of a pixel without any light."""
     gain_e_per_count: float = Field(gt=0, le=1e6)
     read_noise_e: float = Field(ge=0, le=1e6)
     dark_e_per_s: float = Field(default=0.0, ge=0, le=1e9)
     saturation_counts: float = Field(gt=0, le=1e9)
-    """A pixel at or above this is full."""
+    """The count from which a pixel is saturated."""
     exposure_s: float = Field(gt=0, le=3600)
-    """Exposure of a frame that does not state its own."""
+    """The exposure in seconds of a frame that does not state its own."""
     psf_sigma_px: float = Field(ge=0.3, le=20)
-    """Width of a star's image along each axis, before the pixel integrates it.
+    """Sigma of a star's image along each axis in pixels, before integration over the pixel.
 
-    Of the images of an aperture: of the Gaussian that is as wide at half of its height as the
-    image of the aperture without its wires."""
+    For a diffraction image: the sigma of the Gaussian with the same full width at half maximum as
+    the image of the aperture without its wires.
+    """
     psf: PsfKind = Field(default="gaussian", exclude_if="gaussian".__eq__)
-    """A star's image: a Gaussian, the Airy disc of a round aperture, or the cross of wires before
-    it.  The default is no part of the digest."""
+    """The shape of a star's image: a Gaussian, the Airy disc of a round aperture, or the
+    diffraction cross of wires before it. The default is no part of the digest.
+    """
     wires: tuple[Wire, ...] = Field(
         default=TWO_EACH_WAY, max_length=32, exclude_if=TWO_EACH_WAY.__eq__
     )
-    """Wires of the mesh that draws the cross."""
+    """The wires across the aperture that cause the diffraction cross."""
     band_nm: tuple[Wavelength, Wavelength] | None = Field(default=None, exclude_if=is_missing)
-    """The wavelengths between which the detector sees light; None: light of one colour.
+    """The shortest and longest wavelength that the detector sees; None for light of one colour.
 
-    `psf_sigma_px` is then that of the light in the middle of the band."""
+    `psf_sigma_px` then belongs to the middle of the band.
+    """
     zero_point_mag: float | None = Field(default=None, ge=-10, le=40)
-    """Instrument magnitude of a star that gives one count a second; without it stars have none."""
+    """Instrument magnitude of a star of one count per second; None if unknown."""
     sigma_floor_px: float = Field(default=0.0, ge=0, le=10)
-    """What the calibration leaves in a position, per axis, however bright the star."""
+    """Calibration error of a star's position in pixels per axis, however bright the star."""
     threshold_sigma: float = Field(default=5.0, ge=3, le=100)
-    """Detection: light, through a filter of the image's shape, over its noise."""
+    """Least signal to noise of a detected star, in the image filtered with a star's shape."""
     centroid: CentroidMethod = "matched"
     centroid_half_width_px: int = Field(default=4, ge=2, le=25)
     most_stars: int = Field(default=60, ge=2, le=MOST_STARS)
-    """The brightest so many go into a batch."""
+    """Largest number of stars in a batch; the brightest are chosen."""
     faintest_mag: float | None = Field(default=None, ge=-10, le=30)
-    """Stars measured fainter are left out of a batch; by default the run catalog's limit."""
+    """Faintest measured magnitude of stars in a batch; by default the run catalog's limit."""
 
     @model_validator(mode="after")
     def _bias_lies_below_saturation(self) -> Self:
@@ -165,33 +170,35 @@ class Camera(Strict):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """(rows, columns) of a frame."""
+        """The size of a frame as (rows, columns)."""
         return self.height_px, self.width_px
 
     @cached_property
     def corner_radius_deg(self) -> float:
-        """The angle from the boresight to the farthest corner of the sensor."""
+        """The angle in degrees from the boresight to the farthest corner of the sensor."""
         u = np.array([-0.5, self.width_px - 0.5, -0.5, self.width_px - 0.5])
         v = np.array([-0.5, -0.5, self.height_px - 0.5, self.height_px - 0.5])
         return float(np.degrees(np.arccos(self.directions(u, v)[:, 2].min())))
 
     def directions(self, u_px: Vector, v_px: Vector) -> Vector:
-        """Unit vectors (n, 3) in tracker axes of places (n,) on the sensor."""
+        """Unit vectors (n, 3) in tracker axes for places (n,) on the sensor, in pixels."""
         x, y = self._plane(u_px, v_px)
         bent_x, bent_y = self._bent(x, y)
         return unit(np.stack([x + bent_x, y + bent_y, np.ones_like(x)], axis=-1))
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
-        """Coordinates (u, v) of directions (n, 3); NaN for directions far outside the sensor."""
+        """Pixel coordinates (u, v) of directions (n, 3); NaN for directions far outside the
+        sensor.
+        """
         with np.errstate(divide="ignore", invalid="ignore"):
             ahead = directions[..., 2] > 0.0
             true_x = np.where(ahead, directions[..., 0] / directions[..., 2], np.nan)
             true_y = np.where(ahead, directions[..., 1] / directions[..., 2], np.nan)
-        # A polynomial says nothing of what lies far outside the field it was fitted in.
+        # A distortion polynomial is meaningless far outside the field in which it was fitted.
         far = np.hypot(true_x, true_y) > 2.0 * math.tan(math.radians(self.corner_radius_deg))
         true_x, true_y = np.where(far, np.nan, true_x), np.where(far, np.nan, true_y)
         x, y = true_x, true_y
-        # Distortion is small: a fixed point is reached in a few rounds.
+        # Distortion is small, so the fixed-point iteration converges in a few rounds.
         for _ in range(_ROUNDS):
             bent_x, bent_y = self._bent(x, y)
             moved = np.nanmax(np.abs([true_x - bent_x - x, true_y - bent_y - y]), initial=0.0)
@@ -206,9 +213,9 @@ class Camera(Strict):
     def tangent_sigmas_arcsec(
         self, u_px: Vector, v_px: Vector, sigma_u_px: Vector, sigma_v_px: Vector
     ) -> Vector:
-        """One standard deviation per tangent axis (n,) of places with errors along u and v.
+        """One standard deviation (n,) per tangent axis in arcsec, from pixel errors along u and v.
 
-        The root of the mean of the variances along two tangent axes: half the trace.
+        It is the root of the mean of the variances along two tangent axes (half the trace).
         """
         direction = self.directions(u_px, v_px)
         along_u = self.directions(u_px + 1.0, v_px) - direction
@@ -218,9 +225,9 @@ class Camera(Strict):
         return np.asarray(np.sqrt(variance / 2.0) * ARCSEC_PER_RADIAN)
 
     def magnitude(self, flux_counts: Vector, exposure_s: float) -> Vector:
-        """Instrument magnitudes of light summed over an exposure; NaN where there is none.
+        """Instrument magnitudes of stars from their counts over an exposure; NaN where undefined.
 
-        All are NaN where the zero point is not known.
+        All are NaN if the zero point is unknown.
         """
         if self.zero_point_mag is None:
             return np.full(np.shape(flux_counts), np.nan)
@@ -229,9 +236,9 @@ class Camera(Strict):
         return np.asarray(self.zero_point_mag - 2.5 * np.log10(light))
 
     def flux_counts(self, magnitude_mag: Vector, exposure_s: float) -> Vector:
-        """The light, in counts, of a star of an instrument magnitude over an exposure.
+        """The counts over an exposure of stars with given instrument magnitudes.
 
-        NaN where the zero point is not known.
+        All are NaN if the zero point is unknown.
         """
         if self.zero_point_mag is None:
             return np.full(np.shape(magnitude_mag), np.nan)
@@ -252,12 +259,12 @@ class Camera(Strict):
 
 
 def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
-    """The tables of a mission; of a file with a `camera` of its own, those that it leaves out.
+    """The tables of a mission file; those left out beside a table `camera` get default values.
 
-    The camera needs `width_px` and `height_px`.  Its scale may be told by
-    `focal_length_px`, then it counts as calibrated, or roughly by `field_of_view_deg`, along
-    the longer side, or `focal_length_mm` with `pixel_um`, or not at all: then the lens
-    is fitted on every frame.  What is wrong with the values is left to the mission's check.
+    The camera needs `width_px` and `height_px`. Its scale may be given by `focal_length_px`, for a
+    calibrated camera, roughly by `field_of_view_deg` along the longer side or `focal_length_mm`
+    with `pixel_um`, or not at all; the lens is then fitted on every frame. Wrong values are left
+    for the mission's check.
     """
     camera = table.get("camera")
     if not isinstance(camera, dict) or "trackers" in table:
@@ -269,7 +276,7 @@ def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
         if not (min(width, height) >= 16 and 10 <= focal_px < 1e8):
             raise ValueError
     except (KeyError, TypeError, ValueError, ZeroDivisionError):
-        # Refused in the mission's own words.
+        # The check of the mission will report the fault.
         return {**table, "trackers": [{"name": "CAMERA", "camera": camera}]} | {"camera": camera}
     exact = scale_key == "focal_length_px"
     room = 1.0 if exact else ROOM
@@ -314,10 +321,10 @@ def with_camera_defaults(table: dict[str, Any]) -> dict[str, Any]:
 def camera_defaults(
     camera: dict[str, Any], field_of_view_deg: Sequence[float] | None = None
 ) -> dict[str, Any]:
-    """The table of a camera with its defaults.
+    """A camera's table completed with default values.
 
-    Without a focal length it follows from the tracker's `field_of_view_deg`, width and height.
-    Raises `KeyError`, `TypeError` or `ValueError` for a size or scale that is missing or wrong.
+    A missing focal length is computed from `field_of_view_deg` and the width. Raises `KeyError`,
+    `TypeError` or `ValueError` for a size or scale that is missing or wrong.
     """
     if field_of_view_deg is not None and not any(each in camera for each in _SCALES):
         tangent = math.tan(math.radians(0.5 * field_of_view_deg[0]))
@@ -339,7 +346,7 @@ def camera_defaults(
 
 
 def field_of_camera_deg(camera: Mapping[str, Any]) -> tuple[float, float]:
-    """The width and height of a camera's field of view, about its boresight."""
+    """Width and height of a camera's field of view in degrees, symmetric about its boresight."""
     return tuple(  # type: ignore[return-value]
         round(2.0 * math.degrees(math.atan(_half_px(camera, axis) / camera["focal_length_px"])), 3)
         for axis in (("width_px", "center_u_px"), ("height_px", "center_v_px"))
@@ -347,13 +354,13 @@ def field_of_camera_deg(camera: Mapping[str, Any]) -> tuple[float, float]:
 
 
 def _half_px(camera: Mapping[str, Any], axis: tuple[str, str]) -> float:
-    """The distance from the boresight to the farther edge of the sensor."""
+    """The distance in pixels from the boresight to the farther edge of the sensor."""
     size_px, center_px = (float(camera[key]) for key in axis)
     return max(center_px + 0.5, size_px - 0.5 - center_px)
 
 
 def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:
-    """The focal length in pixels, and what told it."""
+    """The focal length in pixels, and the key it was computed from."""
     if "focal_length_px" in camera:
         return float(camera["focal_length_px"]), "focal_length_px"
     if "focal_length_mm" in camera or "pixel_um" in camera:
@@ -367,7 +374,7 @@ def _focal_px(camera: dict[str, Any]) -> tuple[float, str | None]:
 
 
 def _limit_mag(field_deg2: float) -> float:
-    """The magnitude to which a field of view holds the wanted number of stars on average."""
+    """The magnitude down to which a field of view holds the wanted number of stars on average."""
     wanted = math.log(WANTED_STARS * 41253.0 / field_deg2)
     magnitudes, counts = zip(*STARS_TO_MAG, strict=True)
     return round(float(np.interp(wanted, np.log(counts), magnitudes)), 1)

@@ -1,4 +1,4 @@
-"""The defaults of a mission file that follow from its other values, and their origins.
+"""Default values of a mission file, computed from its other values, with their origins.
 
 A file of ten lines names each tracker's field, its errors, its limiting magnitude and the error
 of the a priori attitude.  `RULES` derives the rest.  `docs/missions.md` has the same table.
@@ -21,19 +21,19 @@ from service.missions.camera import (
 from service.vectors import Vector
 
 MARGIN_DEG = 0.1
-"""Room at the edge of a zone for aberration, and for stars just outside of the field of view."""
+"""Margin of a zone in degrees, for aberration and for stars just outside the field of view."""
 LOST_ERROR_DEG = 1.0
-"""Room in the zone of a mission without a priori knowledge, about attitudes found elsewhere."""
+"""A priori error in degrees assumed for the zone of a mission without a priori knowledge."""
 SUN_ERROR_DEG = 0.1
-"""The paper's error of a Sun-pointed axis."""
+"""Default error of a Sun-pointed axis in degrees, from the paper."""
 SEPARATION_SIGMAS = 11.2
-"""The paper's SEPTOL over its sigma per axis: 0.0066 deg for 3 arcsec radial."""
+"""Ratio of the paper's SEPTOL to its sigma per axis: 0.0066 deg for 3 arcsec radial."""
 MAGNITUDE_SIGMAS = 6.0
-"""The paper's XMTOL and TMAGMX over SIGMAG: 0.6 mag for 0.1 mag."""
+"""Ratio of the paper's magnitude tolerances XMTOL and TMAGMX to SIGMAG: 0.6 mag for 0.1 mag."""
 POLE_ERRORS = 1.3
-"""The paper's BANTOL1 over the error of the pole: 0.13 deg for 0.1 deg."""
+"""Ratio of the paper's BANTOL1 to the error of the pole: 0.13 deg for 0.1 deg."""
 MERGE_SIGMAS = 20.0 * math.sqrt(2.0)
-"""The shipped missions' 60 arcsec over their sigma per axis."""
+"""Merging distance of catalog stars over a tracker's sigma per axis, from the shipped missions."""
 MERGE_ARCSEC = 60.0, 300.0
 POSITION_SIGMA_ARCSEC = 5.0
 MAGNITUDE_SIGMA_MAG = 0.1
@@ -44,10 +44,10 @@ BODY_AXES = {name: tuple(np.eye(3)[k].tolist()) for k, name in enumerate(AXES)}
 
 
 class Rule(NamedTuple):
-    """A value that a file may leave out: its key, how it follows from others, and its function.
+    """The rule for a default of a mission file: its key, an explanation, and its function.
 
-    The function returns None where the rule does not apply to the mission.  It may raise the
-    errors of `_FAULTY` where a value that it needs is missing or wrong.
+    The function returns None where the rule does not apply to the mission. It may raise the errors
+    of `_FAULTY` where a required value is missing or wrong.
     """
 
     key: str
@@ -57,10 +57,10 @@ class Rule(NamedTuple):
 
 @dataclass(frozen=True)
 class Completed:
-    """The tables of a mission file with its defaults.
+    """A mission file's tables completed with defaults.
 
-    `origins` maps the dotted key of a derived value to the rule.  `waiting` are the keys whose
-    value could not be derived, because a value of the file is missing or wrong.
+    `origins` maps the dotted key of a computed value to its rule. `waiting` has the keys that could
+    not be computed because a value of the file is missing or wrong.
     """
 
     table: dict[str, Any]
@@ -72,28 +72,28 @@ _FAULTY = (TypeError, ValueError, KeyError, IndexError, ArithmeticError, Attribu
 
 
 class Given:
-    """The values of a file from which others are derived; what is wrong raises `ValueError`."""
+    """Values of a mission file that defaults are computed from; wrong ones raise `ValueError`."""
 
     def __init__(self, table: Mapping[str, Any]) -> None:
         self.table = table
 
     def trackers(self) -> list[dict[str, Any]]:
-        """The tables of the trackers, already with their own defaults."""
+        """The tables of the mission's trackers, completed with their own defaults."""
         trackers = self.table["trackers"]
         if not trackers:
             raise ValueError("no tracker")
         return list(trackers)
 
     def corner_deg(self) -> float:
-        """The largest field of view, from the boresight to its farthest corner."""
+        """Largest angle in degrees from a tracker's boresight to a corner of its field of view."""
         return max(_positive(each["field_of_view_radius_deg"]) for each in self.trackers())
 
     def largest_sigma_arcsec(self) -> float:
-        """The largest position sigma of a tracker."""
+        """The largest position sigma of the trackers, in arcsec."""
         return max(_positive(each["sigma_arcsec"]) for each in self.trackers())
 
     def magnitude_tolerance_mag(self) -> float:
-        """The tolerance of magnitudes for the largest sigma of a tracker."""
+        """The magnitude tolerance, computed from the largest magnitude sigma of the trackers."""
         sigmas = [_positive(each["magnitude_sigma_mag"]) for each in self.trackers()]
         return min(_rounded(MAGNITUDE_SIGMAS * max(sigmas)), 30.0)
 
@@ -103,16 +103,16 @@ class Given:
         return None if axis is None else [_number(each) for each in axis]
 
     def error_deg(self) -> float:
-        """The largest error of the a priori attitude about each axis, or of the pole."""
+        """The largest a priori attitude error in degrees, about each axis or of the pole."""
         default = LOST_ERROR_DEG if self.sun_axis() is None else SUN_ERROR_DEG
         return _positive(self.table.get("a_priori_error_deg", default))
 
     def is_short(self) -> bool:
-        """True if the file leaves the run catalog to the trackers' `limit_mag`."""
+        """True if the file derives its run catalog from the trackers' `limit_mag`."""
         return any("limit_mag" in each for each in self.trackers())
 
     def zone_kind(self) -> Any:
-        """The kind of the zone that the file states or implies."""
+        """The kind of zone, cap or band, that the file states or implies."""
         implied = "cap" if self.sun_axis() is None else "band"
         return self.table.get("zone", {}).get("kind", implied)
 
@@ -123,7 +123,7 @@ def _zone_radius_deg(given: Given) -> float | None:
     error_deg, reach_deg = given.error_deg(), 0.0
     for tracker in given.trackers():
         boresight = _vector(tracker["z_axis_body"])
-        # The errors about the axes add; the largest displacement is at a corner of their cube.
+        # Errors about the axes add; the largest displacement is at a corner of their cube.
         shift = max(float(np.linalg.norm(np.cross(each, boresight))) for each in _CORNERS)
         reach_deg = max(
             reach_deg, _positive(tracker["field_of_view_radius_deg"]) + shift * error_deg
@@ -147,7 +147,7 @@ def _coelevation_deg(given: Given) -> float | None:
 
 
 def _grid_deg(given: Given) -> float | None:
-    """The step of the cached zones; an earlier file, which states the zone, has none."""
+    """The grid step of cached zones in degrees; None for a file in the earlier form with a zone."""
     zone = given.table["zone"]
     size_key = "radius_deg" if zone["kind"] == "cap" else "half_width_deg"
     if "sun_pointed_axis_body" not in given.table and "a_priori_error_deg" not in given.table:
@@ -276,7 +276,7 @@ RULES: tuple[Rule, ...] = (
         _position_sigma_arcsec,
     ),
 )
-"""The values of a mission, in the order in which they are derived."""
+"""The rules for a mission's defaults, in the order of their computation."""
 
 TRACKER_RULES: Mapping[str, str] = {
     "name": "STARTRACKER_1, STARTRACKER_2, ...",
@@ -289,13 +289,13 @@ TRACKER_RULES: Mapping[str, str] = {
     "coelevation_deg": "of a band: the angle from sun_pointed_axis_body to the boresight",
     "camera": "without a value of its own: as of a file with a table [camera]",
 }
-"""The values of each tracker that a file may leave out, and how they follow from others."""
+"""The tracker keys that a file may leave out, and the rules for their defaults in words."""
 
 
 def completed(table: dict[str, Any]) -> Completed:
-    """The tables of a mission file with every default that follows from other values.
+    """A mission file's tables with every default that follows from other values.
 
-    Values that are wrong are left as they are: the check of the mission names them.
+    Wrong values are left unchanged: the check of the mission reports them.
     """
     table = with_camera_defaults(table)
     origins: dict[str, str] = {}
@@ -353,14 +353,15 @@ def _axes(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> dict[st
         return {}
     k = AXES.index(missing[0])
     first, second = (_vector(tracker[AXES[(k + step) % 3]]) for step in (1, 2))
-    # A zero without a sign: the digest of the mission is of its text.
+    # Adding zero removes negative zeros, which would change the text that the mission's digest
+    # covers.
     third = np.cross(first, second) + 0.0
     return {missing[0]: third.tolist()}
 
 
 def _camera(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> dict[str, Any]:
     camera = tracker.get("camera")
-    # A file of an earlier version states all of these; what it leaves out keeps its meaning.
+    # A file in the earlier form states all of these keys; keys that it omits keep their meaning.
     if not isinstance(camera, dict) or camera.keys() >= REQUIRED_OF_CAMERAS:
         return {}
     return {"camera": camera_defaults(tracker["camera"], tracker.get("field_of_view_deg"))}
@@ -386,7 +387,7 @@ def _noise(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> dict[s
 
 
 def _coelevation(table: dict[str, Any], place: int, tracker: dict[str, Any]) -> dict[str, Any]:
-    # The zone has the coelevation of the first tracker.
+    # The first tracker's coelevation is the zone's.
     is_derived = "coelevation_deg" not in table.get("zone", {})
     if place == 0 or "coelevation_deg" in tracker or not is_derived:
         return {}
@@ -409,14 +410,14 @@ def _from_sun_deg(given: Given, tracker: Mapping[str, Any]) -> float:
 
 
 def _number(value: Any) -> float:
-    """A finite number; raises `ValueError` for anything else."""
+    """A value checked to be a finite number; raises `ValueError` for anything else."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise ValueError("no number")
     return float(value)
 
 
 def _vector(value: Any) -> Vector:
-    """Three finite numbers; raises `ValueError` for anything else."""
+    """A value checked to be a vector of three finite numbers; raises `ValueError` otherwise."""
     first, second, third = (_number(each) for each in value)
     return np.array([first, second, third])
 
@@ -428,20 +429,20 @@ def _positive(value: Any) -> float:
 
 
 def _rounded(value: float, digits: int = 2) -> float:
-    """The value to a number of significant digits."""
+    """A number rounded to a number of significant digits."""
     return float(f"{value:.{digits}g}")
 
 
 def _up(value: float, decimals: int = 2) -> float:
-    """The next larger value of so many decimals; a value that has no more stays."""
+    """A number rounded up at a number of decimals."""
     scale = 10.0**decimals
     return math.ceil(round(value * scale, 6)) / scale
 
 
 def needs(table: Mapping[str, Any]) -> Iterator[str]:
-    """What a mission file lacks of the values from which the others follow, each with an example.
+    """The missing values of a mission file that defaults depend on, each with an example.
 
-    Values that are there but wrong are named elsewhere.
+    Values that are present but wrong are reported elsewhere.
     """
     if "camera" in table:
         return

@@ -1,7 +1,7 @@
-"""Faults that pydantic finds, in the service's words and in the order of their cause.
+"""Validation errors of pydantic, in the service's words and ordered by cause.
 
-A fault that only follows from another one is left out: a table that could not be made because one
-of its values is wrong, or a missing key whose name was misspelt.
+Consequential errors are left out: a table that is incomplete because one of its values is wrong, or
+a missing key whose name was misspelt.
 """
 
 import difflib
@@ -73,14 +73,14 @@ EXAMPLES: dict[str, Any] = {
     ],
     "stars": [{"h_deg": 0.52, "v_deg": -1.21, "magnitude": 5.31}],
 }
-"""A usual value for each key that a mission or a batch needs."""
+"""Example values for the keys of missions and batches, shown in error messages."""
 
 _UNSEEN = r"\x00-\x1f\x7f-\x9f\u00ad\u061c\u180e\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff"
 _SPACES = r"\x20\u00a0\u1680\u2000-\u200a\u202f\u205f\u3000"
 VISIBLE_PATTERN = f"^[^{_UNSEEN}]+$"
-"""No character of control, of zero width or of the direction of text."""
+"""A pattern for text without control characters, zero-width characters and direction marks."""
 NAME_PATTERN = f"^[^{_UNSEEN}{_SPACES}](?:[^{_UNSEEN}]*[^{_UNSEEN}{_SPACES}])?$"
-"""`VISIBLE_PATTERN` without a space at either end."""
+"""A pattern for visible text that neither begins nor ends with a space."""
 
 FORMS: dict[str, str] = {
     r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$": (
@@ -95,26 +95,26 @@ FORMS: dict[str, str] = {
         "must be text without control characters, invisible characters and spaces at its ends"
     ),
 }
-"""The patterns of names, in words."""
+"""Explanations of the patterns of names, for error messages."""
 
 
 LONGEST_NAME = 40
-"""Longer names are meant as none that is known; comparing them takes long."""
+"""Longest unknown name that is compared with known ones, since comparison is slow."""
 LEAST_CUT = 3
-"""Letters of a name that stands for a longer one."""
+"""Least length of an abbreviation that is completed to a longer name."""
 MOST_COMPARED = 20
-"""Unknown keys of one table that are compared with its missing ones."""
+"""Largest number of unknown keys of a table that are compared with its missing ones."""
 
 
 def plain_message(fault: PydanticFault) -> str:
-    """What is expected of a value, without the words of pydantic, and an example of its key."""
+    """A validation error in the service's words, with an example value for its key."""
     words = _WORDS.get(fault["type"])
     if words is None:
         text = str(fault["msg"]).removeprefix("Value error, ").removeprefix("Assertion failed, ")
         text = re.sub(r"^Input should (be|have) ", r"must \1 ", text)
     else:
         text = words(fault.get("ctx", {}))
-    # Messages of our own say what is right.
+    # Messages of the service itself already state what is expected.
     if fault["type"] in _WITHOUT_EXAMPLE or "options" in fault["loc"]:
         return text
     example = _example(fault["loc"])
@@ -122,7 +122,7 @@ def plain_message(fault: PydanticFault) -> str:
 
 
 def _example(location: Location) -> Any:
-    """The usual value of a key, or of the entry of its list; None where none is known."""
+    """An example value for the key, or the list entry, at a location; None if none is known."""
     at = max((k for k, part in enumerate(location) if isinstance(part, str)), default=None)
     if at is None or (location[at] == "kind" and "zone" not in location):
         return None
@@ -135,9 +135,11 @@ def _example(location: Location) -> Any:
 
 
 def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
-    """The faults that do not follow from others: unknown keys, wrong values, missing keys."""
+    """The validation errors that are not consequences of others, first unknown keys, then wrong
+    values, then missing keys.
+    """
     joined = [*map(_of_kind, _of_lists(faults))]
-    # A client may send any number of unknown keys: the time is linear in it.
+    # A client may send any number of unknown keys: the time must be linear in it.
     wholes: set[Location] = set()
     unknown: dict[Location, list[Any]] = {}
     for fault in joined:
@@ -160,9 +162,9 @@ def causes(faults: Sequence[PydanticFault]) -> list[PydanticFault]:
 def of_the_form_given(
     faults: Sequence[PydanticFault], key_of: Callable[[PydanticFault], str]
 ) -> list[PydanticFault]:
-    """The faults less those of forms of a value that the file does not use, such as a text.
+    """The errors without those for alternative types of a value that the file does not use.
 
-    Of a value that may have several forms, pydantic names a fault for each.
+    For a value of several types, pydantic reports one error for each.
     """
     return [
         fault
@@ -176,11 +178,11 @@ def of_the_form_given(
 
 
 def nearest(name: Any, known: Sequence[Any]) -> str | None:
-    """The name among those known that is spelt most like another, or None."""
+    """The known name with the most similar spelling, or None."""
     if len(str(name)) > LONGEST_NAME:
         return None
     names = [*map(str, known)]
-    # A unit that was left out, as in sigma for sigma_arcsec, or a word that was cut, as mag.
+    # Either a unit was left out, such as sigma for sigma_arcsec, or a word was cut, such as mag.
     longer = [each for each in names if each.startswith(f"{name}_")] or [
         each for each in names if len(str(name)) >= LEAST_CUT and each.startswith(str(name))
     ]
@@ -189,7 +191,7 @@ def nearest(name: Any, known: Sequence[Any]) -> str | None:
 
 
 def _of_kind(fault: PydanticFault) -> PydanticFault:
-    """The fault, that of a table of an unknown kind as one of the key that names the kind."""
+    """An error, moved to the key that names the kind where a table is of an unknown kind."""
     key = str(fault.get("ctx", {}).get("discriminator", "")).strip("'")
     if fault["type"] not in ("union_tag_invalid", "union_tag_not_found") or not key.isidentifier():
         return fault
@@ -205,7 +207,7 @@ _RANK = {"extra_forbidden": 0, "missing": 2}
 
 
 def _of_lists(faults: Sequence[PydanticFault]) -> Iterator[PydanticFault]:
-    """The faults, with one for the whole list in place of one for each entry that it lacks."""
+    """The errors, with one for a whole list instead of one for every missing entry."""
     lacking: dict[Location, int] = {}
     for fault in faults:
         location = fault["loc"]
@@ -273,17 +275,17 @@ _WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
 
 
 def _either(tags: str) -> str:
-    """Allowed tags, which pydantic separates by commas, as alternatives."""
+    """The allowed tags of a union, which pydantic separates by commas, joined by "or"."""
     return " or ".join(tags.split(", "))
 
 
 def dotted_key(model: type[BaseModel], location: Sequence[str | int]) -> str:
-    """The key at which pydantic found a fault, without the tags that it puts in between."""
+    """The dotted key of an error's location, without pydantic's tags of union members."""
     return ".".join(str(part) for part in _steps(model, location)) or "the file"
 
 
 def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[str]:
-    """The keys of the table at a location."""
+    """The allowed keys of the table at a location."""
     models = [model]
     for part in location:
         models = _after(models, part)[1]
@@ -291,7 +293,7 @@ def allowed_keys(model: type[BaseModel], location: Sequence[str | int]) -> list[
 
 
 def explained(model: type[BaseModel], fault: PydanticFault) -> str:
-    """A fault of a file; for an unknown key the nearest, and the keys that are allowed there."""
+    """The message for an error in a file; for an unknown key with the most similar allowed key."""
     if fault["type"] != "extra_forbidden":
         return plain_message(fault)
     allowed = allowed_keys(model, fault["loc"][:-1])
@@ -313,7 +315,7 @@ def _steps(model: type[BaseModel], location: Sequence[str | int]) -> Iterator[st
 
 
 def _after(models: Models, part: str | int) -> tuple[bool, Models]:
-    """True if a part of a location is a key, not an index; and the tables to which it leads."""
+    """True if a part of a location is no tag of pydantic; and the tables below that part."""
     fields = [each.model_fields[part] for each in models if part in each.model_fields]
     if fields:
         return True, [found for field in fields for found in _models_in(field.annotation)]

@@ -1,9 +1,8 @@
-"""THE registry of identifiers: one entry makes an identifier known everywhere.
+"""The registry of star identification methods: an entry makes a method available everywhere.
 
-The types that check options and mission files, the OpenAPI schema, the console's
-form and the command's choices are derived from it.  The registry stands below the
-identifiers, so an entry may name its function as `module:function`, which is
-imported when it is first used.
+The types that check options and mission files, the OpenAPI schema, the console's form and the
+command's choices are derived from it. An entry may name its function as `module:function`, which is
+imported at its first use, since the registry must not import the identifiers.
 """
 
 from collections.abc import Callable
@@ -15,10 +14,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class IdentifierEntry:
-    """One identifier: its name, its function, and what the pipeline needs to know of it.
+    """A star identification method: its name, its function, and the properties that the pipeline
+    uses.
 
     `function` takes a `Sighting` and returns an `Identification`; with `by_columns` it takes many
-    sightings, and writes what it finds, as `identify_by_votes` does.
+    sightings and writes the results into arrays, as `identify_by_votes` does.
     """
 
     name: str
@@ -26,22 +26,24 @@ class IdentifierEntry:
     description: str
     by_columns: bool = False
     weighs_hypotheses: bool = False
-    """It tells the likeliest hypothesis, so that two groups of stars can be told apart."""
+    """True if the method ranks hypotheses by probability, so that two star groups can be told
+    apart.
+    """
     uses_prior: bool = True
-    """It searches about the a priori attitude where there is one."""
+    """True if the method searches about the a priori attitude where one is known."""
     falls_back: bool = False
-    """The whole sky is searched where it finds nothing good about the a priori attitude."""
+    """True if the whole sky is searched when the a priori attitude gives no good result."""
     needs_guide: bool = False
-    """It searches the whole sky by itself, with the guide database of triangles."""
+    """True if the method searches the whole sky itself, with the guide database of triangles."""
     uses: frozenset[str] | None = None
-    """The tests and tolerances that change what it finds; None: all of them.
+    """The tests and tolerances that affect the method's result; None means all of them.
 
-    Others may still change the votes that it shows beside its result.
+    Other settings may still change the votes shown beside the result.
     """
 
     @cached_property
     def identify(self) -> Callable[..., Any]:
-        """The function itself."""
+        """The method's function, imported if it is given by name."""
         function = self.function
         return resolve_name(function) if isinstance(function, str) else function
 
@@ -52,13 +54,14 @@ class IdentifierEntry:
 
 
 IDENTIFIERS: dict[str, IdentifierEntry] = {}
-"""The entries by name, in the order in which they are shown."""
+"""The registered identification methods by name, in display order."""
 
 
 def register(entry: IdentifierEntry) -> None:
-    """Add an identifier; before `missions.mission`, which derives types, is imported.
+    """Add an identification method to the registry.
 
-    Raises `ValueError` where there is one of that name.
+    Must be called before `missions.mission`, which derives types from the registry, is imported.
+    Raises `ValueError` if the name is taken.
     """
     if entry.name in IDENTIFIERS:
         raise ValueError(f"there is an identifier {entry.name} already")

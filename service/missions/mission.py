@@ -1,7 +1,7 @@
 """A mission: zone, tolerances, tests, run catalog and trackers, read from a TOML file.
 
-Our word names a setting; the paper's symbol stands in the comment, here and in
-the files (Fink & Shoup 1994, Table 1).
+The project's word names a setting; the paper's symbol stands in the comment, here and in the files
+(Fink & Shoup 1994, Table 1).
 """
 
 import difflib
@@ -76,29 +76,33 @@ SolverName = Literal["quest", "triad"]
 
 
 class Cap(Strict):
-    """A small circle about the tracker's presumed boresight."""
+    """A zone of the sky: a circular cap about the presumed boresight."""
 
     kind: Literal["cap"]
     axis_body: Direction
-    """The spacecraft's boresight: the axis that an a priori `boresight` names."""
+    """The spacecraft's boresight in body axes, which an a priori `boresight` refers to."""
     radius_deg: float = Field(gt=0, le=180)  # CCAP
     grid_deg: GridStep = 0.0
-    """Step of the grid to which the zone's axis is snapped for the cache; 0: the exact zone."""
+    """Step in degrees of the grid to which a cached zone's axis is rounded; 0 for the exact
+    zone.
+    """
 
 
 class Band(Strict):
-    """A band about a small or great circle around the catalog generation vector, its pole."""
+    """A zone of the sky: a band about a small or great circle around the catalog generation
+    vector.
+    """
 
     kind: Literal["band"]
     axis_body: Direction
-    """The body axis that lies along the pole: for SOHO the one pointed at the Sun."""
+    """The body axis along the band's pole, for SOHO the axis pointed at the Sun."""
     coelevation_deg: float = Field(gt=0, lt=180)  # COEL
     half_width_deg: float = Field(gt=0, le=90)  # WBAND
     grid_deg: GridStep = 0.0
 
 
 class Tolerances(Strict):
-    """Every tolerance of the identification, each open to change per request."""
+    """The tolerances of star identification; a request may change any of them."""
 
     pair_separation_max_deg: float = Field(ge=0.01, le=60)  # HMAX
     separation_deg: float = Field(ge=0, le=5)  # SEPTOL
@@ -108,11 +112,11 @@ class Tolerances(Strict):
     pole_difference_deg: float = Field(default=0.13, ge=0, le=180)  # BANTOL1
     pole_angle_deg: float = Field(default=7.2, ge=0, le=180)  # BANTOL2
     fov_rotation_deg: float = Field(default=10.0, ge=0, le=180)
-    """Tolerance of Van Bezooijen's test, which the paper leaves out and the missions have off."""
+    """Tolerance of Van Bezooijen's test, not in the paper and off in the shipped missions."""
 
 
 class Tests(Strict):
-    """The switches of the tests; unless a file says otherwise, `pole` is on in bands alone."""
+    """The switches of the identification tests; by default `pole` is on in bands only."""
 
     magnitude: bool = True
     cross_product: bool = True
@@ -122,7 +126,7 @@ class Tests(Strict):
 
 
 class ToleranceLimits(NamedTuple):
-    """The tolerances of the pair tests as kernels take them, angles in radians."""
+    """The tolerances of the pair tests in the form that kernels take, angles in radians."""
 
     separation: float  # SEPTOL
     magnitude: float  # XMTOL
@@ -134,7 +138,7 @@ class ToleranceLimits(NamedTuple):
 
 
 class Switches(NamedTuple):
-    """The pair tests that are made, as kernels take them."""
+    """The switches of the pair tests in the form that kernels take."""
 
     magnitude: bool
     cross_product: bool
@@ -144,7 +148,7 @@ class Switches(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Rules:
-    """The tolerances and tests of an identification, and both as kernels take them."""
+    """The tolerances and tests of an identification, also in the form that kernels take."""
 
     tolerances: Tolerances
     tests: Tests
@@ -153,7 +157,7 @@ class Rules:
 
 
 def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
-    """The rules that tolerances and tests make together."""
+    """The rules of an identification, converted from tolerances and tests."""
     return Rules(
         tolerances,
         tests,
@@ -171,37 +175,37 @@ def rules_of(tolerances: Tolerances, tests: Tests) -> Rules:
 
 
 TESTS_OF_ROLL = ("cross_product", "fov_rotation")
-"""They compare with the presumed roll, which an a priori boresight leaves open."""
+"""The tests that need the presumed roll, which an a priori boresight does not give."""
 
 
 class RunCatalogSettings(Strict):
-    """How the run catalog of the mission is made from the star catalog."""
+    """Settings for extracting the mission's run catalog from the star catalog."""
 
     magnitude_limit_mag: float = Field(ge=-2, le=15)
     epoch_step_years: float = Field(default=1.0, gt=0, le=100)
-    """A batch uses the run catalog of its own time rounded to this step."""
+    """Step in years to which the time of a batch is rounded to choose its run catalog."""
     merge_within_arcsec: float = Field(default=60.0, ge=0, le=3600)
     merge_limit_mag: float | None = Field(default=None, ge=-2, le=15)
-    """A star fainter than this adds no light to a brighter one; None: every one adds its own."""
+    """Faintest star whose light is added to a brighter one's on merging; None for no limit."""
     reject_neighbour_within_arcsec: float = Field(default=0.0, ge=0, le=3600)
     reject_neighbour_fainter_by_mag: float = Field(default=2.0, ge=0, le=30)
     reject_variable_amplitude_mag: float | None = Field(default=None, gt=0, le=30)
     reject_position_sigma_arcsec: float | None = Field(default=None, gt=0)
     color_polynomial_mag: tuple[float, ...] = ()
-    """Instrument magnitude = V + c0 + c1 (B-V) + c2 (B-V)^2 + ...; empty: V itself."""
+    """Coefficients of instrument magnitude = V + c0 + c1 (B-V) + c2 (B-V)^2 + ...; empty for V."""
 
     @cached_property
     def digest(self) -> str:
-        """The settings as text: part of the key under which a run catalog is kept."""
+        """The run catalog's settings as text, part of the key of a cached run catalog."""
         return self.model_dump_json()
 
     def epoch_of(self, julian_year: float) -> float:
-        """The epoch, in Julian years, of the run catalog that serves a time."""
+        """The epoch, in Julian years, of the run catalog for a time."""
         return round(julian_year / self.epoch_step_years) * self.epoch_step_years
 
 
 class Calibration(Strict):
-    """Focal-plane calibration: measured angles to true ones.
+    """The focal-plane calibration of a tracker, from measured to true angles.
 
     With u, v the measured `h_deg`, `v_deg`, each true angle is
     scale (measured + sum of coefficient u^i v^j) over terms [i, j, coefficient].
@@ -213,7 +217,7 @@ class Calibration(Strict):
 
 
 class Magnitudes(Strict):
-    """Calibration of a tracker's magnitudes: measured ones to those of the run catalog.
+    """The photometric calibration of a tracker, from its magnitudes to those of the run catalog.
 
     The magnitude of a star is zero_mag + scale * measured.  The run catalog has V, plus the
     polynomial of the mission's `catalog`, plus (B-V) times the mean `color_mag` of the trackers.
@@ -231,29 +235,31 @@ FieldSide = Annotated[float, Field(gt=0, lt=120)]
 
 
 class Tracker(Strict):
-    """One star tracker: where it looks in the body, how far it sees, how well it measures."""
+    """One star tracker: alignment with the body, field of view, and measurement errors."""
 
     name: Name
     x_axis_body: Components
     y_axis_body: Components
     z_axis_body: Components
-    """The tracker's axes in body components; +Z is the boresight."""
+    """The tracker's X, Y and Z axes in body components; +Z is the boresight."""
     field_of_view_radius_deg: float = Field(gt=0, le=60)  # FOVMAX
     field_of_view_deg: tuple[FieldSide, FieldSide] | None = Field(default=None, exclude=True)
-    """Width along X and height along Y of a field that is no circle; its corners lie within
-    `field_of_view_radius_deg`.  It changes no answer: the check and the simulator use it."""
+    """Width along X and height along Y of a field of view that is no circle, in degrees.
+
+    Its corners lie within `field_of_view_radius_deg`. It changes no answer: the check and the
+    simulator use it.
+    """
     limit_mag: float | None = Field(default=None, ge=-2, le=15, exclude=True)
-    """The faintest star that this tracker sees; the simulator draws none beyond it.  It changes no
-    answer itself."""
+    """The faintest magnitude that the tracker sees, used by the simulator; it changes no answer."""
     sigma_arcsec: float = Field(gt=0, le=3600)
-    """One standard deviation per tangent axis: the paper's radial SIGOBS over the root of two."""
+    """Position error per tangent axis, one sigma in arcsec: radial SIGOBS over the root of two."""
     magnitude_sigma_mag: float = Field(gt=0, le=10)  # SIGMAG
     coelevation_deg: float | None = Field(default=None, gt=0, lt=180)
-    """In bands: the coelevation of this tracker's boresight, where it is not the mission's."""
+    """In bands, the coelevation of this tracker's boresight if it differs from the zone's."""
     calibration: Calibration = Calibration()
     magnitudes: Magnitudes = Field(default=AS_MEASURED, exclude_if=AS_MEASURED.__eq__)
     camera: Camera | None = None
-    """The camera, of a tracker that sends frames; its farthest corner bounds the field of view."""
+    """The camera of a tracker that sends frames; its farthest corner bounds the field of view."""
     scan: Scan | None = Field(default=None, exclude_if=is_missing)
 
     @model_validator(mode="after")
@@ -263,39 +269,42 @@ class Tracker(Strict):
 
     @cached_property
     def body_from_tracker(self) -> Matrix:
-        """The alignment (3, 3): body components = this @ tracker components."""
+        """The alignment matrix (3, 3) that turns tracker components into body components."""
         axes = np.column_stack([self.x_axis_body, self.y_axis_body, self.z_axis_body])
         u, _, vt = np.linalg.svd(axes)
         return read_only(u @ vt)
 
     @cached_property
     def least_cosine(self) -> float:
-        """The cosine of the angle to the boresight at the edge of the field of view."""
+        """The cosine of the field of view's radius."""
         return math.cos(math.radians(self.field_of_view_radius_deg))
 
     @cached_property
     def boresight_body(self) -> Vector:
-        """The boresight (3,) in body axes: the last column of the alignment."""
+        """The boresight (3,) in body axes, the last column of the alignment matrix."""
         return read_only(self.body_from_tracker[:, 2].copy())
 
 
 class Mission(Strict):
-    """All that is fixed for a mission."""
+    """The fixed settings of a mission."""
 
     retired: ClassVar[bool] = False
     name: Name
     description: str = ""
     a_priori_error_deg: float | None = Field(default=None, gt=0, le=180, exclude=True)
-    """Largest error of the a priori attitude about each axis, in bands of the pole.
+    """Largest error of the a priori attitude in degrees, about each axis, or of the pole in bands.
 
-    The zone's size follows from it where the file leaves that out.  It changes no answer, so it is
-    no part of the digest."""
+    It gives the default size of the zone. It changes no answer itself, so it is no part of the
+    digest.
+    """
     sun_pointed_axis_body: Direction | None = Field(default=None, exclude=True)
-    """The body axis that is kept on the Sun: the pole of the band that follows from it."""
+    """The body axis that is kept on the Sun, which makes the zone a band about that pole."""
     identifier: Identifier = "verified"
     solver: SolverName = "quest"
     lost_in_space_fallback: bool = True
-    """Look in the whole sky where `verified` finds no good attitude about the a priori one."""
+    """True if the whole sky is searched where `verified` finds no good attitude near the a priori
+    one.
+    """
     zone: Annotated[Cap | Band, Field(discriminator="kind")]
     tolerances: Tolerances
     tests: Tests = Field(default=Tests(), validate_default=True)
@@ -303,10 +312,10 @@ class Mission(Strict):
     trackers: tuple[Tracker, ...] = Field(min_length=1, max_length=16)
     products: ProductSettings = Field(default=DEFAULT_PRODUCTS, exclude_if=DEFAULT_PRODUCTS.__eq__)
     packets: Packets | None = Field(default=None, exclude_if=is_missing)
-    """Which parameters of space packets fill a batch; missing, it is no part of the digest."""
+    """The space packet parameters that fill a batch; if missing, no part of the digest."""
     gyro: GyroSettings | None = Field(default=None, exclude_if=is_missing)
     motion: MotionSettings | None = Field(default=None, exclude_if=is_missing)
-    """How the body moves while there is no gyro; missing: as `MotionSettings` has it."""
+    """The model of body motion without a gyro; if missing, the defaults of `MotionSettings`."""
     tracking: TrackingSettings | None = Field(default=None, exclude_if=is_missing)
     live_filter: LiveFilterSettings | None = Field(default=None, exclude_if=is_missing)
     smoothing: SmoothingSettings | None = Field(default=None, exclude_if=is_missing)
@@ -325,7 +334,7 @@ class Mission(Strict):
     def _packets_are_of_its_trackers(
         cls, packets: Packets | None, info: ValidationInfo
     ) -> Packets | None:
-        # Trackers that are themselves at fault are not there to be compared with.
+        # Invalid trackers are missing from the data, so nothing can be compared with them.
         known = [tracker.name for tracker in info.data.get("trackers", ())]
         for each in packets.trackers if packets and known else ():
             if each.tracker not in known:
@@ -348,18 +357,18 @@ class Mission(Strict):
 
     @cached_property
     def digest(self) -> str:
-        """`sha256:` of the settings, the same however the file is laid out."""
+        """The `sha256:` digest of the mission's settings, independent of the file's layout."""
         text = json.dumps(self.model_dump(mode="json"), sort_keys=True, separators=(",", ":"))
         return "sha256:" + hashlib.sha256(text.encode()).hexdigest()
 
     @cached_property
     def within_zones(self) -> "Mission":
-        """The mission with no look at the whole sky where a zone gave nothing good."""
+        """The mission without the fallback to a search of the whole sky."""
         return self.model_copy(update={"lost_in_space_fallback": False})
 
     @cached_property
     def run_catalog_settings(self) -> RunCatalogSettings:
-        """How the run catalog is made: with the mean colour term of the trackers' magnitudes."""
+        """The settings of the run catalog, with the trackers' mean colour term added."""
         color_mag = math.fsum(each.magnitudes.color_mag for each in self.trackers)
         if color_mag == 0.0:
             return self.catalog
@@ -369,33 +378,35 @@ class Mission(Strict):
 
     @cached_property
     def rules(self) -> Rules:
-        """The mission's own tolerances and tests."""
+        """The mission's default rules: tolerances and tests."""
         return rules_of(self.tolerances, self.tests)
 
     @cached_property
     def rules_without_roll(self) -> Rules:
-        """The same with the tests off that compare with a presumed roll."""
+        """The mission's default rules without the tests that need a presumed roll."""
         tests = self.tests.model_copy(update=dict.fromkeys(TESTS_OF_ROLL, False))
         return rules_of(self.tolerances, tests)
 
     @property
     def knows_attitude(self) -> bool:
-        """False for a mission whose file states no a priori knowledge of the attitude."""
+        """True unless the mission file states no a priori knowledge of the attitude."""
         is_lost = self.identifier == "lost_in_space" and self.sun_pointed_axis_body is None
         return not is_lost or self.a_priori_error_deg is not None
 
     @cached_property
     def presumed_error_deg(self) -> float:
-        """Largest error of the a priori attitude about each axis, in bands of the pole.
+        """Largest error of the a priori attitude in degrees, about each axis, or of the pole in
+        bands.
 
-        Without `a_priori_error_deg` it is what the zone leaves beside the field of view.
+        If `a_priori_error_deg` is missing, the error is the size of the zone minus the field of
+        view.
         """
         if self.a_priori_error_deg is not None:
             return self.a_priori_error_deg
         field_deg = max(each.field_of_view_radius_deg for each in self.trackers)
         if isinstance(self.zone, Band):
             return max(self.zone.half_width_deg - field_deg, 0.0)
-        # Errors about both axes across the boresight add.
+        # Errors about the two axes perpendicular to the boresight add.
         return max(self.zone.radius_deg - field_deg, 0.0) / math.sqrt(2.0)
 
     @cached_property
@@ -404,7 +415,7 @@ class Mission(Strict):
         return read_only(unit(self.zone.axis_body))
 
     def tracker(self, name: str, field: str) -> Tracker:
-        """The tracker of that name; raises `BadInput` naming `field` and the trackers there are."""
+        """Tracker with a given name; raises `BadInput` naming `field` and the known trackers."""
         for tracker in self.trackers:
             if tracker.name == name:
                 return tracker
@@ -412,9 +423,9 @@ class Mission(Strict):
         raise BadInput(Fault(field, f"{self.name} has {known}", shown_value(name)))
 
     def camera_tracker(self, name: str | None, field: str) -> tuple[Tracker, Camera]:
-        """The tracker of that name with its camera; by default the first that has one.
+        """Tracker with a given name, and its camera; by default the first tracker with a camera.
 
-        Raises `BadInput` naming `field` where there is none.
+        Raises `BadInput` naming `field` if there is no camera.
         """
         trackers = self.trackers if name is None else (self.tracker(name, field),)
         for tracker in trackers:
@@ -425,7 +436,9 @@ class Mission(Strict):
 
 
 def parse_mission(text: str, file: str) -> Mission:
-    """Read one mission from TOML; raises `BadConfiguration` naming file, key and allowed values."""
+    """A mission read from TOML text; raises `BadConfiguration` naming file, key and allowed
+    values.
+    """
     try:
         table = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -446,7 +459,7 @@ def parse_mission(text: str, file: str) -> Mission:
 
 
 def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
-    """True for a missing value that would follow from one that is wrong or missing itself."""
+    """True for a missing value whose default could not be computed from other values."""
     key = dotted_key(Mission, fault["loc"])
     within = (each == key or each.startswith(f"{key}.") for each in whole.waiting)
     return fault["type"] == "missing" and (any(within) or key.endswith("field_of_view_radius_deg"))
@@ -454,7 +467,7 @@ def _is_waiting(fault: PydanticFault, whole: Completed) -> bool:
 
 def _described(fault: PydanticFault) -> str:
     text = f"{dotted_key(Mission, fault['loc'])}: {explained(Mission, fault)}"
-    # The message about a whole table names the values in it that matter.
+    # The message about a whole table already names the values that matter.
     of_a_table = fault["type"] == "value_error" and isinstance(fault["input"], dict)
     if fault["type"] == "missing" or of_a_table:
         return text
@@ -462,7 +475,7 @@ def _described(fault: PydanticFault) -> str:
 
 
 def read_mission(path: Path) -> Mission:
-    """The mission of a file; raises `BadConfiguration` naming the file and what is wrong."""
+    """A mission read from a file; raises `BadConfiguration` naming the file and the fault."""
     try:
         text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
@@ -471,17 +484,16 @@ def read_mission(path: Path) -> Mission:
 
 
 def load_missions(*places: Path | None, shipped: bool = True) -> dict[str, Mission]:
-    """The shipped missions by name, with those of a site's folders and files added.
+    """The shipped missions by name, together with those of a site's folders and files.
 
-    A site's mission takes the place of a shipped one, and a file that of any mission of its name.
-    Raises `BadConfiguration` for a folder that does not exist, and for one name in two files of
-    folders.
+    A site's mission replaces a shipped one of the same name, and a mission from a file replaces any
+    other. Raises `BadConfiguration` for a missing folder, and for one name in two files of folders.
     """
     return {name: mission for name, (mission, _) in mission_files(*places, shipped=shipped).items()}
 
 
 def mission_files(*places: Path | None, shipped: bool = True) -> dict[str, tuple[Mission, Path]]:
-    """The missions of `load_missions` by name, each with its file."""
+    """The missions of `load_missions` by name, each with the path of its file."""
     found: dict[str, tuple[Mission, Path]] = {}
     if shipped:
         found |= {
@@ -512,7 +524,7 @@ def _files(folder: Path) -> list[Path]:
 
 
 def mission_named(missions: Mapping[str, Mission], name: str) -> Mission:
-    """The mission of a spacecraft; raises `UnknownSpacecraft` naming the nearest and all."""
+    """Mission of a spacecraft; raises `UnknownSpacecraft` with the nearest name and all names."""
     try:
         return missions[name]
     except KeyError:

@@ -1,7 +1,7 @@
-"""A mission's tables about attitude over time: gyro, motion, prediction, filter and smoothing.
+"""A mission's settings for the attitude over time: gyro, motion, prediction, filter, smoothing.
 
-The gyro: its axes, its noise, and the largest rate that it is believed; how the body moves
-where there is none; and how the attitude of a batch is predicted from the last good one.
+The gyro's axes, its noise, and the largest credible rate; the model of motion without a gyro; and
+the prediction of a batch's attitude from the last good one.
 """
 
 from functools import cached_property
@@ -16,17 +16,17 @@ from service.times import Utc, parse_utc
 from service.vectors import Matrix, read_only
 
 LARGEST_RATE_DEG_PER_S = 10.0
-"""Default of a mission: star trackers do not follow faster motion."""
+"""Default of a mission's largest body rate: star trackers do not follow faster motion."""
 FIRST_BIAS_RAD_S = 5e-5
-"""One sigma of a gyro's bias when nothing is known of it: 10 deg/h."""
+"""One sigma of the initial uncertainty of a gyro's bias: 10 deg/h."""
 RATE_WALK_RAD_S1_5 = 3e-4
-"""Default of a mission: within minutes a body may begin or end a slew."""
+"""Default random walk of the body's rate, large enough for slews that begin within minutes."""
 RATE_RAD_S = 2e-3
-"""One sigma of the rate of a body when nothing is known of it: 0.1 deg/s."""
+"""One sigma of the initial uncertainty of a body's rate: 0.1 deg/s."""
 FLOOR_DEG, CEILING_DEG = 0.1, 3.0
 MAX_AGE_S = 3600.0
 BODY_RATE_SIGMA_DEG_PER_S = 0.001
-"""Default sigma of the rates that batches carry."""
+"""Default sigma of the body rates sent with batches, deg/s."""
 AXIS_LENGTH_TOLERANCE, LEAST_VOLUME = 1e-3, 0.1
 
 AxisName = Literal["X", "Y", "Z", "-X", "-Y", "-Z"]
@@ -34,27 +34,30 @@ Axis = tuple[float, float, float]
 
 
 class GyroSettings(Strict):
-    """What is fixed of a gyro; the noise is the same for its three axes."""
+    """The fixed properties of a gyro; the noise is the same for its three axes."""
 
     axes: tuple[AxisName, AxisName, AxisName] | tuple[Axis, Axis, Axis] = ("X", "Y", "Z")
-    """The axes about which the three rates of a sample are measured: body axes by name, or unit
-    vectors in body components, which need not be at right angles."""
+    """The axes of a sample's three rates: body axes by name, or unit vectors in body components,
+    not necessarily at right angles.
+    """
     sigma_v_rad_s0_5: float = Field(ge=0, le=1)
-    """Angle random walk, rad/s^.5 (Farrenkopf's sigma_v)."""
+    """Angle random walk of a gyro, rad/s^.5 (Farrenkopf's sigma_v)."""
     sigma_u_rad_s1_5: float = Field(ge=0, le=1)
-    """Walk of the bias, rad/s^1.5 (Farrenkopf's sigma_u)."""
+    """Random walk of a gyro's bias, rad/s^1.5 (Farrenkopf's sigma_u)."""
     scale: float = Field(default=0.0, ge=0, le=0.1)
-    """One sigma of the error of scale that calibration left; .001 is 0.1 %."""
+    """One sigma of a gyro's scale factor error after calibration; .001 is 0.1 %."""
     misalignment_arcsec: float = Field(default=0.0, ge=0, le=36_000)
-    """One sigma of the error of an axis' direction that calibration left."""
+    """One sigma of the misalignment of a gyro's axis after calibration, arcsec."""
     largest_rate_deg_per_s: Annotated[float, Field(gt=0, le=360)] = LARGEST_RATE_DEG_PER_S
-    """A block with a larger rate about an axis is refused."""
+    """Largest credible rate about an axis; a block with a larger one is refused."""
     bias_sigma_rad_s: float = Field(default=FIRST_BIAS_RAD_S, gt=0, le=1)
-    """One sigma of the bias when nothing is known of it."""
+    """One sigma of the initial uncertainty of a gyro's bias, rad/s."""
     samples: Literal["mean", "instant"] = "mean"
-    """A sample is the mean rate since the sample before it, or the rate at its own time."""
+    """Meaning of a gyro sample: the mean rate since the previous sample, or the rate at its
+    time.
+    """
     largest_step_s: float | None = Field(default=None, gt=0, le=3600)
-    """A longer interval between samples is a gap; None: one and a half times the median step."""
+    """Longest interval between gyro samples that is no gap; None: 1.5 times the median step."""
 
     @model_validator(mode="after")
     def _axes_span_space(self) -> "GyroSettings":
@@ -67,22 +70,22 @@ class GyroSettings(Strict):
 
     @cached_property
     def body_from_gyro(self) -> Matrix:
-        """The rates about the body axes are this (3, 3) @ the rates of a sample."""
+        """Matrix (3, 3) that turns the rates of a gyro sample into rates about the body axes."""
         return read_only(np.linalg.inv(self._axes_body))
 
     @property
     def _axes_body(self) -> Matrix:
-        """The axes in body components, a row each."""
+        """The gyro's axes in body components, one per row."""
         return np.array([_vector(axis) for axis in self.axes], np.float64)
 
 
 class MotionSettings(Strict):
-    """How the body moves where there is no gyro: at a constant rate but for a random walk."""
+    """The model of the body's motion without a gyro: a constant rate with a random walk."""
 
     rate_walk_rad_s1_5: float = Field(default=RATE_WALK_RAD_S1_5, gt=0, le=1)
-    """Density of the walk of the rate, rad/s^1.5, about each axis."""
+    """Random walk density of the body's rate about each axis, rad/s^1.5."""
     rate_sigma_rad_s: float = Field(default=RATE_RAD_S, gt=0, le=1)
-    """One sigma of the rate when nothing is known of it."""
+    """One sigma of the initial uncertainty of the body's rate, rad/s."""
 
 
 def _vector(axis: AxisName | Axis) -> Axis:
@@ -94,12 +97,12 @@ def _vector(axis: AxisName | Axis) -> Axis:
 
 
 def largest_rate_deg_per_s(gyro: GyroSettings | None) -> float:
-    """The largest rate of a mission, which may have no table of its gyro."""
+    """The largest credible body rate of a mission, with or without gyro settings."""
     return LARGEST_RATE_DEG_PER_S if gyro is None else gyro.largest_rate_deg_per_s
 
 
 class Flip(Strict):
-    """A manoeuvre through which no attitude is carried, such as SOHO's turns by 180 deg."""
+    """A manoeuvre, such as SOHO's turns by 180 deg, across which no attitude is predicted."""
 
     start: str
     end: str
@@ -121,7 +124,7 @@ class Flip(Strict):
         return self
 
     def lies_between(self, first: Utc, last: Utc) -> bool:
-        """True if the period overlaps that from `first` to `last`."""
+        """True if the manoeuvre overlaps the period from `first` to `last`."""
         start_ns, end_ns = self._span_ns
         return first.tai_ns < end_ns and start_ns < last.tai_ns
 
@@ -131,20 +134,20 @@ class Flip(Strict):
 
 
 class TrackingSettings(Strict):
-    """The prediction of an attitude: how old, how sure, and for which batches."""
+    """Settings for the prediction of attitudes: largest age, zone sizes, and affected batches."""
 
     default: bool = False
-    """Batches whose `a_priori` is null are tracked as if it were {"from": "last"}."""
+    """True if batches with a null `a_priori` are treated as {"from": "last"}."""
     max_age_s: float = Field(default=MAX_AGE_S, gt=0, le=86_400)
-    """An older attitude predicts nothing."""
+    """Largest age in seconds of an attitude from which another is predicted."""
     floor_deg: float = Field(default=FLOOR_DEG, ge=0.001, le=20)
-    """A zone reaches beyond the field of view by this at least."""
+    """Least margin of a predicted zone beyond the field of view, in degrees."""
     ceiling_deg: float = Field(default=CEILING_DEG, ge=0.001, le=60)
-    """And by this at most; a prediction of which one sigma is more predicts nothing."""
+    """Largest margin of a predicted zone, in degrees; no prediction is used with a larger sigma."""
     body_rate_sigma_deg_per_s: float = Field(default=BODY_RATE_SIGMA_DEG_PER_S, ge=0, le=10)
-    """One sigma of the rates that batches carry, about each axis."""
+    """One sigma of the body rates sent with batches, about each axis."""
     flips: tuple[Flip, ...] = Field(default=(), max_length=1000)
-    """An attitude from before the end of one predicts nothing after its start."""
+    """Manoeuvres after whose start no earlier attitude predicts a later one."""
 
     @model_validator(mode="after")
     def _floor_below_ceiling(self) -> Self:
@@ -154,14 +157,14 @@ class TrackingSettings(Strict):
 
 
 class LiveFilterSettings(Strict):
-    """The filter of live data; off where the mission has no such table."""
+    """Settings of the attitude filter of live data; without them the filter is off."""
 
     every_s: float = Field(default=10.0, ge=0.1, le=3600)
-    """Seconds from one look at what was recorded to the next, at least."""
+    """Least seconds between two updates of the live filter."""
 
 
 class SmoothingSettings(Strict):
-    """When the service makes the definitive attitude by itself."""
+    """Settings for the automatic smoothing of the attitude history."""
 
     daily: bool = False
-    """Each UTC day of live data, two hours and ten minutes after its end."""
+    """True if each UTC day of live data is smoothed, two hours and ten minutes after its end."""

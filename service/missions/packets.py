@@ -1,7 +1,7 @@
-"""A mission's table `[packets]`: which telemetry parameters of CCSDS space packets fill a batch.
+"""A mission's table `[packets]`: the telemetry parameters of CCSDS packets that fill a batch.
 
-Parameters have the names of the mission's XTCE file.  The table says nothing of bits: where a
-parameter lies in a packet, how it is encoded and calibrated, is said by the XTCE file alone.
+Parameters have the names of the mission's XTCE file. That file alone describes the position of a
+parameter in a packet, its encoding and its calibration.
 """
 
 import math
@@ -30,7 +30,7 @@ SlotNames = (
     Annotated[str, AfterValidator(_slot_name)]
     | Annotated[tuple[ParameterName, ...], Field(min_length=1, max_length=MOST_SLOTS)]
 )
-"""One parameter for each slot: an XTCE array, numbered names with `{}`, or a list of names."""
+"""The parameter names of a tracker's slots: an XTCE array, a pattern with `{}`, or a list."""
 Triple = ParameterName | tuple[ParameterName, ParameterName, ParameterName]
 Quadruple = ParameterName | tuple[ParameterName, ParameterName, ParameterName, ParameterName]
 Upper = (
@@ -39,17 +39,17 @@ Upper = (
         ParameterName, ParameterName, ParameterName, ParameterName, ParameterName, ParameterName
     ]
 )
-"""The upper triangle of a symmetric matrix by rows: 11, 12, 13, 22, 23, 33."""
+"""The upper triangle of a symmetric matrix by rows, as parameters: 11, 12, 13, 22, 23, 33."""
 ValidLabels = Annotated[tuple[str, ...], Field(min_length=1, max_length=100)] | None
 _no_labels: Any = Field(default=None, exclude_if=lambda labels: labels is None)
-"""Missing, they are no part of the mission's digest."""
+"""A default for labels that keeps them out of the mission's digest if missing."""
 SigmaArcsec = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
 def element_names(names: str | tuple[str, ...], count: int, first: int = 0) -> tuple[str, ...]:
-    """The XTCE names of `count` values: elements of an array, numbered names from `first`, a list.
+    """The XTCE names of `count` values: array elements, numbered names from `first`, or a list.
 
-    An element of an array is written NAME[0], from 0 up, as XTCE references have it.
+    An element of an array is written NAME[0], from 0 up, as in XTCE references.
     """
     if not isinstance(names, str):
         return names
@@ -69,9 +69,9 @@ class CdsTime(Strict):
     day: ParameterName
     millisecond: ParameterName
     microsecond: ParameterName | None = None
-    """Microseconds of the millisecond."""
+    """The parameter with the microseconds of the millisecond."""
     epoch: date = date(1958, 1, 1)
-    """The day whose number is 0."""
+    """The date of day number 0."""
 
 
 class CucTime(Strict):
@@ -81,11 +81,11 @@ class CucTime(Strict):
     coarse: ParameterName
     fine: ParameterName | None = None
     fine_bits: int = Field(default=16, ge=1, le=64)
-    """The fine time counts in units of 2^-fine_bits s."""
+    """Number of bits of the fine time, which counts in units of 2^-fine_bits s."""
     epoch: datetime = datetime(1958, 1, 1)
-    """On the clock of `scale`."""
+    """The epoch of the seconds, on the clock of `scale`."""
     scale: Literal["tai", "gps", "utc"] = "tai"
-    """`tai` and `gps` count leap seconds; `utc` leaves them out, as POSIX time does."""
+    """Clock of the seconds; `tai` and `gps` count leap seconds, `utc` omits them as POSIX does."""
 
     @model_validator(mode="after")
     def _epoch_has_no_zone(self) -> Self:
@@ -98,27 +98,27 @@ PacketTime = Annotated[CdsTime | CucTime, Field(discriminator="kind")]
 
 
 class PacketTracker(Strict):
-    """The stars of one tracker, in slots numbered from `first_slot`."""
+    """The parameters of one tracker's stars, in slots numbered from `first_slot`."""
 
     tracker: str = Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
     slots: int = Field(ge=1, le=MOST_SLOTS)
     first_slot: int = Field(default=1, ge=0, le=1000)
-    """The number that stands for `{}` in the names of the first slot."""
+    """The number that replaces `{}` in the names of the first slot."""
     h: SlotNames | None = None
     v: SlotNames | None = None
     angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "deg"
-    """Unit of h and v after the calibration that the XTCE file describes."""
+    """Unit of the angles h and v after the calibration described by the XTCE file."""
     vector: tuple[SlotNames, SlotNames, SlotNames] | None = None
-    """Parameters of unit vectors in tracker axes, instead of h and v."""
+    """Parameters of unit vectors in tracker axes, as an alternative to h and v."""
     magnitude: SlotNames | None = None
     time_offset_s: SlotNames | None = None
     sigma_arcsec: SlotNames | None = None
     count: ParameterName | None = None
-    """Parameter with the number of slots, from the first, that hold a star."""
+    """The parameter with the number of slots, counted from the first, that hold a star."""
     valid: SlotNames | None = None
-    """A slot holds a star where this is not zero."""
+    """The parameters that are nonzero for slots that hold a star."""
     valid_labels: ValidLabels = _no_labels
-    """The labels of enumerated parameters, or texts, for which a slot holds a star."""
+    """The labels (or texts) of an enumerated parameter for which a slot holds a star."""
 
     @model_validator(mode="after")
     def _names_fit(self) -> Self:
@@ -139,18 +139,20 @@ class PacketTracker(Strict):
 
 
 class PacketPrior(Strict):
-    """The a priori attitude: a quaternion in the packet of the stars or in another one."""
+    """The parameters of an a priori attitude: a quaternion in the stars' packet or another one."""
 
     quaternion: Quadruple | None = None
     scalar: Literal["last", "first"] = "last"
     direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
     frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
     time: PacketTime | None = None
-    """Time of an attitude that has its own; by default the time of its packet."""
+    """The time of an attitude with a time of its own; by default the time of its packet."""
     max_age_s: float = Field(default=10.0, gt=0, le=86400)
-    """An attitude of another packet serves stars that are at most so far from it in time."""
+    """Largest time difference in seconds between stars and an attitude from another packet."""
     sun_pointed: bool = False
-    """Instead of a quaternion: the mission's pole is always at the Sun, its roll unknown."""
+    """True if, instead of a quaternion, the mission's pole is always at the Sun with unknown
+    roll.
+    """
 
     @model_validator(mode="after")
     def _one_source(self) -> Self:
@@ -160,32 +162,32 @@ class PacketPrior(Strict):
 
 
 class PacketMeasurement(Strict):
-    """An attitude that a tracker measured itself: a quaternion with its accuracy.
+    """The parameters of an attitude measured by a tracker itself: a quaternion with its accuracy.
 
-    A packet that holds it gives a batch of its own.
+    Each packet with these parameters gives a batch of its own.
     """
 
     quaternion: Quadruple
     tracker: str | None = Field(default=None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")
-    """Whose axes are meant; None: those of the body."""
+    """The tracker whose axes the attitude describes; None for the body's axes."""
     scalar: Literal["last", "first"] = "last"
     direction: Literal["inertial_to_body", "body_to_inertial"] = "inertial_to_body"
-    """With a tracker, its axes stand for those of the body."""
+    """Sense of the quaternion; with `tracker`, read tracker axes for body axes."""
     frame: Literal["EME2000", "ICRF", "GCRF"] = "EME2000"
     sigma: Triple | None = None
-    """Parameters of one sigma of the rotation about each of the same axes."""
+    """Parameters of one sigma of the rotation about each of the attitude's axes."""
     covariance: Upper | None = None
-    """Parameters of the covariance of that rotation, in place of the sigmas."""
+    """Parameters of the covariance of that rotation, as an alternative to the sigmas."""
     angle_unit: Literal["deg", "arcmin", "arcsec", "rad"] = "arcsec"
     """Unit of `sigma`; the unit of `covariance` is its square."""
     sigma_arcsec: tuple[SigmaArcsec, SigmaArcsec, SigmaArcsec] | None = None
-    """Sigmas of every packet, instead of parameters."""
+    """Constant sigmas in arcsec, as an alternative to parameters."""
     valid: ParameterName | None = None
-    """The packet holds an attitude where this is not zero."""
+    """The parameter that is nonzero if the packet holds an attitude."""
     valid_labels: ValidLabels = _no_labels
-    """The labels of an enumerated parameter, or texts, for which it holds one."""
+    """The labels (or texts) of an enumerated parameter for which the packet holds an attitude."""
     time: PacketTime | None = None
-    """Time of an attitude that has its own; by default the time of its packet."""
+    """The time of an attitude with a time of its own; by default the time of its packet."""
 
     @model_validator(mode="after")
     def _one_accuracy(self) -> Self:
@@ -196,24 +198,24 @@ class PacketMeasurement(Strict):
 
 
 class PacketRates(Strict):
-    """Body rates, in body axes and relative to inertial space."""
+    """The parameters of body rates, in body axes and relative to inertial space."""
 
     components: Triple
     unit: Literal["deg_per_s", "rad_per_s"] = "deg_per_s"
 
 
 class PacketGyro(Strict):
-    """Counts of a gyro about the body axes, in place of body rates."""
+    """The parameters of gyro counts about the body axes, as an alternative to body rates."""
 
     counts: Triple
     kind: Literal["angle", "rate"] = "angle"
-    """`angle`: a counter that accumulates; a rate is its change from the packet before."""
+    """Meaning of gyro counts: with `angle` an accumulating counter, whose change gives the rate."""
     scale_deg: tuple[float, float, float]
-    """Degrees, or of `rate` degrees per second, of one count about each axis."""
+    """Degrees per count about each axis; degrees per second for `rate`."""
     counter_bits: int = Field(default=16, ge=2, le=64)
-    """An accumulated angle starts again after 2^counter_bits counts."""
+    """Number of bits after which an accumulated angle overflows to zero."""
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)
-    """Packets farther apart give no rate."""
+    """Largest interval between packets, in seconds, for which counter changes give a rate."""
 
     @model_validator(mode="after")
     def _scale_is_not_zero(self) -> Self:
@@ -223,32 +225,33 @@ class PacketGyro(Strict):
 
 
 class PacketGyroBlocks(Strict):
-    """Samples about the axes of the mission's gyro, which are recorded as gyro blocks."""
+    """Parameters of gyro samples, about the axes of the mission's gyro, recorded as gyro blocks."""
 
     samples: int = Field(default=1, ge=1, le=MOST_SLOTS)
-    """In one packet, numbered from `first_sample`."""
+    """Number of gyro samples in one packet, numbered from `first_sample`."""
     first_sample: int = Field(default=1, ge=0, le=1000)
     values: tuple[SlotNames, SlotNames, SlotNames]
-    """About each axis a parameter for each sample: arrays, patterns or lists."""
+    """For each axis, the parameters of the samples: arrays, patterns or lists."""
     kind: Literal["rate", "angle"] = "rate"
-    """`angle`: a counter that accumulates; a rate is its change from the sample before."""
+    """Meaning of gyro values: with `angle` an accumulating counter, whose change gives the rate."""
     scale_rad: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    """Radians per second, or of `angle` radians, of one unit about each axis."""
+    """Radians per second per unit about each axis; radians for `angle`."""
     counter_bits: int = Field(default=16, ge=2, le=64)
-    """An accumulated angle starts again after 2^counter_bits counts."""
+    """Number of bits after which an accumulated angle overflows to zero."""
     max_gap_s: float = Field(default=10.0, gt=0, le=3600)
-    """Angles farther apart give no rate."""
+    """Largest interval in seconds between accumulated angles that give a rate."""
     time: PacketTime | None = None
-    """Time of the first sample; by default the time of the packet."""
+    """The time of the first sample; by default the time of the packet."""
     step_s: float | None = Field(default=None, gt=0, le=3600)
-    """From each sample of a packet to the next."""
+    """Interval in seconds between the samples of a packet."""
     time_offset_s: SlotNames | None = None
     """Alternative to `step`: the offset of each sample from the time, in seconds."""
     count: ParameterName | None = None
-    """Parameter with the number of samples, from the first, that are in the packet."""
+    """The parameter with the number of samples, counted from the first, in the packet."""
     block_s: float = Field(default=600.0, ge=1, le=86400)
-    """A block ends where so many seconds of TAI begin, so that the same samples make the same
-    blocks, whichever file they are read from."""
+    """Length of gyro blocks in seconds of TAI, at fixed boundaries, so that the same samples give
+    the same blocks from any file.
+    """
 
     @model_validator(mode="after")
     def _samples_have_times(self) -> Self:
@@ -268,29 +271,29 @@ class PacketGyroBlocks(Strict):
 
 
 class PacketVelocity(Strict):
-    """The geocentric velocity of the spacecraft, EME2000."""
+    """The parameters of the spacecraft's geocentric velocity, EME2000."""
 
     components: Triple
     unit: Literal["km_per_s", "m_per_s"] = "km_per_s"
 
 
 class PacketPosition(Strict):
-    """The geocentric position of the spacecraft, EME2000."""
+    """The parameters of the spacecraft's geocentric position, EME2000."""
 
     components: Triple
     unit: Literal["km", "m"] = "km"
 
 
 class Packets(Strict):
-    """How the parameters of an XTCE file fill the fields of a batch.
+    """The mapping of a mission's XTCE parameters to the fields of a batch.
 
-    A packet that holds the parameters of `time` and those of a tracker gives a batch.
+    Each packet with the parameters of `time` and of a tracker gives a batch.
     """
 
     root_container: ParameterName = "CCSDSPacket"
-    """The container of the XTCE file that every packet is read as."""
+    """The root container in the XTCE file, as which every packet is decoded."""
     prefix_bytes: int = Field(default=0, ge=0, le=4096)
-    """Bytes before each packet in a file, which are skipped."""
+    """Number of bytes before each packet in a file, which are skipped."""
     sequence_flags: Literal["segments", "groups"] = Field(
         default="segments", exclude_if=lambda meaning: meaning == "segments"
     )
@@ -298,27 +301,27 @@ class Packets(Strict):
     segment_header_bytes: int = Field(
         default=0, ge=0, le=4096, exclude_if=lambda length: length == 0
     )
-    """Length of the secondary header that segments after the first repeat, and that is skipped."""
+    """Length of the repeated secondary header in later segments, which is skipped."""
     apids: tuple[Annotated[int, Field(ge=0, le=2047)], ...] = ()
-    """Only packets of these APIDs are read, others are counted; empty: all that XTCE describes."""
+    """The APIDs that are read, others are only counted; empty for all in the XTCE file."""
     time: PacketTime
     trackers: tuple[PacketTracker, ...] = Field(default=(), max_length=16)
-    """Without trackers the packets give what the other tables name alone."""
+    """The trackers' parameters; without them packets give only the data of the other tables."""
     measurements: tuple[PacketMeasurement, ...] = Field(
         default=(), max_length=16, exclude_if=lambda measurements: not measurements
     )
-    """Missing, they are no part of the mission's digest."""
+    """The parameters of measured attitudes; if missing, no part of the mission's digest."""
     join_within_s: float = Field(default=0.0, ge=0, le=60)
-    """Packets of different trackers make one batch if their times differ by at most this."""
+    """Largest time difference in seconds of packets from several trackers in one batch."""
     batch: ParameterName | None = None
-    """Text or number that names a batch; by default APID, time and sequence count do."""
+    """The parameter that names a batch; by default APID, time and sequence count do."""
     prior: PacketPrior | None = None
     rates: PacketRates | None = None
     gyro: PacketGyro | None = None
     gyro_blocks: PacketGyroBlocks | None = Field(
         default=None, exclude_if=lambda blocks: blocks is None
     )
-    """Missing, it is no part of the mission's digest."""
+    """The parameters of gyro blocks; if missing, no part of the mission's digest."""
     velocity: PacketVelocity | None = None
     position: PacketPosition | None = None
     aberration: Literal["to_correct", "applied_upstream", "ignore"] = "to_correct"

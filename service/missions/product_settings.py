@@ -1,4 +1,4 @@
-"""What files of attitudes say of a spacecraft: its identifiers, its clock, its largest gap."""
+"""Settings of attitude files for a spacecraft: its identifiers, its clock, its largest gap."""
 
 import re
 from pathlib import Path
@@ -12,25 +12,25 @@ DEFAULT_LARGEST_GAP_S = 60.0
 MAX_LARGEST_GAP_S = 86_400.0
 DEFAULT_NAIF_ID = -999
 MIN_NAIF_ID = -2_000_000
-"""The ids of a spacecraft's instruments have three digits more, and 32 bits."""
+"""Least NAIF id of a spacecraft: instrument ids add three digits and must fit into 32 bits."""
 OBJECT_ID = r"[A-Za-z0-9][A-Za-z0-9 ._+/-]{0,63}"
 MAX_KERNEL_BYTES = 16 << 20
 
 
 class ProductSettings(Strict):
-    """The table `[products]` of a mission file; every key has a default."""
+    """A mission file's table `[products]` with settings of attitude files; all have defaults."""
 
     largest_gap_s: float = Field(default=DEFAULT_LARGEST_GAP_S, gt=0, le=MAX_LARGEST_GAP_S)
-    """Attitudes that are farther apart belong to two stretches.
+    """Largest interval in seconds between attitudes of one segment of a file.
 
-    Without the key, that of raw attitudes follows their cadence: see the feature `products`.
+    By default, the value for raw attitudes follows their cadence: see the feature `products`.
     """
     object_id: str | None = Field(default=None, pattern=f"^{OBJECT_ID}$")
-    """OBJECT_ID of CCSDS messages; None: the name of the mission."""
+    """The OBJECT_ID of CCSDS messages; None for the name of the mission."""
     naif_id: int = Field(default=DEFAULT_NAIF_ID, ge=MIN_NAIF_ID, lt=0)
-    """NAIF's id of the spacecraft; the default belongs to no spacecraft."""
+    """The NAIF id of the spacecraft; the default belongs to no spacecraft."""
     sclk_kernel: Annotated[Path, PlainSerializer(lambda path: path.name)] | None = None
-    """The file of the spacecraft's clock (SPICE SCLK), relative to the mission's file."""
+    """The SPICE SCLK file of the spacecraft's clock, relative to the mission's file."""
 
     @property
     def names_gap(self) -> bool:
@@ -58,12 +58,12 @@ class ProductSettings(Strict):
 
 
 def beside(file: str) -> dict[str, Path]:
-    """The context of a validation in which paths are relative to the folder of a file."""
+    """A validation context in which paths are relative to the folder of a file."""
     return {"folder": Path(file).parent}
 
 
 def _text_of_kernel(path: Path) -> str:
-    """The text of a clock kernel; raises `ValueError` naming the file."""
+    """The text of a SPICE clock kernel; raises `ValueError` naming the file."""
     try:
         with path.open("rb") as file:
             data = file.read(MAX_KERNEL_BYTES + 1)

@@ -1,4 +1,4 @@
-"""The ground rules of every table of a mission file: nothing unknown, no NaN, no infinity."""
+"""The base class of a mission file's tables: no unknown keys, no NaN, no infinity."""
 
 import math
 from collections.abc import Mapping
@@ -23,7 +23,7 @@ AXIS_NAMES = ("x_axis_body", "y_axis_body", "z_axis_body")
 
 
 def require_right_handed(*axes: Components) -> None:
-    """Raise `ValueError` naming what is wrong with the axes X, Y and Z of an instrument."""
+    """Raise `ValueError` unless an instrument's axes X, Y, Z are right-handed and orthonormal."""
     matrix = np.column_stack(axes)
     products = matrix.T @ matrix
     if np.allclose(products, np.eye(3), atol=1e-4) and np.linalg.det(matrix) > 0:
@@ -48,21 +48,22 @@ def require_right_handed(*axes: Components) -> None:
 
 
 class Strict(BaseModel):
-    """A table whose unknown keys are refused; its values do not change."""
+    """An immutable table of settings that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, strict=False)
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """A copy with other values, and with nothing that was worked out from the old ones."""
+        """A copy with some values replaced, without values cached from the old ones."""
         copied = super().model_copy(update=update, deep=deep)
         for name in vars(copied).keys() - type(self).model_fields.keys():
             del vars(copied)[name]
         return copied
 
     def __getstate__(self) -> dict[Any, Any]:
-        """What another process gets: the values, and nothing that was worked out from them.
+        """The pickled state: the table's values, without values cached from them.
 
-        An array would arrive there as one that can be written, for which kernels are compiled anew.
+        A cached array would become writable in another process, and kernels would compile anew for
+        it.
         """
         state = super().__getstate__()
         fields = type(self).model_fields
@@ -71,5 +72,5 @@ class Strict(BaseModel):
 
 
 def is_missing(table: object) -> bool:
-    """True if a table was left out of the file: it is then no part of the mission's digest."""
+    """True if a table was left out of the file; it is then no part of the mission's digest."""
     return table is None

@@ -1,1 +1,3 @@
-"""Observations: the batch, its text forms, and its calibration to body vectors at one epoch."""
+"""Observations: batches of observed stars, their file formats, and their conversion to body
+vectors.
+"""

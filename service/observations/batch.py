@@ -1,4 +1,4 @@
-"""A batch of observed stars as the core sees it: arrays, units in the names."""
+"""The data structures of a batch of observed stars: arrays, with units in the names."""
 
 from typing import Literal
 
@@ -15,15 +15,15 @@ Aberration = Literal["to_correct", "applied_upstream", "ignore"]
 
 
 class QuaternionPrior(Struct, frozen=True, eq=False):
-    """An a priori attitude: inertial to body, scalar last, of norm one."""
+    """An a priori attitude as a quaternion of norm one: inertial to body, scalar last."""
 
     quaternion: Vector
 
 
 class PredictedPrior(QuaternionPrior, frozen=True, eq=False):
-    """An attitude that was predicted, with its covariance (3, 3) about the body axes.
+    """A predicted attitude, with its covariance (3, 3) about the body axes.
 
-    `margin_deg` is how far its zones reach beyond the fields of view.
+    `margin_deg` is the distance by which its search zones extend beyond the fields of view.
     """
 
     covariance_arcsec2: Matrix
@@ -31,10 +31,10 @@ class PredictedPrior(QuaternionPrior, frozen=True, eq=False):
 
 
 class Tracking(Struct, frozen=True, eq=False):
-    """Source of the prediction for a batch that asks for the last attitude, or why there is none.
+    """Source of a prediction for a batch that asks for the last attitude, or the reason for none.
 
-    Without `result` and `reason` nothing was looked up yet.  The prediction itself is
-    the batch's `a_priori`.
+    If both `result` and `reason` are None, the prediction is still to be made. The predicted
+    attitude itself is the batch's `a_priori`.
     """
 
     by_default: bool
@@ -46,19 +46,18 @@ class Tracking(Struct, frozen=True, eq=False):
 
 
 class BoresightPrior(Struct, frozen=True):
-    """An a priori direction of the spacecraft's boresight, roll unknown (cap missions)."""
+    """An a priori direction of the spacecraft's boresight, with unknown roll (cap missions)."""
 
     ra_deg: float
     dec_deg: float
 
 
 class SunPointedPrior(Struct, frozen=True):
-    """The pole is on the Sun, roll unknown (band missions).
+    """An a priori attitude with the mission's pole on the Sun and unknown roll (band missions).
 
-    `sun_vector` is inertial, spacecraft to Sun; without it the Sun is taken
-    from an ephemeris, seen from `position_km` (geocentric, EME2000) if given.
-    `sun_counts` (4,) of the mission's sun tracker tell where in the body the Sun is; without
-    them it is taken to be along the zone's axis.
+    `sun_vector` is inertial, spacecraft to Sun; without it an ephemeris gives the Sun, seen from
+    `position_km` (geocentric, EME2000) if given. `sun_counts` (4,) of the mission's Sun tracker
+    give the Sun's direction in body axes; without them the zone's axis is assumed.
     """
 
     sun_vector: Vector | None
@@ -70,7 +69,7 @@ APriori = QuaternionPrior | BoresightPrior | SunPointedPrior
 
 
 class Options(Struct, frozen=True):
-    """What a batch or a what-if asks to be done otherwise than its mission says."""
+    """Options of a batch or what-if run that override the mission's settings."""
 
     identifier: Identifier | None = None
     solver: SolverName | None = None
@@ -80,9 +79,10 @@ class Options(Struct, frozen=True):
 
 
 class Readings(Struct, frozen=True, eq=False):
-    """What a scanning tracker gave along h and along v, in the words of its mission.
+    """The raw readings of a scanning tracker along h and along v, in the mission's units.
 
-    Of a star `counts` of two lines or `times` of crossings; of a whole raster its `lines`.
+    For a star, the `counts` of two lines or the `times` of crossings; for a whole raster its
+    `lines`.
     """
 
     kind: Literal["counts", "times", "lines"]
@@ -91,11 +91,10 @@ class Readings(Struct, frozen=True, eq=False):
 
 
 class TrackerStars(Struct, frozen=True, eq=False):
-    """The stars of one tracker, in the order observed.
+    """The stars observed by one tracker, in their order.
 
-    Angles as measured: `vector` rows are unit vectors in tracker axes, NaN
-    where the star came as `angles_deg` (h, v), which are NaN otherwise.
-    Magnitude is NaN where none was given; sigma is NaN where the mission's holds.
+    `vector` rows are unit vectors in tracker axes, NaN for stars with measured `angles_deg` (h, v),
+    which are NaN otherwise. Magnitude is NaN if missing; sigma is NaN if the mission's applies.
     """
 
     tracker: str
@@ -105,22 +104,22 @@ class TrackerStars(Struct, frozen=True, eq=False):
     time_offset_s: Vector
     sigma_arcsec: Vector
     readings: tuple[Readings | None, ...] = ()
-    """Readings of a scanning tracker by star; or one raster, whose stars are not yet found.
+    """The readings of a scanning tracker per star, or of one raster before its stars are extracted.
 
-    `service.observations.scans.reduce` makes angles of them.
+    `service.observations.scans.reduce` converts them to angles.
     """
 
     @property
     def count(self) -> int:
-        """The number of stars."""
+        """The number of stars that a tracker observed."""
         return len(self.magnitude_mag)
 
 
 class MeasuredAttitude(Struct, frozen=True, eq=False):
-    """An attitude that a tracker measured itself: inertial to its axes, or to the body.
+    """An attitude measured by a tracker itself: from inertial to tracker axes, or to body axes.
 
-    `tracker` names the tracker; None: the axes are those of the body.  `covariance_arcsec2`
-    (3, 3) is of the small rotation about the same axes.
+    `tracker` names the tracker; None for body axes. `covariance_arcsec2` (3, 3) is of the small
+    rotation about the same axes.
     """
 
     quaternion: Vector
@@ -129,13 +128,13 @@ class MeasuredAttitude(Struct, frozen=True, eq=False):
 
 
 class ObservationBatch(Struct, frozen=True, eq=False):
-    """One batch: who, when, the a priori attitude, and the stars of each tracker.
+    """One batch of observations: spacecraft, time, a priori attitude, and the stars of each
+    tracker.
 
-    With a `measurement` there are neither stars nor a priori knowledge.
-    Without `a_priori` a batch of stars is lost in space.  `tracking` is there where it
-    asks for the last attitude.
-    Body rates are of the body relative to inertial, in body axes.  Velocity and
-    position are geocentric, EME2000, None where they were not given.
+    With a `measurement` there are neither stars nor a priori knowledge. Without `a_priori` a batch
+    of stars is lost in space. `tracking` is set for a batch that asks for the last attitude. Body
+    rates are of the body relative to inertial, in body axes. Velocity and position are geocentric,
+    EME2000, None if missing.
     """
 
     spacecraft: str
@@ -152,4 +151,4 @@ class ObservationBatch(Struct, frozen=True, eq=False):
     tracking: Tracking | None = None
     measurement: MeasuredAttitude | None = None
     remarks: tuple[str, ...] = ()
-    """What was taken otherwise than it was sent: a code, a colon, and a sentence each."""
+    """Notes on values interpreted otherwise than sent: a code, a colon and a sentence each."""

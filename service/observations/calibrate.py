@@ -1,8 +1,7 @@
-"""From tracker counts to body vectors at the batch's epoch.
+"""The conversion of tracker measurements to unit vectors in body axes at the batch's epoch.
 
-Focal-plane calibration, alignment of tracker to body, then each star carried
-from its own time to the batch's with the body rates.  Aberration is not
-touched here: observed vectors are never changed for it.
+Focal-plane calibration, alignment of tracker to body, then rotation of each star from its own time
+to the batch's with the body rates. Observed vectors are never corrected for aberration.
 """
 
 import math
@@ -22,11 +21,10 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, read_only
 
 
 class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
-    """The stars of one tracker as unit vectors (n, 3) in body axes at the batch's epoch.
+    """The calibrated stars of one tracker: unit vectors (n, 3) in body axes at the batch's epoch.
 
-    Magnitude is NaN where none was given; sigma, in either unit, is one standard
-    deviation per tangent axis; `outside_field_of_view` marks stars that the tracker should
-    not be able to see.
+    Magnitude is NaN if missing; sigma, in either unit, is one standard deviation per tangent axis;
+    `outside_field_of_view` marks stars beyond the tracker's field of view.
     """
 
     tracker: Tracker
@@ -38,10 +36,10 @@ class CorrectedObservations(Struct, frozen=True, eq=False, gc=False):
 
 
 class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
-    """The stars of n batches of t trackers as `CorrectedObservations` has those of one tracker.
+    """The calibrated stars of n batches and t trackers as columns; see `CorrectedObservations`.
 
-    Offsets are those of `BatchColumns`; `trackers` (t,) is None where the stars are not filled in.
-    The other columns, by star, are the fields of `CorrectedObservations`.
+    Offsets are those of `BatchColumns`; `trackers` (t,) is None for trackers whose stars are not
+    computed. The other columns, by star, are the fields of `CorrectedObservations`.
     """
 
     tracker_offsets: Integers
@@ -55,7 +53,7 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
 
     @classmethod
     def of(cls, corrected: Sequence[CorrectedObservations]) -> "CorrectedColumns":
-        """The columns of one batch."""
+        """The columns for a single batch, from the calibrated stars of its trackers."""
         return cls(
             tracker_offsets=np.array((0, len(corrected))),
             trackers=[each.tracker for each in corrected],
@@ -68,11 +66,11 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
         )
 
     def trackers_of(self, row: int) -> range:
-        """The rows of a batch's trackers."""
+        """The row numbers of a batch's trackers."""
         return range(*self.tracker_offsets[row : row + 2].tolist())
 
     def of_batch(self, row: int) -> tuple[CorrectedObservations, ...]:
-        """The stars of each tracker of a batch."""
+        """The calibrated stars of a batch, separately for each tracker."""
         return tuple(self._of_tracker(t) for t in self.trackers_of(row))
 
     def _of_tracker(self, t: int) -> CorrectedObservations:
@@ -90,17 +88,17 @@ class CorrectedColumns(Struct, frozen=True, eq=False, gc=False):
 
 
 def correct(batch: ObservationBatch, mission: Mission) -> tuple[CorrectedObservations, ...]:
-    """Every tracker's stars as body vectors at the epoch.
+    """The stars of a batch as unit vectors in body axes at its epoch, one object per tracker.
 
-    Raises `BadInput` naming the field of a tracker that the mission has not, and as
-    `reduced` does.
+    Raises `BadInput` naming the field of a tracker unknown to the mission, and the errors of
+    `reduced`.
     """
     batch = reduced(batch, mission)
     return correct_columns(BatchColumns.of([batch]), trackers_of(batch, mission)).of_batch(0)
 
 
 def trackers_of(batch: ObservationBatch, mission: Mission) -> list[Tracker]:
-    """The trackers of a batch; raises `BadInput` naming a field whose tracker there is not."""
+    """The mission's trackers for a batch; raises `BadInput` naming the field of an unknown one."""
     return [
         mission.tracker(each.tracker, f"observations.{index}.tracker")
         for index, each in enumerate(batch.observations)
@@ -108,9 +106,9 @@ def trackers_of(batch: ObservationBatch, mission: Mission) -> list[Tracker]:
 
 
 def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -> CorrectedColumns:
-    """The stars of many batches as body vectors at the epochs of the batches.
+    """The stars of many batches as unit vectors in body axes at the epochs of their batches.
 
-    `trackers` are those of `batches.tracker`; the stars of a tracker that is None are left out.
+    `trackers` correspond to `batches.tracker`; the stars of a tracker that is None are left out.
     """
     m = len(batches.magnitude_mag)
     found = CorrectedColumns(
@@ -156,17 +154,17 @@ def correct_columns(batches: BatchColumns, trackers: Sequence[Tracker | None]) -
 
 @njit
 def _to_body(tangents, rows, settings, observed, written):  # type: ignore[no-untyped-def]
-    """Carry the stars of a tracker to the body's axes at the epoch.
+    """Rotate the stars of one tracker to body axes at the epoch of their batch.
 
     v(epoch) = exp([w x] dt) v, dt being the star's time minus the batch's.  A star without a
     vector has the direction (tan h, tan v, 1) in tracker axes; `tangents` (m, 2) are tan h, tan v.
     """
-    # `place` is that of the tracker among `places` (t,).
+    # `place` is the index of the tracker among `places` (t,).
     place, places, tracker_offsets, star_offsets = rows
-    # `least_cosine` is of the angle to the boresight within the field of view.
+    # `least_cosine` is the cosine of the field of view's radius.
     body_from_tracker, least_cosine, default_sigma, zero_mag, magnitude_scale = settings
     vector, rates_deg_per_s, time_offset_s, sigma, magnitude = observed
-    # The true magnitude is as it would be if the tracker were as the run catalog assumes.
+    # The true magnitude is on the scale of the run catalog.
     body, true_magnitude, sigma_arcsec, sigma_rad, outside = written
     for i in range(len(tracker_offsets) - 1):
         rates = rates_deg_per_s[i]
@@ -202,7 +200,7 @@ def _to_body(tangents, rows, settings, observed, written):  # type: ignore[no-un
 
 @njit_no_refcount
 def _turn(vector, x, y, z, angle):  # type: ignore[no-untyped-def]
-    """Turn a vector (3,) about an axis of length one, in place."""
+    """Rotate a vector (3,) about a unit axis by an angle in radians, in place."""
     if angle == 0.0:
         return
     u, v, w = vector[0], vector[1], vector[2]
@@ -215,5 +213,5 @@ def _turn(vector, x, y, z, angle):  # type: ignore[no-untyped-def]
 
 
 def measured_magnitudes(true_mag: Vector, settings: Magnitudes) -> Vector:
-    """The magnitudes that a tracker measures of stars of these; `correct` undoes it."""
+    """The magnitudes that a tracker would measure for true magnitudes; the inverse of `correct`."""
     return np.asarray((true_mag - settings.zero_mag) / settings.scale)

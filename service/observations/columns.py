@@ -1,6 +1,6 @@
-"""Many batches as columns: arrays with a row for each batch, tracker or star.
+"""Many batches of observations as columns: arrays with a row for each batch, tracker or star.
 
-The layout is that of Arrow's list arrays: the trackers of batch i are the rows from
+The layout is that of Arrow's list arrays: trackers of batch i are the rows from
 `tracker_offsets[i]` to before `tracker_offsets[i + 1]` of the columns by tracker, the stars of
 tracker t the rows from `star_offsets[t]` to before `star_offsets[t + 1]` of the columns by star.
 """
@@ -19,7 +19,7 @@ Integers = npt.NDArray[np.int64]
 
 
 class BatchColumns(Struct, frozen=True, eq=False, gc=False):
-    """Batches as they were observed: n batches of t trackers with m stars in all.
+    """Uncalibrated batches as columns: n batches of t trackers with m stars in all.
 
     | column | shape | |
     |---|---|---|
@@ -48,7 +48,7 @@ class BatchColumns(Struct, frozen=True, eq=False, gc=False):
 
     @classmethod
     def of(cls, batches: Sequence[ObservationBatch]) -> "BatchColumns":
-        """The columns of some batches."""
+        """The columns made from a sequence of batches."""
         seen = [each for batch in batches for each in batch.observations]
         return cls(
             batches=batches,
@@ -65,12 +65,12 @@ class BatchColumns(Struct, frozen=True, eq=False, gc=False):
 
 
 def offsets_of(counts: Sequence[int]) -> Integers:
-    """First index of each of several concatenated lists, and the end of the last."""
+    """Index of the first element of each of several concatenated lists, and the end of the last."""
     return np.array([0, *accumulate(counts)])
 
 
 def joined(parts: Sequence[Vector], *width: int) -> Vector:
-    """A new array of some arrays one after another; of none, rows of this width."""
+    """The concatenation of arrays as a new array; for no arrays, zero rows of the given width."""
     if len(parts) == 1:
         return parts[0].copy()
     return np.concatenate(parts) if parts else np.empty((0, *width))

@@ -1,8 +1,8 @@
-"""Batches as rows of comma-separated values, one star a row, and back.
+"""Conversion of batches to and from rows of comma-separated values, with one star per row.
 
-The rows of one (spacecraft, run, batch) form a batch; `CsvTable` gives them together.  A row
-whose star cells are all empty stands for a tracker that saw none.  What the rows give is
-the same JSON as that of an NDJSON file, so that the same checks hold for it.
+The rows of one (spacecraft, run, batch) form a batch; `CsvTable` keeps them together. A row without
+star cells stands for a tracker without stars. The rows are converted to the JSON of an NDJSON file,
+so that the same checks apply.
 
 The columns are named after the fields of the JSON object; an empty cell is an absent field.
 """
@@ -46,36 +46,36 @@ VECTORS = {
 DIRECTION = ("x", "y", "z")
 STAR_NUMBERS = ("h_deg", "v_deg", "magnitude", "time_offset_s", "sigma_arcsec")
 READINGS = ("h_counts", "v_counts", "h_times", "v_times")
-"""Columns of a star of a scanning tracker: numbers with spaces between them, as in `LINES`."""
+"""Columns with the readings of a star of a scanning tracker: numbers separated by spaces."""
 LINES = ("column_counts", "row_counts")
-"""Columns of a tracker with a raster, in a row by themselves: it has no stars."""
+"""Columns with the line sums of a raster tracker, in a row without a star."""
 STAR_COLUMNS = ("tracker", *DIRECTION, *STAR_NUMBERS, *READINGS)
 PRIORS = ("sun_pointed", "sun_counts", "a_priori_from")
 BATCH_COLUMNS = (*TEXTS, *sum(VECTORS.values(), ()), *PRIORS, "options")
 COLUMNS = (*BATCH_COLUMNS, *STAR_COLUMNS, *LINES)
 MEASURED = ("measured_quaternion", "measured_sigma_arcsec", "measured_covariance_arcsec2")
-"""Vectors of an attitude that a tracker measured itself: a row that has them has no star."""
+"""Columns of an attitude measured by a tracker itself, in a row without a star."""
 VERBATIM = (*TEXTS, "tracker")
-"""Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
+"""Columns whose cells keep their spaces; other cells are stripped."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?", re.ASCII)
 _D_TO_E = str.maketrans("dD", "ee")
 
 
 class BadCell(Exception):
-    """A cell that cannot be read; knows its column, not its line."""
+    """An error: a CSV cell cannot be read. It knows the column but not the line."""
 
     def __init__(self, column: str, message: str, value: object = None) -> None:
         self.column, self.message = column, message
         self.value = None if value is None else shown_value(value)
 
     def fault(self, line: int) -> Fault:
-        """The fault as it is reported, with the line."""
+        """The error as a fault that names line and column."""
         return Fault(f"line {line}, column {self.column}", self.message, self.value)
 
 
 def checked_header(names: list[str], where: str) -> None:
-    """Raise `BadFile` for a column that is unknown, missing or there twice."""
+    """Raise `BadFile` for CSV columns that are unknown, missing or repeated."""
     faults = [
         Fault(f"{where}, column {name or '(empty)'}", f"there is no such column; {_near(name)}")
         for name in names
@@ -86,7 +86,7 @@ def checked_header(names: list[str], where: str) -> None:
         for name in sorted({name for name in names if names.count(name) > 1})
     ]
     wanted = list(REQUIRED)
-    # A group of columns is there as a whole or not at all; a star needs a direction.
+    # The columns of a group must all be present or absent; a star needs a direction.
     groups = *VECTORS.values(), DIRECTION, ("h_deg", "v_deg"), READINGS[:2], READINGS[2:], LINES
     for group in groups:
         wanted += group if any(name in names for name in group) else ()
@@ -110,7 +110,7 @@ def _near(name: str) -> str:
 
 
 def number_cell(row: CsvRow, column: str) -> float:
-    """The finite number in a cell; raises `BadCell`."""
+    """The finite number in a CSV cell; raises `BadCell`."""
     cell = row[column]
     if not cell:
         raise BadCell(column, "is empty, while the columns that belong to it are not")
@@ -120,7 +120,7 @@ def number_cell(row: CsvRow, column: str) -> float:
 def _number(column: str, cell: str) -> float:
     if not _NUMBER.fullmatch(cell):
         raise BadCell(column, "must be a number", cell)
-    # Fortran writes the exponents of double precision with D.
+    # Fortran writes double precision exponents with D.
     number = float(cell.translate(_D_TO_E))
     if not math.isfinite(number):
         raise BadCell(column, "must be a finite number", cell)
@@ -128,14 +128,14 @@ def _number(column: str, cell: str) -> float:
 
 
 def _group(row: CsvRow, columns: tuple[str, ...]) -> list[float] | None:
-    """The numbers of columns that are given together, or None where all are empty."""
+    """The numbers of a group of columns that must be filled together; None if all are empty."""
     if not any(row.get(column) for column in columns):
         return None
     return [number_cell(row, column) for column in columns]
 
 
 def batch_fields(row: CsvRow) -> dict[str, Any]:
-    """The fields of the batch itself, without its stars; raises `BadCell`."""
+    """The fields of a batch other than its stars, from a CSV row; raises `BadCell`."""
     fields: dict[str, Any] = {name: row[name] for name in TEXTS if row.get(name)}
     frame = fields.pop("frame", None)
     values = {name: _group(row, columns) for name, columns in VECTORS.items()}
@@ -178,7 +178,7 @@ def batch_fields(row: CsvRow) -> dict[str, Any]:
 def _measurement(
     row: CsvRow, measured: dict[str, list[float] | None], frame: str | None
 ) -> dict[str, Any]:
-    """A tracker's own attitude; the cell `tracker` may be empty: then it is that of the body."""
+    """The fields of a measured attitude; an empty cell `tracker` means the attitude of the body."""
     fields: dict[str, Any] = {
         name.removeprefix("measured_"): value
         for name, value in measured.items()
@@ -195,7 +195,7 @@ def _measurement(
 
 
 def star_of(row: CsvRow) -> dict[str, Any]:
-    """The star of a row; raises `BadCell`."""
+    """The star in a CSV row; raises `BadCell`."""
     star: dict[str, Any] = {name: number_cell(row, name) for name in STAR_NUMBERS if row.get(name)}
     star |= _numbers(row, READINGS)
     vector = _group(row, DIRECTION)
@@ -203,12 +203,12 @@ def star_of(row: CsvRow) -> dict[str, Any]:
 
 
 def lines_of(row: CsvRow) -> dict[str, list[float]]:
-    """The sums of the lines of a raster in a row, if it has any; raises `BadCell`."""
+    """The line sums of a raster in a CSV row, if it has any; raises `BadCell`."""
     return _numbers(row, LINES)
 
 
 def _numbers(row: CsvRow, columns: tuple[str, ...]) -> dict[str, list[float]]:
-    """The columns that are not empty, each with numbers between spaces."""
+    """The non-empty columns of a row, each a list of numbers separated by spaces."""
     return {
         column: [_number(column, cell) for cell in row[column].split()]
         for column in columns
@@ -217,20 +217,20 @@ def _numbers(row: CsvRow, columns: tuple[str, ...]) -> dict[str, list[float]]:
 
 
 def number_cells(cells: Iterable[tuple[str, float]]) -> CsvRow:
-    """Numbers as cells, by column."""
-    # repr gives the shortest text that reads back as the same number.
+    """CSV cells for numbers, by column."""
+    # repr gives the shortest text that is read back as the same number.
     return {column: repr(value) for column, value in cells}
 
 
 def list_cells(model: schema.StarIn | schema.TrackerIn | schema.SunPointedIn) -> CsvRow:
-    """The cells of readings: of a star, of a tracker's raster, of the sun tracker."""
+    """CSV cells for the readings of a star, of a tracker's raster, or of a Sun tracker."""
     names = *READINGS, *LINES, "sun_counts"
     lists = ((name, getattr(model, name, None)) for name in names)
     return {name: " ".join(map(repr, values)) for name, values in lists if values is not None}
 
 
 def batch_cells(batch: schema.BatchIn) -> CsvRow:
-    """The cells of a checked batch that are the same in each of its rows."""
+    """The CSV cells of a checked batch that all of its rows share."""
     prior = batch.a_priori
     cells: CsvRow = {"spacecraft": batch.spacecraft, "batch": batch.batch, "run": batch.run}
     cells |= {"time": batch.time, "aberration": batch.aberration}
@@ -279,14 +279,16 @@ BATCH_ROWS = RowKind(
 
 
 class JoinedRows(ABC):
-    """The rows of one batch or gyro block as they come in; a bad cell refuses all of them."""
+    """A collector for the CSV rows of one batch or gyro block; one bad cell refuses all of the
+    rows.
+    """
 
     key_columns: ClassVar[tuple[str, ...]]
-    """The columns that these rows have in common."""
+    """The columns that identify a batch or block."""
     may_lack: ClassVar[str]
-    """The rows that may be missing where a row beside these cannot be read."""
+    """A message: what may be missing from a batch or block next to an unreadable row."""
     refuses_faulty_rows: ClassVar[bool]
-    """True if a faulty row refuses the rows of its key alone; False: those beside it, too."""
+    """True if a faulty row refuses only rows of its own key; false if neighbouring rows, too."""
 
     def __init__(self, number: int, key: tuple[str, ...]) -> None:
         self.number, self.key = number, key
@@ -294,7 +296,7 @@ class JoinedRows(ABC):
         self.fault_at = number
 
     def add(self, number: int, row: CsvRow) -> None:
-        """Take a row with its number in the file."""
+        """Add a row with its line number in the file."""
         if self.fault is None:
             try:
                 self.take(row)
@@ -303,34 +305,34 @@ class JoinedRows(ABC):
 
     @abstractmethod
     def take(self, row: CsvRow) -> None:
-        """Take the cells of a row; raises `BadCell`."""
+        """Read the cells of a row; raises `BadCell`."""
 
     @abstractmethod
     def body(self) -> Mapping[str, Any]:
-        """The JSON object of all rows."""
+        """The JSON object made from all collected rows."""
 
     def refuse(self, number: int, fault: Fault) -> None:
-        """Refuse all rows for a fault, unless they are refused already."""
+        """Refuse all rows for a fault, unless an earlier fault refused them already."""
         if self.fault is None:
             self.fault, self.fault_at = fault, number
 
     def refuse_beside(self, number: int, damaged: int) -> None:
-        """Refuse all rows for a damaged one beside them, which may have been one of them."""
+        """Refuse all rows because a neighbouring unreadable row may have belonged to them."""
         message = f"{self.may_lack}: the row beside it, line {damaged}, cannot be read"
         self.refuse(number, Fault(f"line {self.number}", message))
 
     def line(self) -> Line:
-        """The rows as a line of JSON, or their fault."""
+        """The collected rows as one line of JSON, or their fault."""
         if self.fault is not None:
             return Line(self.fault_at, None, self.fault)
         return Line(self.number, json.dumps(self.body(), separators=(",", ":")).encode())
 
 
 def joined_lines(rows: Iterator[Row], kind: type[JoinedRows]) -> Iterator[Line]:
-    """The batches or gyro blocks of the rows of a CSV file.
+    """Lines of JSON with the batches or gyro blocks in the rows of a CSV file.
 
-    One with a bad cell is refused whole, by the line and column of the first such cell.  A row
-    too damaged to tell whose it is refuses those on both sides of it: one of them lacks a row.
+    A bad cell refuses its whole batch or block, with the line and column of the first bad cell. A
+    row too damaged to be assigned refuses the batches on both sides, since one of them lacks a row.
     """
     joined: JoinedRows | None = None
     stray: int | None = None
@@ -358,7 +360,7 @@ def joined_lines(rows: Iterator[Row], kind: type[JoinedRows]) -> Iterator[Line]:
 
 
 class BatchRows(JoinedRows):
-    """The rows of one batch: its own fields once, then a star a row."""
+    """A collector for the CSV rows of one batch: its own fields, then one star per row."""
 
     key_columns = KEY
     may_lack = "the batch may lack a star"
@@ -373,7 +375,7 @@ class BatchRows(JoinedRows):
         self.rows = 0
 
     def take(self, row: CsvRow) -> None:
-        """Take the cells of a row; raises `BadCell`."""
+        """Read the cells of a row; raises `BadCell`."""
         self.rows += 1
         if self.rows > MAX_ROWS:
             raise BadCell("batch", f"has more than {MAX_ROWS} rows", self.key[-1])
@@ -401,7 +403,7 @@ class BatchRows(JoinedRows):
             self.rasters[row["tracker"]] = lines
 
     def body(self) -> Mapping[str, Any]:
-        """The JSON object of the batch."""
+        """The JSON object of the batch made from all collected rows."""
         observations = [
             {"tracker": name, "stars": stars, **self.rasters.get(name, {})}
             for name, stars in self.trackers.items()
@@ -410,7 +412,7 @@ class BatchRows(JoinedRows):
 
 
 def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
-    """Write checked batches as rows; `stream` is opened with `newline=""`.
+    """Write checked batches as CSV rows; `stream` must be opened with `newline=""`.
 
     A Sun vector or position inside an a priori attitude is written as the
     batch's own, which means the same.
@@ -440,5 +442,5 @@ def write_batches_csv(batches: Iterable[BatchIn], stream: TextIO) -> None:
 
 
 def _neutralised(cells: CsvRow) -> CsvRow:
-    """Cells whose texts no spreadsheet takes for formulas."""
+    """CSV cells with text escaped so that no spreadsheet takes a cell for a formula."""
     return {name: neutralised(cell) if name in VERBATIM else cell for name, cell in cells.items()}

@@ -1,9 +1,9 @@
-"""A CSV file as a table: its separator, header and decimal mark, and its rows batch by batch.
+"""A reader of CSV files: separator, header and decimal mark, and rows grouped by batch.
 
 Spreadsheets write commas, semicolons or tabs between cells, perhaps a line `sep=;` before the
-header, and in some languages decimal commas.  A file is read once before any row is handed on:
-that shows whether rows of one batch lie apart, as in a file sorted by magnitude or by tracker.
-Such rows are then handed on together, the batches in order of time.
+header, and in some languages decimal commas. A first pass over the file finds out whether the rows
+of one batch are scattered, as in a file sorted by magnitude or by tracker. Scattered rows are then
+grouped, with the batches in order of time.
 """
 
 import csv
@@ -21,14 +21,14 @@ from service.errors import BadFile, BadInput, Fault, shown_value
 from service.observations.decompress import MAX_LINE_BYTES, Line, physical_lines
 from service.times import parse_utc
 
-# The sums of the lines of a raster are one cell, and larger than the module's own limit.
+# The line sums of a raster fill one cell, which exceeds the csv module's default limit.
 csv.field_size_limit(MAX_LINE_BYTES)
 
 SEPARATORS = (",", ";", "\t", "|")
 MOST_GROUPS = 8_000_000
-"""Groups of consecutive rows of one batch in a file; 16 bytes of each are held."""
+"""Largest number of groups of consecutive rows of one batch in a file; each takes 16 bytes."""
 MOST_ROWS_APART = 4_000_000
-"""Rows of a file in which rows of one batch lie apart; 32 bytes of each are held."""
+"""Largest number of rows in a file with scattered batches; each takes 32 bytes."""
 
 _SEPARATOR_LINE = re.compile(r'"?sep=(.)"?[,;\t|]*', re.IGNORECASE)
 
@@ -37,25 +37,25 @@ CsvRow = dict[str, str]
 
 @dataclass(frozen=True)
 class RowKind:
-    """The columns of a kind of rows, and which of them tell the rows of one batch or block."""
+    """The columns of a kind of CSV file, and the key columns that identify a batch or block."""
 
     noun: str
     key: tuple[str, str, str]
-    """Spacecraft, run and name; only the run may be empty."""
+    """The key columns: spacecraft, run and name; only the run may be empty."""
     columns: Sequence[str]
     texts: frozenset[str]
-    """Columns that do not hold numbers."""
+    """Columns that hold text instead of numbers."""
     verbatim: frozenset[str]
-    """Columns whose cells are taken with their spaces; around other cells spaces do no harm."""
+    """Columns whose cells keep their spaces; other cells are stripped."""
     check_header: Callable[[list[str], str], None]
-    """Raises `BadFile` for names of columns, and the place where they are."""
+    """A function that raises `BadFile` for wrong column names, given their location in the file."""
     ordered_by_time: bool
-    """True if rows of one batch that lie apart are put in order of time."""
+    """True if scattered rows of one batch are sorted by time."""
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row by column; `cells` is None where it cannot be told whose row it is."""
+    """A CSV row as cells by column; `cells` is None if the row cannot be assigned to a batch."""
 
     number: int
     cells: CsvRow | None
@@ -64,20 +64,20 @@ class Row:
 
 @dataclass(frozen=True)
 class _Place:
-    """The place of a row in the file: the end of the row before it, and the number of its line."""
+    """Location of a CSV row: the byte offset where the row before it ends, and its line number."""
 
     offset: int
     number: int
 
 
 class CsvTable:
-    """The rows of a CSV file; `kind` is that of its header."""
+    """A CSV file as rows by column; `kind` is the kind of file recognised by its header."""
 
     def __init__(self, stream: BinaryIO, kinds: Sequence[RowKind]) -> None:
-        """Reads the whole file once, which must be seekable.
+        """Scan a whole seekable file once.
 
-        Raises `BadFile` for the header, for decimal commas beside decimal points, and for rows
-        of one batch that lie apart and cannot be brought together.
+        Raises `BadFile` for the header, for decimal commas beside decimal points, and for scattered
+        rows that cannot be grouped by batch.
         """
         self._stream = stream
         self._decimal_comma = False
@@ -105,13 +105,13 @@ class CsvTable:
         self._places = None if apart is None else self._together(apart)
 
     def rows(self) -> Iterator[Row]:
-        """The rows in their order, those of one batch together; can be called once."""
+        """The rows of the file in order, grouped by batch; can be called once."""
         for line in self._lines() if self._places is None else self._lines_at(self._places):
             if (row := self._row(line)) is not None:
                 yield row
 
     def _header(self, kinds: Sequence[RowKind]) -> list[str]:
-        """The names of the columns, after comments that begin with `#`; finds the separator."""
+        """The column names, after comment lines with `#`; also determines the separator."""
         lines = (
             line for line in physical_lines(self._stream) if not (line.body or b"").startswith(b"#")
         )
@@ -150,7 +150,7 @@ class CsvTable:
             yield replace(line, number=place.number)
 
     def _cells(self, line: Line) -> list[str] | Fault:
-        """The cells of a line, none of a row that is empty or the header again."""
+        """The cells of a line; an empty list for an empty row or a repeated header."""
         if line.body is None:
             return line.fault or Fault(f"line {line.number}", "cannot be read")
         found = _split(line.body, self._separator)
@@ -167,14 +167,14 @@ class CsvTable:
         return found
 
     def _key(self, found: Sequence[str]) -> tuple[str, ...] | None:
-        """The texts that tell the batch of a row; None where it cannot be told."""
+        """The key texts of a row's batch; None if they cannot be read."""
         spacecraft, run, name = (
             "" if k is None else found[k] if k < len(found) else None for k in self._key_columns
         )
         return (spacecraft, run, name) if spacecraft and run is not None and name else None
 
     def _row(self, line: Line) -> Row | None:
-        """The row of a line; None for one without a cell, and for the header again."""
+        """The CSV row in a line; None for a line without cells and for a repeated header."""
         found = self._cells(line)
         if isinstance(found, Fault):
             return Row(line.number, None, found)
@@ -190,7 +190,7 @@ class CsvTable:
         cells: CsvRow = {}
         for name, cell in zip(self._names, found, strict=False):
             if name not in self.kind.texts:
-                # An apostrophe marks a text for a spreadsheet, a number among them.
+                # A leading apostrophe marks a cell, even with a number, as text for a spreadsheet.
                 cell = cell.strip().removeprefix("'")
                 cells[name] = cell.replace(",", ".") if self._decimal_comma else cell
             else:
@@ -200,7 +200,7 @@ class CsvTable:
         return Row(line.number, cells, fault)
 
     def _survey(self) -> int | None:
-        """Read all rows; returns the first line whose batch an earlier group of rows began."""
+        """Scan all rows; returns the first line whose batch also occurred earlier in the file."""
         keys, firsts = array("q"), array("Q")
         marks: dict[str, int] = {}
         last = None
@@ -229,7 +229,8 @@ class CsvTable:
                 f"{names[first]}: thousands separators are not read"
             )
             raise BadFile(Fault(f"line {marks[second]}", message))
-        # Between commas a cell with both is refused by itself: its comma separates thousands.
+        # In a file separated by commas a number with both marks is refused cell by cell: its comma
+        # separates thousands.
         self._decimal_comma = list(marks) == [","]
         _, begun = np.unique(np.array(keys), return_index=True)
         again = np.ones(len(keys), bool)
@@ -237,7 +238,7 @@ class CsvTable:
         return int(firsts[int(np.argmax(again))]) if again.any() else None
 
     def _together(self, apart: int) -> Iterator[_Place]:
-        """The places of all rows, those of one batch together and batches in order of time."""
+        """The locations of all rows, grouped by batch, with batches in order of time."""
         keys, times_ns, offsets, numbers = array("q"), array("q"), array("Q"), array("Q")
         noun = self.kind.noun
         time = self._names.index("time")
@@ -272,7 +273,7 @@ class CsvTable:
 def _order(
     keys: npt.NDArray[np.int64], times_ns: npt.NDArray[np.int64], ordered_by_time: bool
 ) -> npt.NDArray[np.int64]:
-    """The order of rows: by the first time of their batch, the batch, and their own place."""
+    """The row order: by the earliest time of a row's batch, then batch, then place in the file."""
     _, first, batch = np.unique(keys, return_index=True, return_inverse=True)
     earliest = np.full(len(first), np.iinfo(np.int64).max)
     np.minimum.at(earliest, batch, times_ns)
@@ -281,7 +282,7 @@ def _order(
 
 
 def _time_ns(text: str) -> int:
-    """The time of a row; 0 for one that cannot be read, which is refused later."""
+    """The time of a row in TAI nanoseconds; 0 for an unreadable time, which is refused later."""
     try:
         return parse_utc(_with_point(text.strip())).tai_ns
     except BadInput:
@@ -289,7 +290,7 @@ def _time_ns(text: str) -> int:
 
 
 def _with_point(time: str) -> str:
-    """A time whose decimal mark, in ISO 8601 a comma or a point, is a point."""
+    """An ISO 8601 time with its decimal comma, if any, replaced by a point."""
     return time.replace(",", ".")
 
 
@@ -298,12 +299,12 @@ def _lower(names: Sequence[str]) -> list[str]:
 
 
 def _kind_of(names: list[str], kinds: Sequence[RowKind]) -> RowKind:
-    """The kind that most of the names belong to, the first of equals."""
+    """The kind of CSV file that shares the most column names with a header."""
     return max(kinds, key=lambda kind: len(set(names) & set(kind.columns)))
 
 
 def _split(body: bytes, separator: str) -> list[str] | None:
-    """The cells of a line; None where it is not a row of separated values."""
+    """The cells of a line of separated values; None if it cannot be parsed."""
     try:
         return next(csv.reader([body.decode()], delimiter=separator, strict=True))
     except (csv.Error, UnicodeDecodeError, StopIteration, TypeError, ValueError):

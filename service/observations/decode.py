@@ -1,8 +1,7 @@
-"""From the canonical JSON of a batch, which passed every check, to the arrays of the core.
+"""Decoding of a batch's canonical JSON, which passed all checks, to arrays.
 
-The arrays are made from the text that is recorded, so that a later run of the
-record gives the same result.  One process may check and another compute: the text
-is all that passes between them.
+The arrays are made from the recorded text, so that a later run of the record gives the same result.
+One process may check a batch and another compute it: they exchange only the text.
 """
 
 import math
@@ -36,11 +35,11 @@ _NO_VECTOR: Final = (_ABSENT, _ABSENT, _ABSENT)
 
 
 class _SentPart(msgspec.Struct, forbid_unknown_fields=True, gc=False):
-    """An object of the text; what a model of `wire` leaves out has the same default here."""
+    """A JSON object of a canonical batch; absent fields have the same defaults as in `schema`."""
 
 
 class SentStar(_SentPart):
-    """One observed star; NaN for a number that is absent."""
+    """One observed star in a canonical batch; absent numbers are NaN."""
 
     vector: Triple = _NO_VECTOR
     h_deg: float = _ABSENT
@@ -55,7 +54,7 @@ class SentStar(_SentPart):
 
 
 class SentTracker(_SentPart):
-    """The stars that one tracker observed, or the sums of the lines of its raster."""
+    """The stars observed by one tracker, or the line sums of its raster, in a canonical batch."""
 
     tracker: str
     stars: list[SentStar]
@@ -64,14 +63,14 @@ class SentTracker(_SentPart):
 
 
 class SentDirection(_SentPart):
-    """A direction in right ascension and declination."""
+    """A direction as right ascension and declination, in a canonical batch."""
 
     ra_deg: float
     dec_deg: float
 
 
 class SentPrediction(_SentPart):
-    """The prediction that a batch was recorded with."""
+    """The attitude prediction that a batch was recorded with."""
 
     quaternion: tuple[float, float, float, float] | None = None
     covariance_arcsec2: tuple[Triple, Triple, Triple] | None = None
@@ -83,7 +82,7 @@ class SentPrediction(_SentPart):
 
 
 class SentMeasurement(_SentPart):
-    """An attitude that a tracker measured itself."""
+    """An attitude measured by a tracker itself, in a canonical batch."""
 
     quaternion: tuple[float, float, float, float]
     tracker: str | None = None
@@ -93,7 +92,7 @@ class SentMeasurement(_SentPart):
 
 
 class SentPrior(_SentPart):
-    """A priori knowledge of one kind, the others left out."""
+    """A priori knowledge of one kind, in a canonical batch; fields of other kinds are absent."""
 
     quaternion: tuple[float, float, float, float] | None = None
     boresight: SentDirection | None = None
@@ -108,7 +107,7 @@ class SentPrior(_SentPart):
 
 
 class SentOptions(_SentPart):
-    """Options that replace the mission's settings."""
+    """Options of a canonical batch that override the mission's settings."""
 
     identifier: Identifier | None = None
     solver: SolverName | None = None
@@ -118,7 +117,7 @@ class SentOptions(_SentPart):
 
 
 class SentBatch(_SentPart):
-    """A batch of observed stars, or of an attitude that a tracker measured itself."""
+    """A canonical batch of observed stars, or of an attitude measured by a tracker itself."""
 
     spacecraft: str
     batch: str
@@ -141,7 +140,7 @@ _PRIOR = msgspec.json.Decoder(SentPrior)
 
 
 def batch_from_canonical(text: str) -> ObservationBatch:
-    """The batch as the core takes it, from a text that `wire` made."""
+    """An observation batch decoded from its canonical JSON."""
     sent = _BATCH.decode(text)
     chosen, prior = sent.options, sent.a_priori
     return ObservationBatch(
@@ -169,16 +168,16 @@ def batch_from_canonical(text: str) -> ObservationBatch:
 
 
 def prior_from_canonical(text: str) -> APriori | None:
-    """A priori knowledge by itself, from a text that `wire` made."""
+    """A priori knowledge without a batch, decoded from its canonical JSON."""
     return _prior_of(_PRIOR.decode(text), None, None)
 
 
 def _prior_of(
     prior: SentPrior, sun_vector: Triple | None, position_km: Triple | None
 ) -> APriori | None:
-    """The a priori knowledge as the core takes it; the Sun's direction may stand beside it too.
+    """A priori knowledge as the solver takes it; the batch's own Sun vector may complete it.
 
-    None where nothing could be predicted from the last attitude.
+    None where no attitude could be predicted from the last one.
     """
     if prior.from_ is not None:
         prediction = prior.prediction
@@ -209,7 +208,7 @@ def _measured(sent: SentMeasurement) -> MeasuredAttitude:
 
 
 def _quaternion(components: tuple[float, float, float, float]) -> Vector:
-    # By plain numbers: numpy takes as long for four as for a thousand.
+    # Plain numbers are faster: numpy takes as long for four as for a thousand.
     q1, q2, q3, qc = components
     norm = math.sqrt(q1 * q1 + q2 * q2 + q3 * q3 + qc * qc)
     return _array((q1 / norm, q2 / norm, q3 / norm, qc / norm))
@@ -234,10 +233,10 @@ def _tracker_stars(tracker: SentTracker) -> TrackerStars:
     vectors: list[float] = []
     for star in stars:
         x, y, z = star.vector
-        # The norm is near one, or NaN: nothing is divided by zero.
+        # The norm is near one, or NaN: no division by zero.
         norm = math.sqrt(x * x + y * y + z * z)
         vectors += (x / norm, y / norm, z / norm)
-    # All in one block, of which each array is a part: to make one takes longer than to fill it.
+    # The arrays are views of one block: allocating an array takes longer than filling it.
     numbers = [
         *vectors,
         *[star.h_deg for star in stars],
@@ -287,4 +286,4 @@ class _Rates(msgspec.Struct):
 
 
 RECORDED_RATES = msgspec.json.Decoder(_Rates)
-"""Reads the rates of a recorded batch; None where it came without."""
+"""A decoder of the body rates in a recorded batch; None for a batch without rates."""

@@ -1,4 +1,4 @@
-"""Lines of telemetry files and of compressed bodies, read in bounded memory."""
+"""Lines of plain or compressed telemetry, read in bounded memory."""
 
 import codecs
 import gzip
@@ -14,14 +14,14 @@ from service.errors import BadBatch, Fault
 Coding = Literal["identity", "gzip", "zstd"]
 
 MAX_UNPACKED_BYTES = 64 << 30
-"""More than any archive of telemetry holds: a body that unpacks to more is no telemetry."""
+"""Largest size of a decompressed body, more than any archive of telemetry."""
 MAX_WINDOW_BYTES = 128 << 20
 
 
 MAX_RATIO = 200
-"""Telemetry packs to a tenth; the same stars in every batch of a simulation to a hundredth."""
+"""Largest compression ratio: telemetry reaches 10, a simulation with repeated stars 100."""
 FREE_BYTES = 256 << 20
-"""May be unpacked whatever the ratio: so much is read in seconds."""
+"""Size up to which a body may decompress whatever its ratio; read in seconds."""
 
 
 def unpacked_lines(
@@ -30,13 +30,12 @@ def unpacked_lines(
     max_bytes: int,
     require: Callable[[], object] = lambda: None,
 ) -> Iterator[bytes]:
-    """The lines of a file, which is closed after the last one.
+    """The lines of a plain or compressed file, which is closed after the last one.
 
-    Of a line longer than `max_bytes` only its beginning is given, which is no
-    JSON and is reported with its number like any other bad line.  Raises
-    `BadBatch` where the packed data are damaged or unpack to too much; the
-    lines before that have been given.  `require` is called before each read of
-    packed data and each piece of a line, and ends the reading where it raises.
+    A line longer than `max_bytes` is cut there, so that it is no JSON and is reported like any
+    other bad line. Raises `BadBatch` where the compressed data are damaged or too large; the lines
+    before are yielded. `require` is called before each read of compressed data and each piece of a
+    line; an exception from it ends the reading.
     """
     watched = _Watched(file, require)
     with file, _unpacking(watched, coding) as text:
@@ -56,7 +55,7 @@ def unpacked_lines(
 
 
 def _most_bytes(file: IO[bytes], coding: Coding) -> tuple[int, str]:
-    """How much a file may unpack to, and which bound says so."""
+    """The largest decompressed size of a file, and the bound that gives it in words."""
     most, why = MAX_UNPACKED_BYTES, f"{MAX_UNPACKED_BYTES >> 30} GiB"
     if coding != "identity":
         place = file.tell()
@@ -79,10 +78,10 @@ def _require_at_most(passed: int, most: tuple[int, str]) -> None:
 
 
 class _Watched(io.RawIOBase):
-    """A file that asks before each read whether reading is to go on.
+    """A file wrapper that calls a function before each read, which may stop the reading.
 
-    Packed data may hold millions of empty members or frames, of which no line
-    comes: only here they can be stopped.
+    Compressed data may hold millions of empty members or frames without a line; only the reads of
+    compressed data can be stopped there.
     """
 
     def __init__(self, file: IO[bytes], require: Callable[[], object]) -> None:
@@ -109,9 +108,9 @@ def _unpacking(file: _Watched, coding: Coding) -> io.RawIOBase | io.BufferedIOBa
 
 
 class _Zstd(io.RawIOBase):
-    """Frames of zstd as one stream; unlike the library's own reader it tells a file cut short."""
+    """The content of several zstd frames as one stream; a truncated file raises an error."""
 
-    # A block of four bytes may unpack to 128 KiB: so little at a time keeps what is held in bounds.
+    # A block of four bytes may decompress to 128 KiB: small pieces bound the memory.
     _PIECE_BYTES = 512
 
     def __init__(self, file: _Watched) -> None:
@@ -121,7 +120,7 @@ class _Zstd(io.RawIOBase):
         self._unpacker = zstandard.ZstdDecompressor(max_window_size=MAX_WINDOW_BYTES)
         self._frame = self._unpacker.decompressobj()
         self._begun = False
-        # A view: to cut the rest off again and again would copy it each time.
+        # A view, since repeated slicing of bytes would copy the rest each time.
         self._ready = memoryview(b"")
 
     def readable(self) -> bool:
@@ -161,10 +160,10 @@ MAX_LINE_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Line:
-    """A batch as JSON, or the fault that stands in its place.
+    """A line of telemetry: a batch or gyro block as JSON, or the fault found instead.
 
-    `number` counts lines from one; a batch of a CSV file has that of its first
-    row, a fault that of the line where it lies.
+    `number` counts lines from one; a batch from a CSV file has the number of its first row, a fault
+    the number of its own line.
     """
 
     number: int
@@ -173,10 +172,10 @@ class Line:
 
 
 def physical_lines(stream: BinaryIO, number: int = 0) -> Iterator[Line]:
-    """The lines of a stream without their ends, after the first `number` that were read already.
+    """The lines of a stream without line ends, counted from `number` already read.
 
-    Blank lines are counted and left out.  A line beyond `MAX_LINE_BYTES` is passed
-    over without being held.
+    Blank lines are counted and left out. A line longer than `MAX_LINE_BYTES` is skipped without
+    being stored.
     """
     while raw := stream.readline(MAX_LINE_BYTES + 1):
         number += 1

@@ -1,6 +1,6 @@
-"""Faults of what clients send, in the service's words: each names a field, a message, a value.
+"""Validation errors of requests in the service's words: a field, a message and a value each.
 
-The faults that pydantic finds are put into words here, for every shape that is read.
+Errors of pydantic are converted here for all request bodies.
 """
 
 from collections.abc import Callable
@@ -16,20 +16,22 @@ Value = TypeVar("Value")
 MAX_FAULTS_SHOWN = 20
 MAX_NAME_SHOWN = 80
 EXPLAINED = 3
-"""Faults of a body for which the nearest field is looked for, which takes milliseconds."""
+"""Number of errors of a body for which the nearest field name is searched, which takes
+milliseconds.
+"""
 
 PRIOR_KINDS = {each: each for each in ("quaternion", "boresight", "sun_pointed")} | {
     "from_last": "from"
 }
-"""The kinds of a priori knowledge, and the field that tells each."""
+"""The kinds of a priori knowledge, each with the field that identifies it."""
 
 
 def faults_of(
     error: ValidationError, prefix: tuple[str, ...] = (), model: type[BaseModel] | None = None
 ) -> list[Fault]:
-    """Faults that pydantic found, in the service's words: a dotted field, a message, the value.
+    """The errors found by pydantic in the service's words: a dotted field, a message, the value.
 
-    With the model that was validated, an unknown field is answered with the nearest that there is.
+    With the validated model, the message for an unknown field names the nearest known one.
     """
     return [
         Fault(
@@ -42,14 +44,14 @@ def faults_of(
 
 
 def _meant(model: type[BaseModel] | None, fault: Any) -> str:
-    """The field that an unknown one may stand for, or those that there are, as end of a message."""
+    """The end of a message about an unknown field: the nearest known field, or all known ones."""
     if model is None or fault["type"] != "extra_forbidden":
         return ""
-    # A field whose name is a word of Python, such as from, ends with a low line there.
+    # In the model a field named like a Python keyword, such as from, ends with an underscore.
     keys = allowed_keys(model, _fields_of(fault["loc"])[:-1])
     allowed = [key.removesuffix("_") for key in keys]
     if fault["loc"][-1] in allowed:
-        # A field of another kind of a priori knowledge.
+        # The field belongs to another kind of a priori knowledge.
         kind = fault["loc"][-2]
         return f" beside {PRIOR_KINDS.get(kind, kind)}"
     if (near := nearest(str(fault["loc"][-1]), allowed)) is not None:
@@ -60,15 +62,15 @@ def _meant(model: type[BaseModel] | None, fault: Any) -> str:
 def checked_by(
     validate: Callable[[Any], Value], given: object, prefix: tuple[str, ...] = ()
 ) -> Value:
-    """What one of pydantic's validators makes of what was given.
+    """The value returned by one of pydantic's validators for an input.
 
-    Raises `BadBatch` with the faults, outside the handler: pydantic's error holds all that was
-    given, and once it is part of a cycle Python's collector never frees it.
+    Raises `BadBatch` with the faults, outside of the exception handler: pydantic's error holds the
+    whole input, and as part of a reference cycle it would never be freed.
     """
     try:
         return validate(given)
     except ValidationError as error:
-        # Of the validator of a model, a bound method, the model is known.
+        # For a bound method of a model class, the model is known.
         owner = getattr(validate, "__self__", None)
         is_model = isinstance(owner, type) and issubclass(owner, BaseModel)
         faults = faults_of(error, prefix, owner if is_model else None)
@@ -76,7 +78,7 @@ def checked_by(
 
 
 def _fields_of(location: tuple[str | int, ...]) -> list[str | int]:
-    """A location without the tag of the kind of prior, which is pydantic's, not a field."""
+    """An error's location without pydantic's tag for the kind of a priori knowledge."""
     return [
         part
         for index, part in enumerate(location)
@@ -90,10 +92,10 @@ def _fields_of(location: tuple[str | int, ...]) -> list[str | int]:
 
 
 def _field(location: tuple[str | int, ...]) -> str:
-    # A client's own key may be of any length.
+    # A key from the client may have any length.
     return ".".join(str(part)[:MAX_NAME_SHOWN] for part in _fields_of(location)) or "body"
 
 
 def _value(fault: Any) -> str | None:
-    # A missing field or a fault of the whole has nothing to show but its surroundings.
+    # For a missing field or a fault of the whole body there is no value to show.
     return None if fault["type"] == "missing" or not fault["loc"] else shown_value(fault["input"])

@@ -1,7 +1,7 @@
-"""Values that stand for none in what senders write, and stars that are there twice.
+"""Removal of fill values and duplicate stars from batches, reported in remarks.
 
-They are taken as not given, or counted once, and a remark of the batch says so.  Values that may
-be in another unit are refused.
+Fill values, which senders write for missing data, are treated as missing. Values in a wrong unit
+are refused.
 """
 
 import math
@@ -14,16 +14,16 @@ if TYPE_CHECKING:
 
 MOST_REMARKS = 40
 EARTH_RADIUS_KM = 6_350.0
-"""A little less than the polar radius."""
+"""A radius in km a little below the Earth's polar radius."""
 EARTH_GM_KM3_PER_S2 = 398_600.4418
 _VECTORS = ("velocity_km_per_s", "position_km")
 
 
 def without_fill_values(batch: "BatchIn") -> "BatchIn":
-    """The batch without values that stand for none, and its stars once each; with remarks on both.
+    """A batch without fill values and duplicate stars, with remarks on both.
 
-    Raises `BadBatch` for a position inside the Earth, and for one that with its velocity would be
-    an orbit about the Earth if it were in metres.
+    Raises `BadBatch` for a position inside the Earth, and for a position and velocity that would be
+    an Earth orbit if the position were in metres.
     """
     changes: dict[str, Any] = {}
     remarks = []
@@ -82,7 +82,7 @@ def _require_outside_earth(
         in_metres_km = distance_km / 1e3
         circular = math.sqrt(EARTH_GM_KM3_PER_S2 / in_metres_km)
         along = sum(p * v for p, v in zip(position_km, velocity_km_per_s, strict=True))
-        # Far spacecraft hardly ever move at such a speed, and across their direction.
+        # Distant spacecraft rarely have this speed perpendicular to their position.
         is_orbit = 0.8 * circular < speed < 1.25 * circular
         if in_metres_km > EARTH_RADIUS_KM and is_orbit and abs(along) < 0.3 * distance_km * speed:
             message = (

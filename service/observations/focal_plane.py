@@ -1,4 +1,4 @@
-"""Between the angles that a tracker measures and directions in its axes."""
+"""Conversion between the angles that a tracker measures and directions in tracker axes."""
 
 import numpy as np
 
@@ -7,9 +7,9 @@ from service.vectors import Vector, unit
 
 
 def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
-    """Unit vectors (n, 3) in tracker axes of measured angles (n, 2).
+    """Unit vectors (n, 3) in tracker axes for measured angles (n, 2) in degrees.
 
-    The direction is that of (tan h, tan v, 1), h and v being the true angles.
+    The direction is (tan h, tan v, 1), where h and v are the true angles.
     """
     plane = np.ones((len(angles_deg), 3))
     plane[:, :2] = true_tangents(angles_deg, calibration)
@@ -17,7 +17,7 @@ def tracker_vectors(angles_deg: Vector, calibration: Calibration) -> Vector:
 
 
 def true_tangents(angles_deg: Vector, calibration: Calibration) -> Vector:
-    """Tangents (n, 2) of the true angles, of measured angles (n, 2)."""
+    """Tangents (n, 2) of the true angles for measured angles (n, 2) in degrees."""
     h, v = angles_deg.T
     true = angles_deg.copy()
     for axis, terms in enumerate((calibration.h_terms, calibration.v_terms)):
@@ -27,10 +27,10 @@ def true_tangents(angles_deg: Vector, calibration: Calibration) -> Vector:
 
 
 def measured_angles_deg(direction: Vector, calibration: Calibration) -> Vector:
-    """The angles (n, 2) that a tracker of this calibration would measure for directions (n, 3)."""
+    """The angles (n, 2) in degrees that a tracker would measure for directions (n, 3)."""
     true = np.degrees(np.arctan2(direction[:, :2], direction[:, 2:]))
     measured = true / calibration.scale
-    # The terms are small: a fixed point is reached in a few rounds.
+    # The terms are small, so the fixed-point iteration converges in a few rounds.
     for _ in range(20):
         h, v = measured.T
         bent = [

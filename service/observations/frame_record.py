@@ -1,4 +1,4 @@
-"""The record of a frame beside the batch that was made of it."""
+"""The record of a frame, stored beside the batch made from it."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -8,11 +8,11 @@ from typing import Any
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """A frame as the records keep it: what was found on it, and a small picture.
+    """A processed frame as stored: its measured candidates and a small preview picture.
 
-    `stars` has an entry for every candidate that was measured, ready for JSON; those
-    with `used` came first, are in the batch, and stand there in the same order.  The
-    preview is a PNG of 8 bits in which `preview_step` pixels a side make one.
+    `stars` has an entry for every measured candidate, ready for JSON; those with `used` come first
+    and are in the batch in the same order. The preview is an 8-bit PNG whose pixels are
+    `preview_step` frame pixels a side.
     """
 
     digest: str
@@ -26,17 +26,18 @@ class FrameRecord:
     noise_counts: float
     candidates: int
     sharp: Sequence[tuple[float, float]]
-    """The places (u, v) of hot pixels and cosmic rays that were left out."""
+    """The places (u, v) of rejected hot pixels and cosmic rays."""
     stars: Sequence[Mapping[str, Any]]
     timings_us: Mapping[str, int]
     preview: bytes
     preview_step: int
     remarks: Sequence[str] = ()
-    """What was fitted of a camera without calibration, or why nothing was found; which image of
-    a file was taken, and how its pixels were turned."""
+    """Remarks on the fit of an uncalibrated camera, or the failure to find stars; on the chosen
+    image of a file, and on its orientation.
+    """
 
     def summary(self) -> dict[str, Any]:
-        """The part of the answer that is about the frame."""
+        """The part of an answer that describes the frame, ready for JSON."""
         used = sum(bool(star["used"]) for star in self.stars)
         plain = (
             *("tracker", "width_px", "height_px", "exposure_s", "centroid"),
@@ -55,7 +56,7 @@ class FrameRecord:
 
 
 def rounded_counts(value: float, digits: int) -> float:
-    """A number of counts rounded to digits behind the point, or to four of its own if small."""
+    """Counts rounded to a number of decimals, or to four significant digits if small."""
     if not math.isfinite(value) or value == 0.0 or abs(value) >= 100.0 * 10.0**-digits:
         return round(value, digits)
     return round(value, 3 - math.floor(math.log10(abs(value))))

@@ -1,7 +1,7 @@
-"""Gyro blocks as rows of comma-separated values, one sample a row.
+"""Conversion of CSV rows, with one gyro sample each, to gyro blocks.
 
-The rows of one (spacecraft, run, block) form a block; `CsvTable` gives them together.  What the
-rows give is the same JSON as that of an NDJSON file, so that the same checks hold for it.
+The rows of one (spacecraft, run, block) form a block; `CsvTable` keeps them together. The rows are
+converted to the JSON of an NDJSON file, so that the same checks apply.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ MAX_ROWS = 10_000
 
 
 class BlockRows(csv_rows.JoinedRows):
-    """The rows of one gyro block, a sample a row."""
+    """A collector for the CSV rows of one gyro block, with one sample per row."""
 
     key_columns = KEY
     may_lack = "the block may lack a sample"
@@ -34,7 +34,7 @@ class BlockRows(csv_rows.JoinedRows):
         self._taken: set[tuple[float, ...]] = set()
 
     def take(self, row: CsvRow) -> None:
-        """Take the cells of a row; raises `BadCell`."""
+        """Read the cells of a row; raises `BadCell`."""
         try:
             time = parse_utc(row["time"])
         except BadInput as error:
@@ -44,7 +44,7 @@ class BlockRows(csv_rows.JoinedRows):
         time_s = (time.tai_ns - self.start_ns) * 1e-9
         rates = [csv_rows.number_cell(row, column) for column in RATES]
         if (row_of := (time_s, *rates)) in self._taken:
-            # The row was written twice, or the file to its own end.
+            # A repeated row: the row was written twice, or a file appended to itself.
             return
         if len(self.rates) == MAX_ROWS:
             raise csv_rows.BadCell("block", f"has more than {MAX_ROWS} rows", self.key[-1])
@@ -53,14 +53,14 @@ class BlockRows(csv_rows.JoinedRows):
         self.rates.append(rates)
 
     def body(self) -> Mapping[str, Any]:
-        """The JSON object of the block."""
+        """The JSON object of the gyro block made from all collected rows."""
         named = {name: value for name, value in zip(KEY, self.key, strict=True) if value}
         times = {"start": self.start, "times_s": self.times_s}
         return {**named, **times, "rates_rad_per_s": self.rates}
 
 
 def _check_header(names: list[str], where: str) -> None:
-    """Raise `BadFile` for a column that is unknown, missing or there twice."""
+    """Raise `BadFile` for a CSV column that is unknown, missing or repeated."""
     there_are = f"there is no such column; there are {', '.join(GYRO_COLUMNS)}"
     faults = [
         Fault(f"{where}, column {name or '(empty)'}", there_are)

@@ -1,8 +1,8 @@
-"""The registry of input formats: files of telemetry, and files that add to their batches.
+"""The registry of input formats: telemetry files, and files with attitudes or orbits for batches.
 
-`acquire replay` and uploads read the formats of telemetry by the suffixes and media types that
-stand here.  A feature, or another package, brings formats by a module `formats` with a mapping
-`INPUT_FORMATS` (`service.feature`).
+`acquire replay` and uploads choose a telemetry format by its suffixes and media types. A feature,
+or another package, adds formats by a module `formats` with a mapping `INPUT_FORMATS`
+(`service.feature`).
 """
 
 import os
@@ -21,7 +21,7 @@ from service.observations.decompress import Line, physical_lines
 from service.observations.gyro_rows import GYRO_ROWS, BlockRows
 
 NDJSON, CSV = "ndjson", "csv"
-"""Names of formats: what is not named by a suffix is NDJSON."""
+"""Names of formats; NDJSON is the default for unknown suffixes."""
 
 
 def _is_this(start: bytes) -> str | None:
@@ -30,15 +30,14 @@ def _is_this(start: bytes) -> str | None:
 
 @dataclass(frozen=True)
 class InputFormat:
-    """A format that `acquire replay` reads.
+    """An input format of `acquire replay`.
 
-    `given` are the words of the command that name such a file.  A format of telemetry has `read`,
-    which gives the batches and gyro blocks of a seekable stream as lines of JSON; the others are
-    read by the option that names them.  `refusal` tells from the first bytes of a file what else
-    it is, None if it is of this format.  In a format of `one_a_line` the lines of a file can be
-    counted, and the body of an upload may be compressed.  A format that `is_text` may also come as
-    UTF-16.  `notes` are for people, line by line; `uploaded` describes an upload in
-    `openapi.yaml`.
+    `given` is the command line argument for such a file. A telemetry format has `read`, which
+    yields the batches and gyro blocks of a seekable stream as lines of JSON; other formats are read
+    by their options. `refusal` recognises other kinds of files by their first bytes and returns
+    None for this format. In a format with `one_a_line` the lines of a file can be counted, and the
+    body of an upload may be compressed. A format that `is_text` may also come as UTF-16. `notes` is
+    text for users; `uploaded` describes an upload in `openapi.yaml`.
     """
 
     title: str
@@ -56,28 +55,28 @@ class InputFormat:
 
 
 def input_formats(off: str | None = None) -> dict[str, InputFormat]:
-    """The formats by name: those of `INPUT_FORMATS`, then those that features bring.
+    """The input formats by name: the built-in ones, then those added by features.
 
-    `off` are the features that are left out; None: those of the environment.
+    `off` names disabled features; None for those of the environment.
     """
     brought = feature_modules("formats", os.environ.get(SETTING, "") if off is None else off)
     return {**INPUT_FORMATS, **{k: v for each in brought for k, v in each.INPUT_FORMATS.items()}}
 
 
 def telemetry_formats() -> dict[str, InputFormat]:
-    """The formats whose files hold batches or gyro blocks, each as a line of JSON."""
+    """The input formats whose files hold batches or gyro blocks, one line of JSON each."""
     return {name: each for name, each in input_formats().items() if each.read is not None}
 
 
 def telemetry_format(path: Path) -> str:
-    """The name of a file's format, by its suffix; NDJSON for a suffix that no format has."""
+    """The name of a file's telemetry format by its suffix; NDJSON for an unknown suffix."""
     suffix = path.suffix.lower()
     named = (name for name, each in telemetry_formats().items() if suffix in each.suffixes)
     return next(named, NDJSON)
 
 
 def input_format(name: str) -> InputFormat:
-    """The format of that name; raises `BadInput` naming all."""
+    """The input format with a given name; raises `BadInput` naming all formats."""
     formats = input_formats()
     if name not in formats:
         message = f"must be one of {', '.join(formats)}"
@@ -160,7 +159,7 @@ CSV_COLUMNS: tuple[tuple[str, str, str], ...] = (
         "its covariance, by rows",
     ),
 )
-"""The columns of batches in CSV: names that belong together, unit, meaning."""
+"""The CSV columns of batches: names of columns that belong together, unit, meaning."""
 
 _CSV_NOTES = """\
 A header, then one star a row; the rows with the same spacecraft, run and batch form a batch, in
@@ -267,7 +266,7 @@ INPUT_FORMATS: dict[str, InputFormat] = {
             "application/x-ndjson",
             "application/ndjson",
             "application/jsonl",
-            # Generated clients can send this one: most know no type for lines.
+            # Generated clients can send this type; most know no type for lines.
             "application/octet-stream",
         ),
         read=physical_lines,
@@ -337,4 +336,4 @@ INPUT_FORMATS: dict[str, InputFormat] = {
         "two-line set.  Needs the extra `tle`.",
     ),
 }
-"""The input formats by name."""
+"""The built-in input formats by name."""

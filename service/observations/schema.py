@@ -1,8 +1,7 @@
-"""A batch as JSON: the object that pipelines send, checked field by field.
+"""The JSON schema of batches sent by clients, checked field by field.
 
-Every entrance reads batches here, so that all refuse the same things with the
-same words: the faults that pydantic finds are put into those of the service.  The pydantic
-models are also what `openapi.yaml` shows.
+All interfaces read batches with this module, so that they refuse the same errors with the same
+messages, in the service's words. The pydantic models are also what `openapi.yaml` shows.
 """
 
 import codecs
@@ -44,7 +43,7 @@ from service.times import parse_utc
 
 
 def is_time(text: str) -> str:
-    """The text, if it is a time in UTC; pydantic reports the error that it raises otherwise."""
+    """A text checked to be a UTC time; raises `ValueError` otherwise, as pydantic expects."""
     try:
         parse_utc(text)
     except BadInput as error:
@@ -53,7 +52,7 @@ def is_time(text: str) -> str:
 
 
 Key = Annotated[str, Field(min_length=1, max_length=128, pattern=r"^[^\x00-\x1f\x7f]+$")]
-"""A name that is looked up: records of earlier versions have some that are no `Name`."""
+"""Looser pattern for looking up names: records of earlier versions hold some that are no `Name`."""
 Name = Annotated[str, Field(min_length=1, max_length=128, pattern=NAME_PATTERN)]
 RunName = Annotated[
     str, Field(min_length=1, max_length=64, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.:-]*$")
@@ -73,7 +72,7 @@ def _near_unit(components: tuple[float, ...]) -> tuple[float, ...]:
 
 
 Number = Annotated[float, Field(strict=True)]
-"""Strict: JSON's true and "5.3" are no numbers, though pydantic would take them for some."""
+"""A strict JSON number: pydantic would otherwise accept true and "5.3"."""
 Components = tuple[Number, Number, Number]
 UnitVector = Annotated[Components, AfterValidator(_near_unit)]
 Quaternion = Annotated[tuple[Number, Number, Number, Number], AfterValidator(_near_unit)]
@@ -87,7 +86,7 @@ ToleranceValue = Annotated[Number, Field(ge=0, le=180)]
 
 
 class Wire(BaseModel):
-    """The ground rules of every body: nothing unknown, no NaN, no infinity."""
+    """The base class of request bodies: no unknown fields, no NaN, no infinity."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
@@ -177,7 +176,7 @@ class SunPointedIn(Wire):
 
     sun_pointed: Literal[True]
     sun_counts: tuple[Count, Count, Count, Count] | None = None
-    """Counts of the mission's sun tracker: I+ and I- of the pair along its X, then along its Y."""
+    """Counts of the mission's Sun tracker: I+ and I- of the pair along its X, then along its Y."""
     sun_vector: UnitVector | None = None
     position_km: Position | None = None
     frame: ReferenceFrame = "EME2000"
@@ -211,18 +210,18 @@ class PredictionIn(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     quaternion: tuple[Number, Number, Number, Number] | None = None
-    """Inertial to body, scalar last."""
+    """The predicted attitude as a quaternion, inertial to body, scalar last."""
     covariance_arcsec2: PositiveDefinite | None = None
-    """Covariance of the rotation about the body axes."""
+    """Covariance in arcsec² of the prediction, for rotations about the body axes."""
     margin_deg: Annotated[Number, Field(gt=0, le=60)] | None = None
-    """By which the zone reaches beyond the field of view."""
+    """Distance in degrees by which the search zone extends beyond the field of view."""
     result: Annotated[str, Field(max_length=26)] | None = None
-    """The result whose attitude it came from."""
+    """The id of the result that the prediction started from."""
     age_s: Annotated[Number, Field(ge=0)] | None = None
     rate: RateSource | None = None
-    """What told how the body turned since then."""
+    """The source of the body rates used for the prediction."""
     reason: NoPrediction | None = None
-    """Why nothing was predicted."""
+    """The reason for having no prediction."""
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -242,7 +241,7 @@ class FromLastIn(Wire):
     model_config = ConfigDict(serialize_by_alias=True)
     from_: Annotated[Literal["last"], Field(alias="from")]
     by_default: bool = False
-    """The mission asks for it; the batch was sent with null.  The service adds this."""
+    """True if the service added the request, because the mission asks for it by default."""
     prediction: PredictionIn | None = None
 
 
@@ -279,7 +278,7 @@ class OptionsIn(Wire):
     zone_grid_deg: Annotated[GridStep, Field(strict=True)] | None = None
 
     def to_options(self) -> Options:
-        """The options as the core takes them."""
+        """The options as the solver takes them."""
         return Options(
             identifier=self.identifier,
             solver=self.solver,
@@ -290,7 +289,7 @@ class OptionsIn(Wire):
 
 
 def _named(model: Wire) -> dict[str, Any]:
-    """The fields that were given a value."""
+    """The fields of a model that were set to a value other than null."""
     values = ((name, getattr(model, name)) for name in model.model_fields_set)
     return {name: value for name, value in values if value is not None}
 
@@ -321,7 +320,7 @@ def _stars_of_different_trackers(
     observations: list[TrackerIn], info: ValidationInfo
 ) -> list[TrackerIn]:
     if "measurement" not in info.data:
-        # It is refused itself.
+        # The measurement has a fault of its own, which is reported already.
         return observations
     if info.data["measurement"] is not None:
         if observations:
@@ -339,7 +338,7 @@ def _stars_of_different_trackers(
 
 LEAST_SIGMA_ARCSEC, LARGEST_SIGMA_ARCSEC = 1e-3, 36_000.0
 LEAST_RATIO = 1e-10
-"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
+"""Least ratio of the smallest to the largest variance; below it a covariance is singular."""
 
 
 def _of_a_tracker(rows: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
@@ -365,14 +364,14 @@ def _require_ratio(variances: Sequence[float]) -> None:
 
 
 def none_beside_measurement(prior: Any, info: ValidationInfo) -> Any:
-    """The a priori knowledge of a batch, which must be null if it holds a measured attitude."""
+    """The a priori knowledge of a batch, checked to be null beside a measured attitude."""
     if prior is not None and info.data.get("measurement") is not None:
         raise ValueError("must be null: a measured attitude needs no a priori knowledge")
     return prior
 
 
 def no_options_beside_measurement(options: Any, info: ValidationInfo) -> Any:
-    """The options of a batch, which must be left out if it holds a measured attitude."""
+    """The options of a batch, checked to be absent beside a measured attitude."""
     if options.model_fields_set and info.data.get("measurement") is not None:
         raise ValueError("must be left out: a measured attitude is not searched for")
     return options
@@ -388,15 +387,15 @@ class MeasurementIn(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     quaternion: Quaternion
-    """Scalar last, inertial to the axes of `tracker`, or to the body without it."""
+    """Measured quaternion: scalar last, from inertial to the axes of `tracker`, or to the body."""
     tracker: Name | None = None
-    """Whose axes are meant; the mission's alignment turns them into the body's."""
+    """The tracker whose axes the quaternion describes; the alignment turns them into body axes."""
     sigma_arcsec: Annotated[tuple[Sigma, Sigma, Sigma], AfterValidator(_of_one_tracker)] | None = (
         None
     )
-    """One sigma of the rotation about each of the same axes."""
+    """One sigma of the rotation about each of those axes."""
     covariance_arcsec2: Annotated[PositiveDefinite, AfterValidator(_of_a_tracker)] | None = None
-    """Covariance of the small rotation about the same axes, instead of the sigmas."""
+    """Covariance of the small rotation about those axes, as an alternative to the sigmas."""
     frame: ReferenceFrame = "EME2000"
 
     @model_validator(mode="after")
@@ -427,11 +426,11 @@ class BatchIn(Wire):
     ] = []
     options: Annotated[OptionsIn, AfterValidator(no_options_beside_measurement)] = OptionsIn()
     remarks: Annotated[tuple[Remark, ...], Field(max_length=MOST_REMARKS)] = ()
-    """What was taken otherwise than it was sent.  The service adds this."""
+    """Notes on values interpreted otherwise than sent, added by the service."""
 
 
 def prior_of(prior: APrioriIn) -> APriori:
-    """A priori knowledge without a batch, as the core takes it; raises `BadBatch`."""
+    """A priori knowledge without a batch, as the solver takes it; raises `BadBatch`."""
     known = prior_from_canonical(prior.model_dump_json(exclude_defaults=True))
     if known is None:
         raise BadBatch(Fault("a_priori.from", "is for batches alone", shown_value("last")))
@@ -439,11 +438,11 @@ def prior_of(prior: APrioriIn) -> APriori:
 
 
 class Checked(Struct, frozen=True):
-    """A batch that passed every check of its form.
+    """The canonical form of a batch that passed every check.
 
-    `text` is its canonical JSON, defaults left out: what is recorded and run
-    again.  `fingerprint` is the digest of that text as it was sent, without what the
-    service added, so that white space and the order of keys do not make another body.
+    `text` is its canonical JSON without defaults, which is recorded and can be run again.
+    `fingerprint` is the digest of that text without additions of the service, so that white space
+    and the order of keys make no difference.
     """
 
     text: str
@@ -451,10 +450,9 @@ class Checked(Struct, frozen=True):
 
 
 class Submission(Struct, frozen=True, eq=False):
-    """A batch and the text that identifies it; see `Checked`.
+    """A batch to be processed, with its canonical text and its fingerprint; see `Checked`.
 
-    A batch that was made of a frame has the fingerprint of the frame and of what
-    was told with it.
+    A batch made from a frame has the fingerprint of the frame and its metadata.
     """
 
     batch: ObservationBatch
@@ -464,7 +462,7 @@ class Submission(Struct, frozen=True, eq=False):
 
 
 def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
-    """Check one batch; `run`, where given, takes the place of the batch's own.
+    """The canonical form of one batch in JSON, after all checks; `run` overrides the batch's own.
 
     Raises `BadBatch` with every fault, each naming field and value.
     """
@@ -478,7 +476,7 @@ def checked_from_json(body: bytes | str, run: str | None = None) -> Checked:
 
 
 def checked_from_model(model: BatchIn) -> Checked:
-    """The checked value for which a model stands."""
+    """The canonical form of a validated model of a batch."""
     model = without_fill_values(model)
     text, prior = model.model_dump_json(exclude_defaults=True), model.a_priori
     sent = text
@@ -492,7 +490,7 @@ def checked_from_model(model: BatchIn) -> Checked:
 
 
 def fingerprint_of(input: str) -> str:
-    """The fingerprint of a recorded batch that was not made of a frame."""
+    """The fingerprint of a recorded batch that was not made from a frame."""
     if _PREDICTED in input or _REMARKS in input:
         return checked_from_json(input).fingerprint
     return hashlib.sha256(input.encode()).hexdigest()
@@ -502,24 +500,24 @@ _PREDICTED, _REMARKS = '"from":"last"', '"remarks":['
 
 
 def submission_from_json(body: bytes | str, run: str | None = None) -> Submission:
-    """Read one batch, as `checked_from_json` does."""
+    """One batch read from JSON, after all checks; see `checked_from_json`."""
     return submission_from_checked(checked_from_json(body, run))
 
 
 def submission_from_model(model: BatchIn) -> Submission:
-    """The submission of a model that is already checked."""
+    """The submission for a validated model of a batch."""
     return submission_from_checked(checked_from_model(model))
 
 
 def submission_from_checked(checked: Checked) -> Submission:
-    """The submission of a batch that was checked here or elsewhere."""
+    """The submission for a batch in canonical form."""
     return Submission(batch_from_canonical(checked.text), checked.text, checked.fingerprint)
 
 
 def tolerances_from_text(texts: Iterable[str], field: str) -> TolerancesIn:
     """Tolerances written as NAME=VALUE; raises `BadBatch` naming `field`, the name and the value.
 
-    Of a name that comes twice the last one counts, as in JSON.
+    If a name occurs twice the last value counts, as in JSON.
     """
     values: dict[str, float] = {}
     for text in texts:

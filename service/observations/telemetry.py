@@ -1,8 +1,7 @@
-"""Telemetry files as numbered lines, each holding one batch or one gyro block as JSON.
+"""Reader of telemetry files as numbered lines, each with one batch or gyro block as JSON.
 
-The formats are those of `input_formats`, read in bounded memory.  A line that cannot be read is
-handed on with its fault, and the next lines follow: what to make of it is the
-caller's choice.  A file that makes no sense as a whole raises `BadFile`.
+The formats of `input_formats` are read in bounded memory. A line that cannot be read is yielded
+with its fault, and the next lines follow. A file that is no telemetry at all raises `BadFile`.
 """
 
 import codecs
@@ -23,11 +22,11 @@ _SHOWN_BYTES = 40
 
 
 def read_lines(source: Path | BinaryIO, form: str | None = None) -> Iterator[Line]:
-    """The batches and gyro blocks of a file or of a binary stream, in order.
+    """The batches and gyro blocks in a telemetry file or binary stream, in order.
 
-    The form is told by the file's name where it is not given; a stream without
-    one is NDJSON, and one with CSV is seekable.  Raises `BadFile` for a file that cannot be
-    opened, and for a CSV file that `CsvTable` refuses, before the first of them.
+    The default format is that of the file's name, and NDJSON for a stream; a CSV stream must be
+    seekable. Raises `BadFile`, before the first line, for a file that cannot be opened and for a
+    CSV file that `CsvTable` refuses.
     """
     form = form or (telemetry_format(source) if isinstance(source, Path) else NDJSON)
     read = telemetry_formats()[form].read
@@ -37,10 +36,10 @@ def read_lines(source: Path | BinaryIO, form: str | None = None) -> Iterator[Lin
 
 
 def require_telemetry(path: Path, form: str | None = None, field: str | None = None) -> None:
-    """Raise `BadFile` for a file that cannot be opened or that is no telemetry at all.
+    """Raise `BadFile` for a file that cannot be opened or that is no telemetry.
 
-    That is told by its first bytes.  Single bad lines are no matter of this.  Faults name the
-    path, or `field` in its place.
+    Only the first bytes are looked at, so that single bad lines do not matter. Faults name the
+    path, or `field` instead.
     """
     form, field = form or telemetry_format(path), field or str(path)
     with _opened(path, form) as stream:
@@ -59,9 +58,9 @@ def require_telemetry(path: Path, form: str | None = None, field: str | None = N
 
 
 def _not_telemetry(start: bytes, form: str) -> str | None:
-    """The kind of a file that is no telemetry, by its beginning; None for telemetry."""
+    """A description of a file that is no telemetry, by its first bytes; None for telemetry."""
     if not start.strip():
-        # Of a longer file more may follow.
+        # More may follow in a longer file.
         return None if len(start) == _LOOKED_AT_BYTES else "is empty: there is no batch in it"
     if not telemetry_formats()[form].is_text:
         return telemetry_formats()[form].refusal(start)
@@ -75,7 +74,7 @@ def _not_telemetry(start: bytes, form: str) -> str | None:
 
 @contextmanager
 def _opened(source: Path | BinaryIO, form: str) -> Iterator[BinaryIO]:
-    """The file as UTF-8 with line feeds; one that has others is copied to a temporary file."""
+    """A file as UTF-8 with line feeds; other encodings are copied to a temporary file."""
     if not isinstance(source, Path):
         yield source
         return
@@ -95,7 +94,7 @@ def _opened(source: Path | BinaryIO, form: str) -> Iterator[BinaryIO]:
             yield stream
             return
         with tempfile.TemporaryFile() as copy:
-            # Without `newline` every kind of line end becomes a line feed.
+            # The default `newline` turns every kind of line end into a line feed.
             text = io.TextIOWrapper(stream, "utf-16" if is_utf16 else "utf-8", "surrogateescape")
             try:
                 while piece := text.read(_LOOKED_AT_BYTES):

@@ -1,1 +1,1 @@
-"""What scanning trackers count and time, made to measured angles with their sigmas."""
+"""Conversion of scanning trackers' counts and crossing times to measured angles with sigmas."""

@@ -1,9 +1,9 @@
-"""Stars along a line of samples: the first moment, the cross-scan made of it, and maxima.
+"""Location of stars along a line of samples: first moments, the cross-scan, and maxima.
 
-Of the cross-scan (report on star images, 7.2 to 7.5), `displacement` is where the star stands,
-plus the first moment over the sum.  The report writes the image as Phi(u + a), whose star is at
--a, and drops that minus in 7.4 to 7.6 and 7.17 to 7.22.  What the telescope must be moved by is
-minus the displacement.
+In the cross-scan (report on star images, 7.2 to 7.5), `displacement` is the star's position, with a
+plus sign: the first moment over the sum. The report writes the image as Phi(u + a), whose star is
+at -a, and drops that minus in 7.4 to 7.6 and 7.17 to 7.22. The telescope must be moved by minus the
+displacement.
 """
 
 import math
@@ -15,15 +15,17 @@ import numpy.typing as npt
 from service.vectors import Vector
 
 BREAKDOWN_RATIO = 5.0
-"""Light over its noise below which a ratio of sums has no usable variance (report, 7.30)."""
+"""Least ratio of light to its noise at which a ratio of sums has a usable variance (report,
+7.30).
+"""
 
 
 @dataclass(frozen=True)
 class ProfileMoment:
-    """The first moment of one profile over its sum, in steps from its middle sample.
+    """The first moment of a line of samples over their sum, in steps from the middle sample.
 
-    `variance` is the full law sum (n - d)² sigma_n² / (sum)², of which the report's 7.36
-    is the case of white noise without displacement and without photon noise.
+    `variance` is the full law sum (n - d)² sigma_n² / (sum)²; the report's 7.36 is the special case
+    of white noise without displacement and photon noise.
     """
 
     displacement: float
@@ -33,12 +35,12 @@ class ProfileMoment:
 
     @property
     def signal_ratio(self) -> float:
-        """The sum over its own noise (7.30)."""
+        """The ratio of the samples' sum to its own noise (7.30)."""
         return self.total / math.sqrt(self.total_variance) if self.total_variance > 0 else math.inf
 
 
 def moment(samples: Vector, sample_variance: Vector, level_sigma: float = 0.0) -> ProfileMoment:
-    """The moment of samples n = -N ... N; `level_sigma` is an error common to all of them."""
+    """The normalised first moment of samples n = -N ... N; `level_sigma` is a common error."""
     steps = np.arange(len(samples), dtype=np.float64) - (len(samples) - 1) / 2.0
     total = float(samples.sum())
     displacement = float(steps @ samples) / total if total else math.nan
@@ -51,7 +53,7 @@ def moment(samples: Vector, sample_variance: Vector, level_sigma: float = 0.0) -
 
 @dataclass(frozen=True)
 class ScanResult:
-    """A displacement with its sigma; no number where the light is below the breakdown ratio."""
+    """The displacement of a star along a scan with its sigma; NaN for too little light."""
 
     displacement: float
     sigma: float
@@ -59,7 +61,7 @@ class ScanResult:
 
     @property
     def refused(self) -> bool:
-        """True if the scan held too little light to have a variance (7.30)."""
+        """True if the scan held too little light for a displacement (7.30)."""
         return math.isnan(self.displacement)
 
 
@@ -70,10 +72,10 @@ def cross_scan(
     background: float = 0.0,
     gain: float = math.inf,
 ) -> ScanResult:
-    """D = T sum n Phi_n / sum Phi_n of samples n = -N ... N at steps of T (7.21, 7.22).
+    """The displacement D = T sum n Phi_n / sum Phi_n of samples n = -N ... N, T apart (7.21, 7.22).
 
-    `background` is taken off first; left in, it pulls every displacement towards zero.
-    `gain` in photons per unit of Phi adds photon noise.
+    `background` is subtracted first; otherwise it would bias displacements towards zero. `gain` in
+    photons per unit of Phi adds photon noise.
     """
     light = np.asarray(samples, dtype=np.float64) - background
     variance = np.full(light.shape, noise_sigma**2) + np.maximum(light + background, 0.0) / gain
@@ -86,10 +88,9 @@ def cross_scan(
 
 
 def mean_of_scans(scans: npt.ArrayLike, spacing: float, noise_sigma: float) -> ScanResult:
-    """M scans (M, samples) of one place: the mean of their displacements, 1/M of the variance.
+    """The mean displacement of M scans (M, samples) of one place, with 1/M of the variance.
 
-    Each must hold enough light by itself, as in the report; where they do not, add the
-    samples first.
+    Each scan must hold enough light by itself, as in the report; otherwise add the samples first.
     """
     each = [cross_scan(scan, spacing, noise_sigma) for scan in np.atleast_2d(scans)]
     m = len(each)
@@ -103,13 +104,13 @@ def mean_of_scans(scans: npt.ArrayLike, spacing: float, noise_sigma: float) -> S
 def line_peaks(sums: Vector, threshold: float) -> Vector:
     """Places of the maxima of `sums` above `threshold`, rising, in lines from the first one.
 
-    A parabola through three sums refines each, to about half a line.  The first and the last
-    line are the place of none.
+    A parabola through three sums refines each place to about half a line. Maxima in the first and
+    last line are excluded.
     """
     padded = np.concatenate([[-np.inf], sums, [-np.inf]])
     before, middle, after = padded[:-2], padded[1:-1], padded[2:]
     at = np.flatnonzero((middle > threshold) & (middle > before) & (middle >= after))
-    # Maxima without a valley between them are one star and its noise.
+    # Maxima without a deep valley between them belong to one noisy star.
     kept: list[int] = []
     for line in at.tolist():
         if kept and sums[kept[-1] : line + 1].min() > min(sums[kept[-1]], sums[line]) - threshold:

@@ -1,8 +1,8 @@
-"""Stars from the sums of the lines of a raster (report on star images, 7.8).
+"""Extraction of stars from the line sums of a raster (report on star images, 7.8).
 
-Columns show the h of the stars and rows their v, unpaired.  The report's pattern constant
-does not ask which belong together; an attitude does.  A star puts the same light into its
-columns as into its rows, which tells the pairs apart.
+Columns give the h of the stars and rows their v, unpaired. The report's pattern constant needs no
+pairs; an attitude does. A star has the same light in its columns as in its rows, by which pairs are
+found.
 """
 
 import math
@@ -17,13 +17,13 @@ from service.vectors import Vector
 
 SAME_LIGHT_SIGMAS = 4.0
 SAME_LIGHT_SHARE = 0.02
-"""Light differs by no more between columns and rows: each moment cuts off its own tails."""
+"""Tolerated difference of a star's light between columns and rows: each moment cuts off tails."""
 NOISE_SIGMAS = 2.0
-"""Difference of light, in sigmas, that noise alone often makes."""
+"""Difference of light, in sigmas, that noise alone often causes."""
 
 
 class LinePlace(NamedTuple):
-    """A star along one axis: its place in lines from the first one, and its light."""
+    """A star along one axis of a raster: its place in lines from the first one, and its light."""
 
     line: float
     sigma_lines: float
@@ -32,7 +32,7 @@ class LinePlace(NamedTuple):
 
 
 class RasterStars(NamedTuple):
-    """Stars of a raster, the brightest first: arrays (n, 2) along h and v, and light (n,)."""
+    """Stars of a raster, brightest first: angles and sigmas (n, 2) along h and v, light (n,)."""
 
     angles_deg: Vector
     sigma_arcsec: Vector
@@ -40,11 +40,11 @@ class RasterStars(NamedTuple):
 
 
 def raster_stars(columns: Vector, rows: Vector, scan: Raster, field: str) -> RasterStars:
-    """The stars whose column and row are told apart from all others.
+    """The stars of a raster whose column and row can be paired without ambiguity.
 
-    Left out are stars that share a band of lines with another one, that stand at the edge, and
-    those whose light fits several columns or rows.  Raises `BadBatch` naming `field` for
-    another number of lines than the mission has, and for lines that are full.
+    Stars are left out if they overlap another star's lines, lie at the edge, or have light that
+    fits several columns or rows. Raises `BadBatch` naming `field` for a number of lines other than
+    the mission's, and for saturated lines.
     """
     along_h = _places(columns, scan.columns, scan, f"{field}.column_counts")
     along_v = _places(rows, scan.rows, scan, f"{field}.row_counts")
@@ -76,7 +76,7 @@ def _places(counts: Vector, lines: int, scan: Raster, field: str) -> list[LinePl
     light = counts - scan.background_counts
     per_count = 0.0 if scan.gain_e_per_count is None else 1.0 / scan.gain_e_per_count
     variance = scan.noise_counts**2 + counts * per_count
-    # Of a line without a star.
+    # The noise of a line without a star.
     noise = math.sqrt(scan.noise_counts**2 + scan.background_counts * per_count)
     peaks = np.round(line_peaks(light, scan.threshold_sigma * noise)).astype(np.intp)
     half = scan.half_width_lines
@@ -94,9 +94,9 @@ def _places(counts: Vector, lines: int, scan: Raster, field: str) -> list[LinePl
 
 
 def _hidden_shift_lines(h: LinePlace, v: LinePlace, half_width_lines: int) -> float:
-    """How far a star that hides beside this one along one axis may move it.
+    """The largest shift, in lines, of a star along one axis by another star hidden beside it.
 
-    Its light is in the sum of one axis and not of the other; it is within the half width.
+    The hidden star's light is in the sum of one axis only; it lies within the half width.
     """
     noise = math.hypot(h.sigma_light_counts, v.sigma_light_counts)
     more = max(0.0, abs(h.light_counts - v.light_counts) - NOISE_SIGMAS * noise)
@@ -104,7 +104,7 @@ def _hidden_shift_lines(h: LinePlace, v: LinePlace, half_width_lines: int) -> fl
 
 
 def _pairs(along_h: list[LinePlace], along_v: list[LinePlace]) -> list[tuple[LinePlace, LinePlace]]:
-    """Places of equal light, where each fits the other and nothing else."""
+    """Pairs of column and row places with equal light, where each fits only the other."""
     light, sigma = (
         [np.array([place[k] for place in along]) for along in (along_h, along_v)] for k in (2, 3)
     )

@@ -1,7 +1,8 @@
-"""A batch of scanning trackers as one of measured angles, and the Sun of a sun tracker.
+"""Conversion of scanning trackers' readings to measured angles, and a Sun tracker's counts to the
+Sun's direction.
 
-The record keeps what was sent; angles and sigmas are made of it with the settings of the
-mission, as often as it is read.
+The stored record keeps the readings as sent; angles and sigmas are computed with the mission's
+settings at every reading of the record.
 """
 
 import math
@@ -30,10 +31,10 @@ _SETTLED_DEG = 1e-9
 
 
 def reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
-    """The batch with angles, sigmas and, of a raster, stars in the place of readings.
+    """A batch with scanning trackers' readings replaced by angles, sigmas and, for a raster, stars.
 
-    A batch without readings is returned as it is.  Raises `BadInput` naming the field of a
-    tracker that the mission has not, and of readings that its scan cannot give.
+    A batch without readings is returned as it is. Raises `BadInput` naming the field of a tracker
+    unknown to the mission, or of readings that do not fit its scan.
     """
     if not any(each.readings for each in batch.observations):
         return batch
@@ -50,7 +51,7 @@ def reduced(batch: ObservationBatch, mission: Mission) -> ObservationBatch:
 
 
 def _reduced(stars: TrackerStars, tracker: Tracker, rates: Vector, field: str) -> TrackerStars:
-    """`rates` are of the body, in rad/s about the tracker's axes."""
+    """Stars of one scanning tracker, with angles; `rates` are the body's, rad/s in tracker axes."""
     first = next(each for each in stars.readings if each is not None)
     if first.kind == "lines":
         return _of_raster(first, tracker, field)
@@ -93,7 +94,7 @@ def _other_kind(tracker: Tracker, field: str, kind: str) -> BadBatch:
 
 
 def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, float]:
-    """The displacement (2,) from the middle of the lines in deg, and its sigma in arcsec."""
+    """The displacement (2,) of a star from the middle of two lines in deg, its sigma in arcsec."""
     places, variance = [], scan.sigma_floor_arcsec**2
     for axis, counts in (("h", reading.h), ("v", reading.v)):
         line_field = f"{field}.{axis}_counts"
@@ -133,9 +134,9 @@ def _of_counts(reading: Readings, scan: CrossScan, field: str) -> tuple[Vector, 
 def _of_times(
     reading: Readings, tracker: Tracker, scan: Sweep, rates: Vector, field: str
 ) -> tuple[Vector, float, float]:
-    """Angles (2,) in deg, their sigma in arcsec, and when they hold, in s after the first sweep.
+    """Star's angles (2,) in deg, their sigma in arcsec, and their time in s after the first sweep.
 
-    Both hold when the star crossed along h: until it crossed along v the body turned on.
+    They hold for the crossing along h; the body's rotation until the crossing along v is corrected.
     """
     h = crossing_of(reading.h, scan, f"{field}.h_times")
     v = crossing_of(reading.v, scan, f"{field}.v_times")
@@ -184,7 +185,7 @@ def _of_raster(reading: Readings, tracker: Tracker, field: str) -> TrackerStars:
 
 
 class Crossing(NamedTuple):
-    """A star's measured angle at a time after the sweep began, with the angle's sigma."""
+    """The mean crossing of a star over the wires: its angle at a time after the sweep began."""
 
     angle_deg: float
     time_s: float
@@ -192,10 +193,10 @@ class Crossing(NamedTuple):
 
 
 def crossing_of(times: Vector, scan: Sweep, field: str) -> Crossing:
-    """The mean over the wires, in the middle of their times.
+    """The mean crossing over all wires, at the mean of the crossing times.
 
-    `times` are in the mission's unit.  Raises `BadBatch` naming `field` for another number of
-    times than of wires, times that do not rise, and times after the end of the sweep.
+    `times` are in the mission's unit. Raises `BadBatch` naming `field` for a number of times other
+    than that of the wires, for times that do not rise, and for times after the end of the sweep.
     """
     wires_deg = np.array(scan.wires_deg)
     if len(times) != len(wires_deg):
@@ -218,11 +219,11 @@ def crossing_of(times: Vector, scan: Sweep, field: str) -> Crossing:
 
 
 def sun_body(counts: Vector, mission: Mission, field: str) -> Vector:
-    """The unit vector (3,) to the Sun in body axes.
+    """The unit vector (3,) to the Sun in body axes, from a Sun tracker's counts.
 
-    `counts` are I+ and I- of the pair along the tracker's X, then of that along Y.  Raises
-    `BadBatch` naming `field` for a mission without a sun tracker, for pairs without light, and
-    for signals beyond their straight part.
+    `counts` are I+ and I- of the pair along the tracker's X, then of that along Y. Raises
+    `BadBatch` naming `field` for a mission without a sun tracker, for pairs without light, and for
+    signals beyond their linear range.
     """
     tracker = mission.sun_tracker
     if tracker is None:
