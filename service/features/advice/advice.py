@@ -30,14 +30,16 @@ ALL_RECOMMENDED = "all that is recommended"
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """Other settings: an identifier, and tolerances in place of the mission's."""
+    """Alternative mission settings for a trial: an identifier, and tolerances that replace the
+    mission's.
+    """
 
     name: str
     identifier: Identifier
     tolerances: Mapping[str, float] = field(default_factory=dict)
 
     def of(self, batch: ObservationBatch) -> ObservationBatch:
-        """The batch with these settings in place of its own."""
+        """Copy of a batch with the identifier and the tolerances of a trial."""
         options = batch.options
         tolerances = {**options.tolerances, **self.tolerances}
         return structs.replace(
@@ -48,7 +50,7 @@ class Variant:
 
 @dataclass(frozen=True)
 class TrialCounts:
-    """Outcomes of the stars of one batch under a variant.
+    """Numbers of unique, ambiguous and unmatched stars in one batch identified with trial settings.
 
     `other_star` counts the stars that are unique here and under verified
     identification, but not the same star.
@@ -63,7 +65,7 @@ class TrialCounts:
 
 @dataclass(frozen=True)
 class VariantOutcome:
-    """A variant with the sums over the sample, and the change from the present settings.
+    """Star counts of one trial of settings over all sampled batches, and the change they cause.
 
     `change` is that of the share of stars not unique, in percentage points;
     None for the present settings themselves.
@@ -80,12 +82,13 @@ class VariantOutcome:
 
     @property
     def not_unique_percent(self) -> float:
-        """Stars ambiguous or unmatched, in percent of the observed."""
+        """Percentage of the observed stars that are ambiguous or unmatched."""
         return 100.0 * (self.ambiguous + self.unmatched) / self.observed if self.observed else 0.0
 
 
 def variants(findings: Sequence[ToleranceFinding], own: Mapping[str, float]) -> Iterator[Variant]:
-    """The variants to try: both identifiers, each tolerance halved, doubled and as recommended.
+    """Settings to try on the sample: both identifiers, each tolerance halved, doubled and as
+    recommended.
 
     `own` are requested values, tried together.  The tolerances belong
     to the votes: verified identification is tried once, with the present tolerances.
@@ -114,7 +117,7 @@ def variants(findings: Sequence[ToleranceFinding], own: Mapping[str, float]) -> 
 
 
 def trial_counts(acquisition: Acquisition, verified: Sequence[Identification]) -> TrialCounts:
-    """The outcomes of one batch, held against those of verified identification by tracker."""
+    """Star counts of one acquisition, compared tracker by tracker with verified identification."""
     other_star = 0
     for each, sure in zip(acquisition.trackers, verified, strict=True):
         mine = each.identification
@@ -127,14 +130,18 @@ def trial_counts(acquisition: Acquisition, verified: Sequence[Identification]) -
 def variant_outcome(
     variant: Variant, counts: Sequence[TrialCounts], present: Sequence[TrialCounts] | None
 ) -> VariantOutcome:
-    """The sums over a sample, and the change from the same batches under the present settings."""
+    """Star counts summed over a sample, and their change against the same batches under present
+    settings.
+    """
     sums = {name: sum(getattr(each, name) for each in counts) for name in (*OUTCOMES, "other_star")}
     change = None if present is None else _change(counts, present)
     return VariantOutcome(variant, len(counts), **sums, change=change)
 
 
 def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> Interval | None:
-    """The ratio of sums over batches, with the linearised variance of a ratio."""
+    """Change of the share of unique stars, in percentage points, with the variance of a ratio
+    estimator.
+    """
     stars = np.array([each.observed for each in counts], float)
     lost = np.array(
         [before.unique - after.unique for after, before in zip(counts, present, strict=True)],
@@ -150,18 +157,18 @@ def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> In
 
 
 EVIDENCE_SHARE, TRIALS_SHARE = 0.4, 0.7
-"""The shares of the time until evidence is collected, and other mission settings are tried."""
+"""Shares of the time limit at which collecting evidence and trying other mission settings end."""
 LARGEST_ZONE_DEG = 80.0
 
 RunAgain = Callable[[ObservationBatch], Acquisition]
 RunWith = Callable[[Mission, ObservationBatch], Acquisition]
 MOST_WITH_MISSION = 60
-"""Batches that are run again with another mission file."""
+"""Greatest number of batches that are processed again with each changed mission file."""
 
 
 @dataclass(frozen=True)
 class WorkLimit:
-    """How long the work may take, and a callback for its progress.
+    """Time limit of the computation of advice, with a callback for progress.
 
     `in_time` says whether a share of the time is still left; `step` is called
     after each batch of either round.
@@ -173,7 +180,7 @@ class WorkLimit:
 
 @dataclass(frozen=True)
 class Findings:
-    """The findings of a sample of batches on a mission's settings.
+    """Everything that a sample of recorded batches shows about the settings of a mission.
 
     `refused` counts batches that no longer fit the mission, the first reason
     beside it; `sampled` those that gave evidence.  `with_rival` counts batches in
@@ -206,7 +213,8 @@ def advise(
     pace: WorkLimit | None = None,
     run_with: RunWith | None = None,
 ) -> Findings:
-    """The advice that batches of a mission give; `run` acquires one batch within its zones.
+    """Find better settings for a mission from its recorded batches; `run` acquires a batch within
+    its zones.
 
     `run_freely` also searches the whole sky, as the service does: a batch whose attitude lies
     outside its zones fits there by chance alone, and as well in a mirror.
@@ -265,7 +273,7 @@ def advise(
 
 @dataclass
 class _SampledBatches:
-    """The batches that could run, each with its verified identification."""
+    """Sampled batches that could be processed again, with their verified identification."""
 
     cases: list[tuple[ObservationBatch, tuple[Identification, ...], TrialCounts]] = field(
         default_factory=list
@@ -276,7 +284,7 @@ class _SampledBatches:
     mirrored: int = 0
 
     def refuse(self, error: BadInput) -> None:
-        """Note a batch that does not fit the mission any more, or asks for too much work."""
+        """Count a batch that the mission's present settings refuse, and keep the first reason."""
         self.refused += 1
         self.refusal = self.refusal or str(error.faults[0])
 
@@ -309,7 +317,7 @@ def _trials(
 
 
 def mission_variants(mission: Mission) -> Iterator[tuple[str, Mission]]:
-    """Other values of the settings that act under verified identification, with their names."""
+    """Copies of a mission, each named and with one changed setting: sigma, zone size and others."""
     settings = mission.model_dump()
     for factor in (0.5, 2.0, 5.0):
         trackers = [
@@ -329,7 +337,9 @@ def mission_variants(mission: Mission) -> Iterator[tuple[str, Mission]]:
 def _mission_trials(
     mission: Mission, sample: "_SampledBatches", run_with: RunWith, pace: WorkLimit
 ) -> Iterator[VariantOutcome]:
-    """The outcomes of the batches with other settings of the mission, one setting at a time."""
+    """Star counts of sampled batches processed with changed missions, one changed setting at a
+    time.
+    """
     cases = [
         case
         for case in sample.cases[:MOST_WITH_MISSION]

@@ -36,22 +36,22 @@ from service.vectors import (
 )
 
 NEAR_DEG = 0.1
-"""A catalog star farther from an observed one is another star."""
+"""Distance in degrees beyond which a catalog star is not taken for the observed star."""
 SURROUNDINGS_DEG = 10.0
-"""Radius in which catalog stars are counted for the density of a field."""
+"""Radius in degrees about the boresight in which catalog stars are counted for field density."""
 RADIAL_MEDIAN = 1.1774
-"""Median radial error over the standard deviation per axis."""
+"""Ratio of the median radial error to the standard deviation per axis, for Gaussian errors."""
 NOISY, DENSER, FEWER, FAR = 1.5, 1.4, 0.75, 1.5
-"""Ratios to the earlier period from which noise, density, numbers of stars and angles differ."""
+"""Ratios to the earlier period beyond which noise, density, star numbers or angles differ."""
 BRIGHTER_MAG, OFFSET_MAG = 0.4, 0.25
 FITTING_SHARE = 0.6
-"""Stars near one of the catalog, of a batch whose attitude is right."""
+"""Least share of a batch's stars with a catalog star nearby if its attitude is right."""
 LEAST_STARS, LEAST_BATCHES = 20, 5
 FALSE_SHARE = 0.02
 USUAL_SHARE = 0.15
-"""Batches beyond the zone's room, by wrong attitudes or now and then, that are no cause."""
+"""Normal share of batches with a priori errors beyond the zone, not reported as a cause."""
 OVER_SHARE, OVER_BATCHES = 0.1, 6
-"""Share of the period, and number of batches, without a cause after which the cause is over."""
+"""Share of the period and number of last batches free of a cause after which the cause is over."""
 COMMON = 5
 
 Flags = npt.NDArray[np.bool_]
@@ -79,37 +79,37 @@ class StarTable:
     outcome: npt.NDArray[np.str_]
     magnitude: Vector
     off_axis: Vector
-    """Angle from the boresight over the radius of the field of view."""
+    """Angle of a star from the boresight, divided by the radius of the field of view."""
     offset_sigmas: Vector
     offset_mag: Vector
     rivals: tuple[tuple[str, ...], ...]
 
     @property
     def batches(self) -> int:
-        """The number of batches in the sample."""
+        """Number of batches in the sample."""
         return len(self.time_ns)
 
     @property
     def ambiguous(self) -> Flags:
-        """The ambiguous stars."""
+        """Mask (n,) of the ambiguous stars."""
         return np.asarray(self.outcome == "a")
 
     def share(self, of: Flags | None = None) -> float:
-        """The share of ambiguous stars, of all or of some; NaN without any."""
+        """Share of ambiguous stars, among all or the selected ones; NaN if none is selected."""
         chosen = self.ambiguous if of is None else self.ambiguous[of]
         return float(chosen.mean()) if len(chosen) else float("nan")
 
     def share_of(self, outcome: str) -> float:
-        """The share of the stars with an outcome."""
+        """Share of all stars with the outcome `u`, `a` or `m`."""
         return float(np.mean(self.outcome == outcome)) if len(self.outcome) else 0.0
 
     def reported(self, tracker: int) -> Vector:
-        """How many stars (b,) a tracker reported in each batch."""
+        """Number of stars (b,) that a tracker reported in each batch."""
         own = self.batch[self.tracker == tracker]
         return np.bincount(own, minlength=self.batches).astype(float)
 
     def noise(self, tracker: int) -> float:
-        """The noise of a tracker over its sigma, robustly; NaN with too few stars."""
+        """Robust estimate of a tracker's noise in units of its sigma; NaN with too few stars."""
         own = (self.tracker == tracker) & np.isfinite(self.offset_sigmas)
         if np.count_nonzero(own) < LEAST_STARS:
             return float("nan")
@@ -117,7 +117,7 @@ class StarTable:
 
 
 def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
-    """The stars of a sample of batches."""
+    """Build the table of observed stars from a sample of recorded batches and their answers."""
     names = tuple(dict.fromkeys(t.name for m in sample.missions.values() for t in m.trackers))
     count = len(sample.rows)
     density = np.full((count, len(names)), np.nan)
@@ -196,7 +196,7 @@ def _offsets_of(
     catalog: RunCatalog,
     batch: ObservationBatch,
 ) -> list[Vector]:
-    """Distance over its sigma and magnitude difference (2, n) to the nearest star, by tracker.
+    """Distance in sigmas and magnitude difference (2, n) of each star to its nearest catalog star.
 
     NaN without an attitude, and where it is wrong: few stars then have a neighbour.
     """
@@ -235,7 +235,7 @@ def _offsets(
 
 @dataclass(frozen=True, eq=False)
 class Factor:
-    """A cause that was found: the batches (b,) and the stars (n,) of the period that it is in."""
+    """Suspected cause of lost stars, with masks of the affected batches (b,) and stars (n,)."""
 
     batches: Flags
     stars: Flags
@@ -245,7 +245,7 @@ class Factor:
 
 
 def causes(now: StarTable, before: StarTable | None) -> list[Cause]:
-    """The causes, those that explain the most batches first."""
+    """Causes of ambiguous and unmatched stars, the cause with the most batches first."""
     if not len(now.outcome):
         return []
     lost = now.outcome != "u"
@@ -283,7 +283,7 @@ def _cause(factor: Factor, now: StarTable, hit: Flags, explained: Flags) -> Caus
 
 
 def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """A priori errors for which the zone leaves no room: the error grew, or the zone is small."""
+    """Detect a priori attitude errors beyond the zone: errors that grew, or a small zone."""
     beyond = now.a_priori_deg > now.room_deg
     angle, room = (
         float(np.nanmedian(each)) if np.isfinite(each).any() else np.nan
@@ -314,7 +314,7 @@ def _a_priori(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
 
 
 def _noise(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """Trackers that are noisier than the mission's sigma, and than before."""
+    """Detect trackers with more noise than the mission's sigma and than in the earlier period."""
     ratios = [now.noise(number) for number in range(len(now.trackers))]
     worst = max((each for each in ratios if np.isfinite(each)), default=0.0)
     for number, (name, ratio) in enumerate(zip(now.trackers, ratios, strict=True)):
@@ -335,7 +335,7 @@ def _noise(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
 
 
 def _sensitivity(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """Trackers that report fewer or brighter stars than before."""
+    """Detect trackers that report fewer or only brighter stars than in the earlier period."""
     for number, name in enumerate(now.trackers):
         mean, mean_before = _both(now, before, number, lambda t, k: float(t.reported(k).mean()))
         faint, faint_before = _both(
@@ -356,7 +356,7 @@ def _sensitivity(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
 
 
 def _density(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """Fields with more catalog stars than nearly all earlier ones."""
+    """Detect fields of view with more catalog stars than 90 % of the earlier ones."""
     for number, name in enumerate(now.trackers):
         middle, middle_before = _both(
             now, before, number, lambda t, k: _percentile(t.density[:, k], 50.0)
@@ -377,7 +377,7 @@ def _density(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
 
 
 def _false_stars(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """Observed points at which the catalog has no star."""
+    """Detect trackers whose points often have no catalog star nearby."""
     for number, name in enumerate(now.trackers):
         share, earlier = _both(now, before, number, _false_share)
         if not share > FALSE_SHARE + NOISY * np.nan_to_num(earlier):
@@ -400,7 +400,7 @@ def _false_share(table: StarTable, tracker: int) -> float:
 
 
 def _magnitudes(now: StarTable, before: StarTable | None) -> Iterator[Factor]:
-    """Trackers whose magnitudes moved against the catalog's."""
+    """Detect trackers whose magnitudes shifted relative to the catalog."""
     for number, name in enumerate(now.trackers):
         offset, earlier = _both(
             now, before, number, lambda t, k: _percentile(t.offset_mag[t.tracker == k], 50.0)
@@ -440,7 +440,7 @@ FACTORS: tuple[Callable[[StarTable, StarTable | None], Iterator[Factor]], ...] =
 def _earlier(
     before: StarTable | None, tracker: str, value: Callable[[StarTable, int], float]
 ) -> float:
-    """A value of a tracker in the earlier period; NaN where it is not known."""
+    """Value of one tracker computed for the earlier period; NaN without that period or tracker."""
     if before is None or tracker not in before.trackers:
         return float("nan")
     return value(before, before.trackers.index(tracker))
@@ -453,7 +453,7 @@ def _percentile(values: Vector, percent: float) -> float:
 
 @dataclass(frozen=True)
 class Part:
-    """The ambiguous stars of a part of a period, and of the same part of the earlier one."""
+    """Share of ambiguous stars in a group of stars, now and in the earlier period."""
 
     name: str
     stars: int
@@ -462,19 +462,23 @@ class Part:
 
     @property
     def points(self) -> float | None:
-        """The change in percent points; None without an earlier share."""
+        """Change of the share of ambiguous stars, in percentage points; None without an earlier
+        share.
+        """
         return None if self.before is None else 100.0 * (self.share.value - self.before.value)
 
     @property
     def is_certain(self) -> bool:
-        """True if the change is more than chance: neither interval holds the other's share."""
+        """True if the change is significant: neither interval holds the other period's share."""
         return self.before is not None and (
             self.share.low > self.before.high or self.share.high < self.before.low
         )
 
 
 def parts(now: StarTable, before: StarTable | None) -> list[Part]:
-    """Groups of stars to compare: all, by tracker, bright and faint, inner and outer."""
+    """Ambiguous shares of groups of stars: all, by tracker, bright and faint, inner and outer
+    field.
+    """
     found = [_part("all stars", now, before, lambda t: np.ones(len(t.batch), bool))]
     if len(now.trackers) > 1:
         found += [_part(name, now, before, _of_tracker(name)) for name in now.trackers]
@@ -514,5 +518,7 @@ def _part(
 
 
 def common_rivals(now: StarTable) -> list[tuple[str, int]]:
-    """The groups of rivals of the most ambiguous stars, with their numbers of stars."""
+    """Most frequent groups of rival catalog stars, with the number of ambiguous stars for each
+    group.
+    """
     return [(", ".join(names), n) for names, n in Counter(now.rivals).most_common(COMMON)]

@@ -1,4 +1,4 @@
-"""`acquire advise`: what recorded batches say of a mission's settings."""
+"""Command `acquire advise`: recommended settings of a mission from its recorded batches."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -9,7 +9,7 @@ from service.cli.arguments import period_of, progress_bar, settings_of_existing
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `advise` and its options."""
     parser = arguments.add_command(commands, "advise", run, first="--run --try")
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run to examine; default live")

@@ -1,4 +1,4 @@
-"""What identified stars say of the settings: observed minus catalog differences.
+"""Evidence on mission settings: observed minus catalog differences of identified stars.
 
 The stars are those that verified identification names.  It does not look at
 the tolerances, so differences beyond a tolerance are visible too; pairs
@@ -26,7 +26,7 @@ from service.vectors import Matrix, Vector, angle_between_deg, unit
 
 @dataclass(frozen=True)
 class StarEvidence:
-    """Identified stars (n): batch and tracker, observed and catalog magnitude.
+    """Identified stars (n): number of batch and tracker, observed and catalog magnitude.
 
     `pole_angle_deg` is the difference between the observed angle to the pole,
     through the a priori attitude, and the catalog's; NaN in caps.
@@ -41,7 +41,8 @@ class StarEvidence:
 
 @dataclass(frozen=True)
 class PairEvidence:
-    """Pairs (n) of identified stars of one tracker, no farther apart than the pair index goes.
+    """Differences of pairs (n) of identified stars of one tracker, within the largest indexed
+    separation.
 
     `separation_deg` is observed minus catalog.  `pole_difference_deg` is that
     between the observed and the catalog difference of the angles to the pole
@@ -63,7 +64,7 @@ _Columns = TypeVar("_Columns", StarEvidence, PairEvidence)
 
 @dataclass(frozen=True)
 class TrackerAttitude:
-    """One tracker's own attitude in one batch: its quaternion, covariance, fit and time."""
+    """Attitude of one tracker alone in one batch: its quaternion, covariance, fit and time."""
 
     batch: int
     tracker: int
@@ -76,7 +77,7 @@ class TrackerAttitude:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The evidence that the identified stars of some batches give."""
+    """Star pairs, magnitudes and single-tracker attitudes from verified batches."""
 
     stars: StarEvidence
     pairs: PairEvidence
@@ -84,12 +85,13 @@ class Evidence:
 
     @property
     def batches(self) -> int:
-        """Batches with at least one identified star."""
+        """Number of batches with at least one identified star."""
         return len(np.unique(self.stars.batch))
 
 
 def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
-    """The evidence of one acquisition by verified identification; `batch` is its number.
+    """Evidence from one acquisition with verified identification; `batch` is its number in the
+    sample.
 
     Tests and zones are judged by the prior attitude: an acquisition whose attitude
     came from the whole sky gives no evidence.
@@ -142,7 +144,7 @@ def evidence_of(batch: int, acquisition: Acquisition) -> Evidence:
 
 
 def merged(parts: Iterable[Evidence]) -> Evidence:
-    """The evidence of many batches as one."""
+    """Concatenate the evidence of several batches."""
     parts = list(parts)
     return Evidence(
         _joined(StarEvidence, [part.stars for part in parts]),
@@ -152,7 +154,9 @@ def merged(parts: Iterable[Evidence]) -> Evidence:
 
 
 def _uniquely_identified(result: TrackerResult) -> npt.NDArray[np.bool_]:
-    """The unique stars, without those that share an identity: one of them must be wrong."""
+    """Mask of unique stars, except where two observed stars share a catalog star: one must be
+    wrong.
+    """
     star = result.identification.star
     names, count = np.unique(star, return_counts=True)
     return result.identification.unique & ~np.isin(star, names[count > 1])
@@ -191,7 +195,7 @@ def _pairs(
 def _tracker_attitude(
     acquisition: Acquisition, result: TrackerResult, used: npt.NDArray[np.bool_]
 ) -> AttitudeSolution | None:
-    """The attitude of one tracker's stars alone, independent of the other trackers."""
+    """Attitude from the stars of one tracker alone, independent of the other trackers."""
     solved = attitude_of(
         result.corrected.direction_body,
         result.corrected.sigma_rad,
@@ -207,7 +211,7 @@ def _tracker_attitude(
 
 
 def _joined(kind: type[_Columns], parts: Sequence[_Columns]) -> _Columns:
-    """The columns of many parts one after another; those of no part are empty."""
+    """Concatenate the columns of several parts; empty columns without parts."""
     return kind(**{each.name: _column(each.name, parts) for each in fields(kind)})
 
 

@@ -1,4 +1,4 @@
-"""The noise of gyro and trackers from innovations and how they follow each other.
+"""Noise of gyro and trackers from filter innovations and their autocorrelation.
 
 The mean square of innovations alone cannot tell the gyro's noise: a filter that believes its gyro
 four times too good has errors nearly three times as large, and innovations that are as large as
@@ -36,23 +36,23 @@ from service.missions.motion import GyroSettings
 from service.vectors import Vector, full_matrices
 
 MOST = 20_000
-"""Measurements, the latest ones: of more the estimate needs too long."""
+"""Greatest number of measurements, the latest ones, that are used to bound the computing time."""
 LEAST = 300
 SEGMENTS = 20
-"""Consecutive parts, each of which is left out once for the interval."""
+"""Number of consecutive parts; leaving out one at a time (jackknife) gives the interval."""
 STUDENT = 2.093
 """The 97.5 % point of Student's t with 19 degrees of freedom."""
 LONGEST_STEPS = 3.0
-"""The longest step, in median steps, across which the gyro's noise is estimated."""
+"""Longest step, in median steps, across which the noise of the gyro is estimated."""
 SETTLING = 4.0
-"""The multiple of 1 / K measurements after a break that only settle A and B."""
+"""Number of measurements to skip after a break while A and B settle, in multiples of 1 / K."""
 
 Full = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class InnovationNoise:
-    """Ratios of true sigmas to those assumed: of the gyro over a step, and of the attitudes."""
+    """Ratio of true to assumed sigma, for the gyro over one step and for the measured attitudes."""
 
     gyro: Interval
     attitudes: Interval
@@ -60,10 +60,10 @@ class InnovationNoise:
 
 
 def innovation_noise(parts: Sequence[MeasuredInnovations]) -> InnovationNoise | None:
-    """The noise that innovations of stretches with a gyro show; None where they are too few.
+    """Estimate the noise of gyro and attitudes from innovations; None with too few of them.
 
-    Each part is of one stretch, in order of time.  What the gyro's bias adds to its noise is
-    counted as noise of its steps.
+    Each part is an uninterrupted interval with a gyro, in order of time.  The drift of the gyro's
+    bias counts as noise of its steps.
     """
     sums = _segment_sums(_latest(parts))
     if sums is None:
@@ -86,7 +86,7 @@ def innovation_noise(parts: Sequence[MeasuredInnovations]) -> InnovationNoise | 
 
 
 def _of_sigmas(ratio: float, half: float) -> Interval:
-    """A ratio of variances with its interval as one of sigmas."""
+    """Convert a ratio of variances with its interval to a ratio of sigmas."""
     low, value, high = (math.sqrt(max(each, 0.0)) for each in (ratio - half, ratio, ratio + half))
     return Interval(value, low, high)
 
@@ -111,7 +111,9 @@ def _latest(parts: Sequence[MeasuredInnovations]) -> list[MeasuredInnovations]:
 def _segment_sums(
     parts: Sequence[MeasuredInnovations],
 ) -> tuple[Full, Full, int] | None:
-    """Both equations summed over each segment: (segments, 2, 2), (segments, 2)."""
+    """Left matrices (segments, 2, 2) and right sides (segments, 2) of both equations, summed by
+    segment.
+    """
     used = [part for whole in parts for part in _unbroken(whole)]
     if not used:
         return None
@@ -125,7 +127,7 @@ def _segment_sums(
 
 
 def _unbroken(whole: MeasuredInnovations) -> Iterator[MeasuredInnovations]:
-    """The parts of consecutive accepted measurements without a gap."""
+    """Split innovations into runs of consecutive accepted measurements without a gap."""
     if len(whole) < 2:
         return
     step = np.diff(whole.tai_ns)
@@ -139,13 +141,15 @@ def _unbroken(whole: MeasuredInnovations) -> Iterator[MeasuredInnovations]:
 
 
 def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
-    """Axes, as columns, about which the errors of an attitude are independent on average."""
+    """Axes (columns) about which errors of measured attitudes are uncorrelated on average."""
     mean = np.mean(np.concatenate([full_matrices(each.measured_arcsec2) for each in parts]), axis=0)
     return np.asarray(np.linalg.eigh(mean)[1])
 
 
 def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
-    """The two equations of each measurement, summed over the axes: left sides and right side."""
+    """Coefficients and right sides of the two equations for each measurement, summed over three
+    axes.
+    """
     z = part.innovation_arcsec @ axes
     predicted, measured = (
         np.einsum("ji,njk,ki->ni", axes, full_matrices(each), axes)
@@ -164,7 +168,7 @@ def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
 def _axis_rows(
     z: Sequence[float], s: Sequence[float], r: Sequence[float]
 ) -> Iterator[tuple[float, ...] | None]:
-    """The two equations of each measurement about one axis; None until A and B have settled."""
+    """The two equations for each measurement about one axis; None until A and B have settled."""
     usual = sorted(1.0 - b / a for a, b in zip(s, r, strict=True))[len(s) // 2]
     settling = SETTLING / max(usual, 1e-6)
     a = b = 0.5 * (s[0] - r[0])
@@ -195,13 +199,17 @@ def _axis_rows(
 
 
 FITS = (0.85, 1.18)
-"""A ratio of sigmas between these changes no attitude by more than its sigma says."""
+"""Range of the sigma ratio that still counts as fitting: it changes no attitude by more than a
+sigma.
+"""
 Subject = Literal["gyro", "attitudes"]
 
 
 @dataclass(frozen=True)
 class InnovationFinding:
-    """The ratio of the true sigma to the assumed one, of gyro or attitudes; None: unknown."""
+    """Ratio of true to assumed sigma for the gyro or the attitudes, and the advice; None if
+    unknown.
+    """
 
     subject: Subject
     ratio: Interval | None
@@ -212,10 +220,11 @@ class InnovationFinding:
 def innovation_findings(
     noise: InnovationNoise | None, mission: Mission, trackers: tuple[NoiseFinding, ...]
 ) -> list[InnovationFinding]:
-    """The findings on the gyro and on the attitudes; none for a mission without a gyro.
+    """Advice on the noise of gyro and attitudes from innovations; empty for a mission without a
+    gyro.
 
-    `trackers` are those of residuals: where they say that a tracker's sigma fits, or give it
-    a line, innovations give it none.
+    `trackers` are findings from residuals: where they confirm or change the sigma of a tracker,
+    innovations propose no line for it.
     """
     if mission.gyro is None:
         return []

@@ -1,4 +1,4 @@
-"""The page of advice."""
+"""Console page with advice on the settings of a mission."""
 
 import re
 from collections.abc import Mapping
@@ -16,11 +16,13 @@ from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.requests.access import Policy
 
 FIRST_SAMPLE, FIRST_LIMIT_S = 60, 1.5
-"""Batches and seconds of the first answer; the page offers a larger sample."""
+"""Sample size (batches) and time limit (seconds) of the first view, before a larger sample is
+asked.
+"""
 
 
 class AdviceForm(AdviceQuery):
-    """The same from a form, whose empty fields are left out."""
+    """Query of the advice page, sent by a form whose empty fields are ignored."""
 
     @model_validator(mode="before")
     @classmethod
@@ -32,7 +34,7 @@ class AdviceForm(AdviceQuery):
 
 
 def with_settings(text: str) -> Markup:
-    """A sentence that names settings, with the paper's symbols as their tooltips."""
+    """Mark up setting names in a sentence, with the symbols of Fink & Shoup as tooltips."""
     named = re.compile(r"\b([A-Z0-9]+) \(([a-z_.]+)\)")
     marked = named.sub(r'<abbr title="\1 in Fink &amp; Shoup (1994)">\2</abbr>', str(escape(text)))
     return Markup(marked.replace(" (NTOT)", ""))
@@ -40,7 +42,9 @@ def with_settings(text: str) -> Markup:
 
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
 def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
-    """Tolerances, noise, magnitudes, alignment, and the outcomes of other settings."""
+    """Console page with recommended tolerances, noise, magnitudes and alignment, and trial
+    outcomes.
+    """
     is_first = "sample" not in query.model_fields_set and not query.tolerance
     asked = query.asked() | ({"sample": FIRST_SAMPLE} if is_first else {})
     advice = context.app.part(AdviceService).of_spacecraft(

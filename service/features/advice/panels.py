@@ -1,4 +1,4 @@
-"""Why stars are ambiguous, on the page of a spacecraft."""
+"""Panel of a spacecraft page that explains ambiguous stars."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from service.web.console.pages.spacecraft import PeriodBefore, ShownPeriod
 def ambiguity_of_period(
     context: PageContext, name: str, run: str, shown: ShownPeriod, before: PeriodBefore
 ) -> Iterator[Panel]:
-    """Ambiguous stars of a period beside an earlier one, and their causes."""
+    """Panel that compares ambiguous stars of a period with an earlier one, with causes."""
     found = context.app.part(AdviceService).ambiguity(
         name, run, shown.start, shown.end, before.shift_s
     )

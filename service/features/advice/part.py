@@ -1,4 +1,4 @@
-"""Advice on a mission's settings from recorded batches, as the API and the command show it."""
+"""Service that computes advice on a mission's settings from recorded batches."""
 
 import math
 import threading
@@ -51,16 +51,16 @@ from service.storage.recording.unsaved_result import LIVE
 from service.times import DAY_S, Utc, recorded_utc, shifted
 
 ADVICE_SAMPLE = 200
-"""Gives a sigma to about five percent; these batches are processed again in seconds."""
+"""Default number of batches for advice: sigma accurate to about 5 %, processed in seconds."""
 ADVICE_RETRY_S = 10
 NO_TOLERANCES = TolerancesIn()
 CAUSES_SAMPLE = 300
-"""Batches of each period whose recorded answers are read for causes: less than half a second."""
+"""Number of recorded batches per period read to find causes; takes less than half a second."""
 
 
 @dataclass(frozen=True)
 class Ambiguity:
-    """Ambiguous stars of a period by parts beside an earlier period, their causes and rivals."""
+    """Ambiguous stars of a period compared with an earlier one, with causes and rival stars."""
 
     parts: list[Part]
     causes: list[records.Cause]
@@ -72,12 +72,12 @@ class Ambiguity:
 
     @property
     def ambiguous(self) -> int:
-        """How many stars of the period are ambiguous."""
+        """Number of ambiguous stars in the period."""
         return round(self.parts[0].stars * self.parts[0].share.value)
 
 
 class AdviceService:
-    """Computes advice, for one caller at a time."""
+    """Computes advice on mission settings, for one caller at a time."""
 
     def __init__(self, context: Context, submissions: SubmissionService, zones: Zones) -> None:
         self._context = context
@@ -86,12 +86,14 @@ class AdviceService:
         self._lock = threading.Lock()
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file and no thread is open."""
 
     def ambiguity(
         self, name: str, run: str, start: Utc, end: Utc, earlier_s: float = DAY_S
     ) -> Ambiguity:
-        """Why stars of a period are ambiguous, beside the period some seconds before it."""
+        """Explain the ambiguous stars of a period, compared with the period `earlier_s` seconds
+        before.
+        """
         now = self._stars(name, run, start, end)
         before = self._stars(name, run, shifted(start, -earlier_s), shifted(end, -earlier_s))
         earlier = before if before.batches else None
@@ -127,9 +129,9 @@ class AdviceService:
     ) -> records.Advice:
         """Advice on a mission's settings from the batches of a run; see `advise`.
 
-        Of the batches at most `sample` are run again, fewer where `limit_s`
-        seconds run out; `step` is called after each, twice a batch.  `tolerances`
-        are tried as well.  Raises `Busy` while the service is computing other advice.
+        At most `sample` batches are processed again, fewer if `limit_s` seconds run out; `step` is
+        called after each batch, twice per batch.  `tolerances` are tried as well.  Raises `Busy`
+        while the service is computing other advice.
         """
         mission = self._context.mission(name)
         own = tolerances.model_dump(exclude_none=True)
@@ -176,7 +178,7 @@ def advice_record(
     innovations: Sequence[InnovationFinding] = (),
     causes: Sequence[records.Cause] = (),
 ) -> records.Advice:
-    """The findings with their figures and sentences, the trials, and the lines to change."""
+    """Combine findings, trials and sentences to the advice record of the API."""
     tolerances = [(each, tolerance_statement(each, findings)) for each in findings.tolerances]
     noise = [(each, noise_statement(each)) for each in findings.noise]
     magnitudes = [(each, magnitude_statement(each, findings)) for each in findings.magnitudes]
@@ -314,7 +316,7 @@ def _trial(outcome: VariantOutcome) -> records.Trial:
 
 
 def _changes(statements: Iterable[Statement]) -> list[records.Change]:
-    """The lines to write, a key of a table once: trackers may share one."""
+    """Lines to change in the mission file, each key of a table once even if trackers share it."""
     lines: dict[tuple[str, str | None, str], records.Change] = {}
     for each in (change for statement in statements for change in statement.changes):
         key = each.table, each.tracker, each.line.partition(" = ")[0]
@@ -329,13 +331,13 @@ def _estimate(found: Interval | None) -> records.Estimate | None:
 
 
 def _bounded(found: Interval) -> records.Estimate:
-    """The interval, with null for a bound that the sample does not give."""
+    """Convert an interval to an API record, with null for an infinite bound."""
     low, high = (part if math.isfinite(part) else None for part in (found.low, found.high))
     return records.Estimate(value=found.value, low=low, high=high)
 
 
 def no_changes_text(advice: records.Advice) -> str:
-    """The text shown when no line of the mission file should change."""
+    """Text shown when no line of the mission file should change."""
     findings = (
         advice.groups,
         advice.zone,
@@ -354,10 +356,11 @@ def no_changes_text(advice: records.Advice) -> str:
 
 
 def best_setting(advice: records.Advice) -> tuple[records.Trial, records.Trial] | None:
-    """The present settings, and the one setting that leaves the fewest stars ambiguous instead.
+    """Trial with present settings and trial of the one setting that leaves the fewest ambiguous
+    stars.
 
-    Of those of the identifier in use; None where none certainly leaves fewer, or it leaves more
-    stars unmatched instead.
+    Only trials of the identifier in use count.  None if no setting certainly leaves fewer, or if it
+    leaves more stars unmatched.
     """
     own = [each for each in advice.tried if each.identifier == advice.identifier and each.observed]
     present = next((each for each in own if each.change_points is None), None)
@@ -378,5 +381,5 @@ def best_setting(advice: records.Advice) -> tuple[records.Trial, records.Trial] 
 
 
 def open_part(app: App) -> AdviceService:
-    """The advice of an open app."""
+    """Create the advice service for an open app."""
     return AdviceService(app.context, app.submissions, app.zones)

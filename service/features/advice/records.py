@@ -1,4 +1,4 @@
-"""Advice: what recorded batches say of a mission's settings."""
+"""API records of advice on the settings of a mission."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -16,7 +16,7 @@ Size = Literal["too_small", "fits", "too_large", "no_verdict"]
 
 
 class Estimate(Record, frozen=True, kw_only=True):
-    """An estimate with its 95 % interval; null if the sample does not bound it."""
+    """An estimated value with its 95 % interval; null where the sample gives no bound."""
 
     value: float
     low: float | None
@@ -35,11 +35,11 @@ class ToleranceAdvice(Record, frozen=True, kw_only=True):
     differences: Count
     batches: Count
     needed: Estimate | None
-    """The value that accepts 99 % of the true pairs or stars."""
+    """Value of the tolerance that accepts 99 % of the true pairs or stars."""
     share_beyond: Estimate | None
-    """Share of the true pairs or stars that the present value rejects."""
+    """Share of the true pairs or stars that the present tolerance rejects."""
     recommended: float | None
-    """For votes; `not_used` says where the identifier is another."""
+    """Recommended tolerance for identification by votes; `not_used` marks another identifier."""
     action: Action
     text: Text
 
@@ -52,7 +52,7 @@ class GroupAdvice(Record, frozen=True, kw_only=True):
 
 
 class ZoneAdvice(Record, frozen=True, kw_only=True):
-    """A finding on the size of the zone, or on the largest separation of its pairs."""
+    """A finding on the size of the zone or on the largest separation of indexed pairs."""
 
     action: Action
     text: Text
@@ -82,12 +82,12 @@ class NoiseAdvice(Record, frozen=True, kw_only=True):
 
 
 class MagnitudeAdvice(Record, frozen=True, kw_only=True):
-    """observed = catalog + offset + (scale - 1) (catalog - pivot)."""
+    """Magnitude fit of a tracker: observed = catalog + offset + (scale - 1) (catalog - pivot)."""
 
     tracker: str
     pivot_mag: Annotated[float | None, doc("The median of the catalog magnitudes.")]
     offset_mag: Estimate | None
-    """At the pivot; positive: the tracker measures fainter."""
+    """Magnitude offset at the pivot; positive if the tracker measures fainter than the catalog."""
     scale: Estimate | None
     now_sigma_mag: float
     scatter_mag: Annotated[Estimate | None, doc("One standard deviation about the line.")]
@@ -104,9 +104,11 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
     tracker: str
     reference: str
     rotation_arcsec: Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None
-    """Rotation vector about the body axes."""
+    """Rotation vector of the tracker about the body axes."""
     axes_body: Annotated[list[Components], Field(min_length=3, max_length=3)] | None
-    """The measured x, y and z axis of the tracker, if the sample fixes them."""
+    """Measured x, y and z axes of the tracker in the body frame; null if the sample does not fix
+    them.
+    """
     batches: Count
     verdict: Literal["off", "fits", "no_verdict"]
     action: Action
@@ -114,12 +116,14 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
 
 
 class InnovationAdvice(Record, frozen=True, kw_only=True):
-    """Noise by the innovations of the filter and how they follow each other."""
+    """Noise of the gyro or the attitudes, estimated from the filter's innovations."""
 
     subject: Literal["gyro", "attitudes"]
-    """`gyro`: sigma_v of the mission. `attitudes`: what the covariances of batches say."""
+    """Noise that is judged: `gyro`, sigma_v of the mission, or `attitudes`, the recorded
+    covariances.
+    """
     ratio: Estimate | None
-    """True over assumed standard deviation; null: too little data."""
+    """Ratio of true to assumed standard deviation; null with too little data."""
     measurements: Annotated[Count, doc("Innovations that were used.")]
     action: Action
     text: Text
@@ -138,14 +142,17 @@ class Trial(Record, frozen=True, kw_only=True):
     ambiguous: Count
     unmatched: Count
     named_otherwise: Count
-    """Stars that are unique here and under `verified`, but as different catalog stars."""
+    """Stars that are unique both in this trial and under `verified`, but as different catalog
+    stars.
+    """
     change_points: Estimate | None
-    """Change of the share that is not unique, in percentage points, relative to votes with the
-    present settings; null: not compared."""
+    """Change of the share of stars that are not unique, in percentage points, relative to votes
+    with     the present settings; null: not compared.
+    """
 
 
 class Change(Record, frozen=True, kw_only=True):
-    """A line for the mission's file."""
+    """A line to write into the mission file."""
 
     table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
@@ -153,7 +160,7 @@ class Change(Record, frozen=True, kw_only=True):
 
 
 class Cause(Record, frozen=True, kw_only=True):
-    """A cause of ambiguous or unmatched stars, by recorded answers."""
+    """A cause of ambiguous or unmatched stars, found in recorded answers."""
 
     batches: Annotated[Count, doc("Batches of the sample with such stars that it explains.")]
     text: Text

@@ -1,4 +1,4 @@
-"""The route of advice."""
+"""Route of the API that gives advice on mission settings."""
 
 from typing import Annotated, Any
 
@@ -25,11 +25,11 @@ AdviceDep = Annotated[AdviceService, Depends(_advice)]
 
 MAX_SAMPLE = 2_000
 ADVICE_LIMIT_S = 20.0
-"""The longest wait for an answer; a sample that takes longer is cut short, and says so."""
+"""Time limit of an answer in seconds; a sample that takes longer is cut short and marked."""
 
 
 class AdviceQuery(PeriodQuery):
-    """Which batches to advise from, and how much work to spend on them."""
+    """Query for advice: the batches to process again, their greatest number, tolerances to try."""
 
     sample: Annotated[
         int, Field(ge=1, le=MAX_SAMPLE, description="Maximum number of batches to process again.")
@@ -44,7 +44,7 @@ class AdviceQuery(PeriodQuery):
     ]
 
     def asked(self) -> dict[str, Any]:
-        """Every parameter as the app's functions take them."""
+        """Parameters of a query for advice, converted to arguments of the advice service."""
         asked = super().asked()
         return asked | {"tolerances": tolerances_from_text(asked.pop("tolerance"), "tolerance")}
 

@@ -1,4 +1,4 @@
-"""Findings as sentences, with the lines of the mission file to change."""
+"""Advice as sentences, with the lines of the mission file to change."""
 
 import math
 from collections.abc import Sequence
@@ -25,7 +25,9 @@ _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 
 @dataclass(frozen=True)
 class FileChange:
-    """A line for the mission file: its table, of a tracker where `tracker` names one, and why."""
+    """A line to write into the mission file: its table, the tracker if the table has several, the
+    text.
+    """
 
     table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None
@@ -34,10 +36,11 @@ class FileChange:
 
 @dataclass(frozen=True)
 class Statement:
-    """The action that a finding asks for, its sentence, and the lines that carry it out.
+    """Recommended action for a setting, a sentence that explains it, and the lines that carry it
+    out.
 
-    A line is meant to be written unchanged; there is none where the sentence
-    recommends to keep the setting or to correct something else first.
+    A line is meant to be written unchanged; there is none where the sentence recommends keeping the
+    setting or correcting something else first.
     """
 
     action: Action
@@ -46,7 +49,7 @@ class Statement:
 
 
 def group_statements(advice: Findings) -> list[Statement]:
-    """Statements on batches with two groups of stars, and on mirrored batches."""
+    """Sentences on batches with two groups of stars, and on mirrored batches."""
     statements = []
     if advice.with_rival:
         statements.append(
@@ -70,7 +73,7 @@ def group_statements(advice: Findings) -> list[Statement]:
 
 
 def tolerance_statement(finding: ToleranceFinding, advice: Findings) -> Statement:
-    """The statement on one tolerance."""
+    """Sentence and action for one tolerance."""
     name, unit = finding.tolerance.name, finding.tolerance.unit
     now = _quantity(finding.now, unit)
     start = f"{finding.symbol} ({name})"
@@ -131,7 +134,7 @@ def _change_statement(action: Action, text: str, finding: ToleranceFinding) -> S
 def _present_and_recommended(
     finding: ToleranceFinding, trials: Sequence[VariantOutcome]
 ) -> tuple[VariantOutcome | None, VariantOutcome | None]:
-    """The votes with the present settings, and with this tolerance as recommended."""
+    """Trials by votes with the present settings, and with only this tolerance as recommended."""
     present = next((t for t in trials if t.variant.name == PRESENT), None)
     alone = {finding.tolerance.name: finding.recommended}
     found = (
@@ -162,7 +165,7 @@ def _gains(present: VariantOutcome | None, with_it: VariantOutcome | None) -> bo
 
 
 def noise_statement(finding: NoiseFinding) -> Statement:
-    """The statement on one tracker's noise."""
+    """Sentence and action for the noise of one tracker."""
     start = f"Noise of {finding.tracker}"
     if finding.sigma_arcsec is None:
         return Statement("wait", _too_few(start, finding.batches, "an attitude of its own"))
@@ -201,7 +204,7 @@ def noise_statement(finding: NoiseFinding) -> Statement:
 
 
 def _worst(finding: NoiseFinding) -> str:
-    """The sentence on a period of more noise, empty without one."""
+    """Sentence on a period of more noise, empty without one."""
     if finding.worst is None:
         return ""
     worst = finding.worst
@@ -214,7 +217,7 @@ def _worst(finding: NoiseFinding) -> str:
 
 
 def magnitude_statement(finding: MagnitudeFinding, advice: Findings) -> Statement:
-    """The statement on one tracker's magnitudes."""
+    """Sentence and action for the magnitudes of one tracker."""
     start = f"Magnitudes of {finding.tracker}"
     if finding.offset_mag is None or finding.scale is None or finding.scatter_mag is None:
         return Statement("wait", f"{start}: too little data to judge them: {finding.stars} stars.")
@@ -261,7 +264,7 @@ def magnitude_statement(finding: MagnitudeFinding, advice: Findings) -> Statemen
 def _color_line(
     mission: Mission, finding: MagnitudeFinding, all_of_them: Sequence[MagnitudeFinding]
 ) -> FileChange | None:
-    """The colour polynomial with the offset in its constant; None where trackers disagree."""
+    """New line of the colour polynomial, its constant corrected; None where trackers disagree."""
     for other in all_of_them:
         if other is finding or other.offset_mag is None or finding.offset_mag is None:
             continue
@@ -275,7 +278,7 @@ def _color_line(
 
 
 def alignment_statement(finding: AlignmentFinding) -> Statement:
-    """The statement on the alignment of one tracker with another."""
+    """Sentence and action for the alignment of one tracker relative to another."""
     start = f"Alignment of {finding.tracker} with {finding.reference}"
     if finding.rotation_arcsec is None:
         return Statement("wait", _too_few(start, finding.batches, "an attitude of each"))
@@ -325,7 +328,7 @@ def _number(value: float, unit: str) -> str:
 
 
 def _bounds(found: Interval, decimals: int) -> str:
-    # Of the size of an offset, whichever way it goes.
+    # Bounds on the absolute value of the offset.
     low, high = found.low, found.high
     if found.value < 0:
         low, high = -high, -low
@@ -337,13 +340,13 @@ def _percent_with_bounds(share: Interval) -> str:
 
 
 WIDER, NARROWER = 1.05, 0.5
-"""Times the width of the widest field of view; as `mission_check` judges a file."""
+"""Bounds on zone widths, in widths of the widest field of view; the same as in `mission_check`."""
 
 
 def zone_statements(mission: Mission, size: ZoneSize, costs: Sequence[ZoneCost]) -> list[Statement]:
-    """The statements on CCAP or WBAND, by recorded a priori errors, and on HMAX.
+    """Sentences on zone size (CCAP or WBAND) from recorded a priori errors, and on HMAX.
 
-    `costs` are those of `size.sizes_deg`.
+    `costs` belong to `size.sizes_deg`.
     """
     return [_size_statement(mission, size, costs), _hmax_statement(mission, size)]
 

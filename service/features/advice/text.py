@@ -1,4 +1,4 @@
-"""Advice as text for a terminal."""
+"""Advice as plain text for a terminal."""
 
 import textwrap
 from collections.abc import Iterable, Sequence
@@ -11,7 +11,7 @@ WIDTH = 96
 
 
 def advice_text(advice: Advice) -> str:
-    """The advice as lines of text."""
+    """Format advice as lines of text for a terminal."""
     lines = [*_heading(advice), ""]
     sections: tuple[tuple[str, Sequence[Any]], ...] = (
         ("Groups of stars", advice.groups),
@@ -39,7 +39,7 @@ def _heading(advice: Advice) -> list[str]:
 
 
 def _sentences(findings: Iterable[Any]) -> list[str]:
-    """The findings, whatever they are about, by their `text` and the mark of their `action`."""
+    """Findings as wrapped lines of text, each with a mark for its action."""
     marks = {"keep": "  ok  ", "wait": "  ?   "}
     return [
         line
@@ -71,7 +71,7 @@ def _table(tried: Sequence[Trial]) -> list[str]:
 
 
 def _changes(advice: Advice) -> list[str]:
-    """The lines for the mission file, under the tables that they belong to."""
+    """Lines to change in the mission file as text, grouped by table."""
     if not advice.changes:
         return [no_changes_text(advice)]
     lines = [f"To change in the mission file of {advice.spacecraft}:"]

@@ -1,9 +1,8 @@
-"""Finds tolerances that are too tight or too wide for what the tracker really measures.
+"""Detection of tolerances that are too tight or too wide for the measured differences.
 
-A tolerance is held against the differences of pairs that are known to be the
-same stars.  It is too tight where it certainly loses more than one true pair in
-a hundred, and wide where it is certainly more than WIDE times what that takes:
-then false pairs pass that need not.
+A tolerance is compared with the differences of pairs that are known to be the same stars.  A
+tolerance is too tight if it certainly loses more than 1 % of the true pairs, and too wide if it is
+certainly more than WIDE times the value needed: false pairs then pass unnecessarily.
 """
 
 import math
@@ -20,9 +19,9 @@ from service.missions.mission import Band, Mission
 from service.vectors import Vector
 
 KEPT = 0.99
-"""The share of true pairs that a tolerance is to let through."""
+"""Share of true pairs that a tolerance should accept."""
 MARGIN = 1.2
-"""Factor of the recommended over the needed value: later data may be worse than the sample."""
+"""Factor between needed and recommended tolerance: later data may be worse than the sample."""
 WIDE = 4.0
 LEAST_BATCHES = 20
 LEAST_DIFFERENCES = 100
@@ -34,7 +33,9 @@ Differences = Callable[[Evidence], tuple[Vector, npt.NDArray[np.int64]]]
 
 @dataclass(frozen=True)
 class Tolerance:
-    """A tolerance, what it is called, where it takes part, and the differences that it bounds."""
+    """Description of a tolerance: name, symbol, unit, test, limits, and the differences that it
+    bounds.
+    """
 
     name: str
     symbol: str
@@ -42,13 +43,15 @@ class Tolerance:
     unit: Literal["deg", "mag"]
     what: str
     test: str | None
-    """The switch in the mission's `tests` without which it takes no part."""
+    """Name of the switch in the mission's `tests` that activates the tolerance; None: always
+    active.
+    """
     in_caps: bool
     most: float
-    """The largest value that a mission may give it."""
+    """Largest value of the tolerance that a mission file accepts."""
     differences: Differences
     loses: str = "loses {share} of the true {what}"
-    """The consequence of a value that is too small."""
+    """Text for the consequence of a tolerance that is too small."""
 
 
 TOLERANCES: tuple[Tolerance, ...] = (
@@ -124,7 +127,7 @@ TOLERANCES: tuple[Tolerance, ...] = (
 
 @dataclass(frozen=True)
 class ToleranceFinding:
-    """The finding of the differences on one tolerance.
+    """Judgement of one tolerance from the differences of true pairs.
 
     `needed` is the value that lets KEPT of the true pairs pass; `beyond` is the
     share that the present value loses.  Both are None without data.
@@ -144,7 +147,7 @@ class ToleranceFinding:
 
 
 def tolerance_findings(mission: Mission, evidence: Evidence) -> list[ToleranceFinding]:
-    """A finding for each tolerance that the mission's kind of zone knows."""
+    """Judge every tolerance that applies to the mission's kind of zone."""
     in_band = isinstance(mission.zone, Band)
     return [
         _finding(tolerance, mission, evidence, in_band)
@@ -208,7 +211,7 @@ def _confidence(verdict: ToleranceVerdict, needed: Interval | None) -> Confidenc
 
 
 def rounded_up(value: float, digits: int = 2) -> float:
-    """The value to two significant digits, not below it: what a person would write in a file."""
+    """Round a value up to two significant digits, for a mission file."""
     if value <= 0.0:
         return 0.0
     step = 10.0 ** (math.floor(math.log10(value)) - digits + 1)

@@ -1,4 +1,4 @@
-"""How well each tracker measures: its noise, its magnitudes, and how it stands to the others."""
+"""Noise, magnitudes and mutual alignment of trackers, judged from identified stars."""
 
 import math
 from dataclasses import dataclass
@@ -17,18 +17,20 @@ LEAST_STARS = 50
 CERTAIN_CHI2 = 16.266
 """The 99.9 % point of chi-square with three degrees of freedom."""
 CLOSE = 0.2
-"""A sigma that is right within a fifth needs no change."""
+"""Relative error of a sigma that is tolerated without recommending a change."""
 CERTAIN = 0.999
-"""The confidence of the intervals that show a change of noise: several stretches are tested."""
+"""Confidence of the intervals that show a change of noise; high, because several changes are
+tested.
+"""
 SCAN_SIGMAS = 4.5
-"""About one in five hundred samples of 200 batches of constant noise has a stretch above it."""
+"""Threshold in sigmas for a noisier period; constant noise passes in 1 of 500 samples of 200."""
 
 SizeVerdict = Literal["too_small", "fits", "too_large", "no_verdict"]
 
 
 @dataclass(frozen=True)
 class NoisePeriod:
-    """A tracker's noise over consecutive batches, from the first of them to the last."""
+    """Noise of a tracker over consecutive batches, with the times of the first and the last."""
 
     sigma_arcsec: Interval
     batches: int
@@ -38,11 +40,12 @@ class NoisePeriod:
 
 @dataclass(frozen=True)
 class NoiseFinding:
-    """A tracker's noise: one standard deviation per tangent axis, beside the mission's.
+    """Measured noise of a tracker, one standard deviation per tangent axis, beside the mission's
+    sigma.
 
-    Where it changed, all this is of the latest batches alone, from `since` on;
-    `before_arcsec` is the noise of those before, else None.  `worst` is a period
-    in which it was certainly larger, and to which none of the others belong.
+    If the noise changed, the values are of the latest batches alone, from `since` on, and
+    `before_arcsec` is the earlier noise, else None.  `worst` is a period of certainly larger noise,
+    whose batches are left out of the other values.
     """
 
     tracker: str
@@ -57,7 +60,8 @@ class NoiseFinding:
 
 @dataclass(frozen=True)
 class MagnitudeFinding:
-    """observed = catalog + offset + (scale - 1) (catalog - pivot), and the scatter about that.
+    """Fit of magnitudes, observed = catalog + offset + (scale - 1) (catalog - pivot), and the
+    scatter.
 
     The offset is that at the pivot, the median of the catalog magnitudes.  The
     scatter is one standard deviation.
@@ -76,7 +80,7 @@ class MagnitudeFinding:
 
 @dataclass(frozen=True)
 class AlignmentFinding:
-    """How a tracker is turned from where the mission has it, as seen by another one.
+    """Rotation of a tracker from its alignment in the mission file, relative to another tracker.
 
     The rotation vector is in body axes; `axes_body` are the tracker's axes
     turned by it, where it is certainly not zero.
@@ -91,15 +95,13 @@ class AlignmentFinding:
 
 
 def noise_findings(mission: Mission, evidence: Evidence) -> list[NoiseFinding]:
-    """The noise of each tracker, from how well its own stars agree with one attitude.
+    """Judge the noise of each tracker from the fit of its own stars to one attitude.
 
-    TASTE over the square of the true noise is chi-square with 2N - 3 degrees of
-    freedom, so that TASTE over the median of that distribution has the square of
-    the noise, in units of the sigmas, for its own median, batch by batch.  The
-    median over batches does not mind a few bad ones.  For the same reason it does
-    not show a tracker that began to fail: the latest batches are held against
-    those before, and speak for the tracker where they differ.  A period of more noise that
-    ended before them is found as well: an alarm asks about it.
+    TASTE over the square of the true noise is chi-square with 2N - 3 degrees of freedom.  So the
+    median of TASTE over the median of that distribution is the square of the noise, in units of the
+    sigmas.  The median over batches resists a few bad ones, and so hides a tracker that began to
+    fail: the latest batches are compared with earlier ones, and are used alone where they differ.
+    An earlier period of more noise is found as well, since an alarm may refer to it.
     """
     return [_noise(tracker, index, evidence) for index, tracker in enumerate(mission.trackers)]
 
@@ -114,7 +116,7 @@ def _noise(tracker: Tracker, index: int, evidence: Evidence) -> NoiseFinding:
     others = np.arange(len(squared))
     if worst is not None and worst.start >= LEAST_BATCHES:
         if worst.stop <= len(squared) - LEAST_BATCHES // 2:
-            # It ended.  With it in the median, those before or after it would seem of other noise.
+            # The disturbance is over; left in the median it would bias the other periods.
             others = np.delete(others, worst)
         else:
             worst = None
@@ -140,10 +142,11 @@ def _noise_period(
 
 
 def _worst_in_a_row(squared: vectors.Vector) -> slice | None:
-    """The batches in a row that most certainly show more noise than all others; None if none do.
+    """Run of consecutive batches with significantly more noise than the rest; None if there is
+    none.
 
-    Of every stretch the sum of its ranks is compared with what chance gives (Mann & Whitney);
-    the search is that of circular binary segmentation (Olshen et al. 2004) in one step.
+    The rank sum of each run is compared with its expectation (Mann & Whitney); the search is one
+    step of circular binary segmentation (Olshen et al. 2004).
     """
     from scipy.stats import rankdata
 
@@ -165,16 +168,17 @@ def _worst_in_a_row(squared: vectors.Vector) -> slice | None:
 
 def _sigma(squared: vectors.Vector, tracker: Tracker) -> Interval:
     ratio = median(squared)
-    # Of fewer than six values the median is not bounded, below not by zero either.
+    # The median of fewer than six values has no bounds; the lower one may even be negative.
     bounds = (max(each, 0.0) for each in (ratio.value, ratio.low, ratio.high))
     return Interval(*map(math.sqrt, bounds)).scaled(tracker.sigma_arcsec)
 
 
 def _latest_with_own_noise(squared: vectors.Vector) -> int:
-    """How many of the latest batches show another noise than those before; all if none do.
+    """Number of latest batches whose noise differs from the earlier ones; all batches if none
+    differs.
 
-    The fewest that do so with certainty: of a noise that grows all the time they
-    are nearest to what it is now.
+    The smallest number with a certain difference is taken: with steadily growing noise it is
+    nearest to the present value.
     """
     count = len(squared)
     latest = LEAST_BATCHES
@@ -189,7 +193,7 @@ def _latest_with_own_noise(squared: vectors.Vector) -> int:
 
 
 def _squared_noise(fits: list[TrackerAttitude]) -> vectors.Vector:
-    """One estimate a fit of the squared noise, in units of the stars' sigmas."""
+    """Estimate of the squared noise from each fit, in units of the squared star sigmas."""
     from scipy.stats import chi2
 
     freedom = np.array([fit.degrees_of_freedom for fit in fits])
@@ -197,7 +201,7 @@ def _squared_noise(fits: list[TrackerAttitude]) -> vectors.Vector:
 
 
 def _size_verdict(now: float, found: Interval) -> SizeVerdict:
-    """The verdict on a sigma: certainly, and by more than CLOSE, below or above what was found."""
+    """Judge a sigma as too small or too large, if certainly so by more than the fraction CLOSE."""
     if found.low > now and found.value > (1.0 + CLOSE) * now:
         return "too_small"
     if found.high < now and found.value < (1.0 - CLOSE) * now:
@@ -206,7 +210,7 @@ def _size_verdict(now: float, found: Interval) -> SizeVerdict:
 
 
 def magnitude_findings(mission: Mission, evidence: Evidence) -> list[MagnitudeFinding]:
-    """Offset, scale and scatter of each tracker's magnitudes, by a robust line."""
+    """Offset, scale and scatter of each tracker's magnitudes, from a robust line fit."""
     return [
         _magnitudes(tracker, index, evidence.stars)
         for index, tracker in enumerate(mission.trackers)
@@ -255,7 +259,9 @@ def _magnitudes(tracker: Tracker, index: int, stars: StarEvidence) -> MagnitudeF
 
 
 def alignment_findings(mission: Mission, evidence: Evidence) -> list[AlignmentFinding]:
-    """How each further tracker stands to the mission's first, over batches in which both solve."""
+    """Rotation of each further tracker relative to the first, over batches where both have an
+    attitude.
+    """
     first, *others = mission.trackers
     by_batch = {fit.batch: fit for fit in evidence.fits if fit.tracker == 0}
     return [
@@ -275,10 +281,10 @@ def alignment_findings(mission: Mission, evidence: Evidence) -> list[AlignmentFi
 def _alignment(
     first: Tracker, tracker: Tracker, both: list[tuple[TrackerAttitude, TrackerAttitude]]
 ) -> AlignmentFinding:
-    """The rotation e of tracker B's attitude from A's, A_B = exp(-[e x]) A_A, weighed by both.
+    """Weighted mean rotation e of tracker B's attitude from A's, A_B = exp(-[e x]) A_A.
 
-    A tracker whose axes lie turned by e from the mission's gives, through the
-    mission's alignment, an attitude that is off by just that.
+    A tracker whose axes are rotated by e from the mission's alignment yields, through that
+    alignment, an attitude with the error e.
     """
     if len(both) < LEAST_BATCHES:
         return AlignmentFinding(tracker.name, first.name, None, len(both), "no_verdict", None)

@@ -1,4 +1,4 @@
-"""Alarms: limits held against quantities, and what operators do about values out of them."""
+"""Alarms: limits on monitored quantities, and the operators' responses to violations."""
 
 from service.feature import Feature
 

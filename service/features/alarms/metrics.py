@@ -1,4 +1,4 @@
-"""The metric of alarms: those of live batches that are not cleared."""
+"""Prometheus metric for the number of alarms of live batches that are not cleared."""
 
 import collections
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -16,12 +16,12 @@ ALARM_STATES = ("open", "acknowledged", "shelved")
 
 
 def reads(app: App) -> Mapping[str, Callable[[], Any]]:
-    """The active alarms, which the database has."""
+    """Database query for the active alarms, read before metrics are collected."""
     return {"alarms": app.part(Alarms).active}
 
 
 def collect(app: App, found: Mapping[str, Any]) -> Iterator[Metric]:
-    """The number of alarms of each spacecraft by severity and state."""
+    """Metric with the number of active alarms by spacecraft, severity and state."""
     if "alarms" in found:
         yield _of_alarms(app, found["alarms"])
 

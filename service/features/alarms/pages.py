@@ -1,4 +1,4 @@
-"""The pages of alarms: lists, one with its history, and a spacecraft's limits."""
+"""Console pages for alarms: list, single alarm with history, limits of a spacecraft."""
 
 import math
 from collections.abc import Callable
@@ -44,7 +44,7 @@ STATES: dict[State, str] = {
 Order = Literal["last", "severity", "spacecraft", "quantity", "times", "duration", "raised"]
 Grouping = Literal["", "time", "quantity", "spacecraft"]
 NAMES = ("spacecraft", "quantity")
-"""Orders that begin with A; all others begin with the latest or the greatest."""
+"""Sort orders that start at A; all others start with the latest or the greatest."""
 GROUPINGS: dict[Grouping, str] = {
     "": "not grouped",
     "time": "left limits together",
@@ -52,14 +52,14 @@ GROUPINGS: dict[Grouping, str] = {
     "spacecraft": "one spacecraft",
 }
 BEFORE_S, AFTER_S = 1800.0, 1800.0
-"""Around the time at which an alarm was raised: what its links and its trend show."""
+"""Seconds before and after the raise of an alarm that links from its page cover."""
 TREND_BEFORE_S = 4 * 3600.0
 TOGETHER_S = 1800.0
-"""Alarms that left their limits within this time are likely to have one cause."""
+"""Seconds within which alarms that leave their limits are assumed to share a cause."""
 
 
 class AlarmsQuery(SortedQuery):
-    """Which alarms, in which order; an empty field of the form stands for any value."""
+    """Query of the alarm list: filters, sort order, grouping; an empty form field matches all."""
 
     state: State = "active"
     spacecraft: Key | Literal[""] = ""
@@ -71,24 +71,24 @@ class AlarmsQuery(SortedQuery):
 
 @dataclass(frozen=True)
 class AlarmLine:
-    """An alarm with the times at which it was out of its limits, in telemetry time."""
+    """An alarm with the intervals of telemetry time in which its quantity was out of limits."""
 
     alarm: Alarm
     times: list[TimeOut]
 
     @property
     def last(self) -> TimeOut:
-        """The latest of them; without an end, it is out now."""
+        """Latest interval out of limits; without an end if still out of limits."""
         return self.times[-1]
 
     @property
     def last_ns(self) -> int:
-        """When the latest of them began, on the clock of TAI."""
+        """Start of the latest interval out of limits, in TAI nanoseconds."""
         return recorded_utc(self.last[0]).tai_ns
 
     @property
     def duration_s(self) -> float:
-        """How long they last together; the present one lasts until the latest value."""
+        """Total seconds out of limits; an unfinished interval ends at the latest value."""
         ends = [recorded_utc(end or self.alarm.latest.time).tai_ns for _, end in self.times]
         starts = [recorded_utc(start).tai_ns for start, _ in self.times]
         return max(0, sum(ends) - sum(starts)) * 1e-9
@@ -96,7 +96,7 @@ class AlarmLine:
 
 @dataclass(frozen=True)
 class AlarmGroup:
-    """Alarms with something in common; without a grouping there is one, without a title."""
+    """Alarms with the same time, quantity or spacecraft; all of them if no grouping is chosen."""
 
     title: str
     lines: list[AlarmLine]
@@ -104,7 +104,7 @@ class AlarmGroup:
 
 @console_page("/alarms", "Alarms", Policy("read", "nothing"), position=20)
 def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
-    """The alarms of a run, those that left their limits last first."""
+    """Console page with the alarms of a run, the latest violation first."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
     elif context.caller.spacecraft is not None:
@@ -131,7 +131,7 @@ def alarms_page(query: FromQuery[AlarmsQuery], context: ContextDep) -> Response:
 
 
 def _found(context: PageContext, query: AlarmsQuery) -> tuple[list[Alarm], str | None]:
-    """The alarms that match: every one that is not cleared, or a page of the history."""
+    """Alarms that match a query: all that are not cleared, or one page of the history."""
     next_cursor = None
     if query.state in ("cleared", "all"):
         page = context.app.part(Alarms).page(
@@ -163,7 +163,7 @@ def _matches(alarm: Alarm, query: AlarmsQuery) -> bool:
 
 
 def _sorted(lines: list[AlarmLine], query: AlarmsQuery) -> list[AlarmLine]:
-    """The alarms in the asked order; of equals, those that left their limits last come first."""
+    """Alarms in the requested sort order; ties begin with the latest violation."""
     keys: dict[Order, Callable[[AlarmLine], Any]] = {
         "last": lambda line: (line.last[1] is None, line.last_ns),
         "severity": lambda line: present_rank(line.alarm),
@@ -179,7 +179,7 @@ def _sorted(lines: list[AlarmLine], query: AlarmsQuery) -> list[AlarmLine]:
 
 
 def _grouped(lines: list[AlarmLine], grouping: Grouping) -> list[AlarmGroup]:
-    """The groups in the order of their first lines."""
+    """Group sorted alarms; groups are in the order of their first alarms."""
     groups: dict[Any, list[AlarmLine]] = {}
     if grouping == "time":
         # Each group is what left its limits within `TOGETHER_S` after its first.
@@ -205,14 +205,14 @@ def _grouped(lines: list[AlarmLine], grouping: Grouping) -> list[AlarmGroup]:
 
 
 class AlarmQuery(Query):
-    """The run in the address of the page is that of the alarm."""
+    """Query of the page for one alarm; `run` is ignored, since an alarm has a run."""
 
     run: str | None = None
 
 
 @console_page("/alarms/{id}", "Alarm", Policy("read", "nothing"), section="/alarms")
 def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Response:
-    """One alarm: how it was raised, its usual cause, and what operators did about it."""
+    """Console page for one alarm: its raise, its usual cause, and the actions of operators."""
     alarm = context.app.part(Alarms).get(id)
     if not context.caller.may_see(alarm.spacecraft):
         # As if it did not exist: probing for ids of others must tell nothing.
@@ -238,13 +238,15 @@ def alarm_page(id: str, query: FromQuery[AlarmQuery], context: ContextDep) -> Re
 
 
 def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
-    """True if the alarm is about a tracker that has a history of its own."""
+    """True if the alarm is about a tracker with recorded history."""
     known = alarm.spacecraft in context.app.context.known
     return known and alarm.tracker in context.app.context.trackers(alarm.spacecraft)
 
 
 def _end(alarm: Alarm) -> Utc:
-    """Some time after the alarm was raised, or its latest batch, whichever is later."""
+    """End of the period shown for an alarm: some time after its raise, or its latest batch if
+    later.
+    """
     after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
     # The latest batch belongs to the period, the end of which does not.
     latest = second_after(alarm.latest.time)
@@ -252,7 +254,7 @@ def _end(alarm: Alarm) -> Utc:
 
 
 def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
-    """Active alarms that may have the same cause.
+    """Active alarms that may share a cause with another alarm.
 
     The same quantity of other spacecraft, and other quantities of this one that
     left their limits at about the same time.
@@ -272,7 +274,7 @@ def _related(context: PageContext, alarm: AlarmWithActions) -> list[Alarm]:
 
 @dataclass(frozen=True)
 class AlarmTrend:
-    """The chart of an alarm's quantity before and since the raise."""
+    """Chart of an alarm's quantity, from before its raise until its latest value."""
 
     start: Utc
     end: Utc
@@ -282,7 +284,7 @@ class AlarmTrend:
 
 
 def _trend(context: PageContext, alarm: AlarmWithActions) -> AlarmTrend | None:
-    """The quantity before and since the raise; None without a history."""
+    """Chart of an alarm's quantity about its raise; None for a quantity without history."""
     if alarm.quantity not in trend_names() or alarm.spacecraft not in context.app.context.known:
         return None
     if alarm.tracker is not None and not _has_tracker(context, alarm):
@@ -307,14 +309,16 @@ PREVIEW_DAYS = (1, 7, 30)
 
 
 class LimitsQuery(PageQuery):
-    """Whose limits: those of the spacecraft as a whole, or of one of its trackers."""
+    """Query of the limits page: limits of the whole spacecraft, or of one tracker."""
 
     tracker: Key | None = None
 
 
 @console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
 def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -> Response:
-    """The bounds of every quantity, which can be previewed and changed, with their history."""
+    """Console page with the limits of every quantity, to preview and change them, with their
+    history.
+    """
     app, tracker = context.app, query.tracker
     limits = app.part(Alarms).limits.all(name, tracker)
     return context.rendered(

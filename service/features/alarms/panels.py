@@ -1,4 +1,4 @@
-"""Limits and times out of limits on the charts of a spacecraft."""
+"""Limits and violations drawn on the charts of a spacecraft."""
 
 from collections.abc import Iterator
 
@@ -13,9 +13,9 @@ from service.web.console.pages.spacecraft import DrawnLimits, ShownPeriod
 def limits_of_charts(
     context: PageContext, name: str, run: str, tracker: str | None, shown: ShownPeriod | None
 ) -> Iterator[DrawnLimits]:
-    """The limits of a spacecraft or a tracker, and when alarms were out of them.
+    """Limits of a spacecraft or tracker, and intervals in which alarms were out of limits.
 
-    With a tracker, alarms of its own and those of all trackers.
+    For a tracker, its own alarms and alarms of all trackers are included.
     """
     alarms, limited = context.app.part(Alarms), limited_trackers(context.app.context.known[name])
     limits = alarms.limits.all(name, tracker if tracker in limited else None)

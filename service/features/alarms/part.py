@@ -1,4 +1,4 @@
-"""Limits, alarms and what operators do about them."""
+"""Service for limits, alarms and the operators' actions on alarms."""
 
 from collections.abc import Callable, Sequence
 from typing import cast
@@ -32,9 +32,9 @@ from service.trends.quantities import (
 
 
 class Alarms:
-    """Reads alarms and changes their state.  `entry` goes to the audit list with a change.
+    """Reads alarms and changes their state.  `entry` is the audit entry written with a change.
 
-    `limits` are those that raise them.
+    `limits` manages the limits that raise alarms.
     """
 
     def __init__(self, context: Context) -> None:
@@ -53,7 +53,7 @@ class Alarms:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Alarm]:
-        """Alarms, newest first; the run `*` stands for every run."""
+        """One page of alarms, newest first; the run `*` selects all runs."""
         with self._context.reading() as connection:
             return list_alarms(
                 connection,
@@ -66,34 +66,40 @@ class Alarms:
             )
 
     def active(self, run: str = LIVE) -> list[Alarm]:
-        """Every alarm of a run that is not cleared, the one that is worst now first."""
+        """Alarms of a run that are not cleared, sorted by present severity, the worst first."""
         with self._context.reading() as connection:
             return state.active_alarms(connection, run, utc_now().text)
 
     def of_period(self, spacecraft: str, run: str, start: Utc, end: Utc) -> list[records.AlarmSpan]:
-        """When alarms of a spacecraft were out of their limits; see `alarm_spans`."""
+        """Intervals in which alarms of a spacecraft were out of limits; see `alarm_spans`."""
         with self._context.reading() as connection:
             return alarm_spans(connection, run, spacecraft, start, end)
 
     def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
-        """When each alarm was out of its limits; see `state.times_out`."""
+        """For each alarm, the intervals in which its value was out of limits; see
+        `state.times_out`.
+        """
         with self._context.reading() as connection:
             return times_out(connection, found)
 
     def get(self, id: str) -> records.AlarmWithActions:
-        """One alarm with its history."""
+        """An alarm with the actions recorded for it."""
         with self._context.reading() as connection:
             return state.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
 
     def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
-        """True if no mission file has the spacecraft, or the tracker with limits of its own."""
+        """True if no loaded mission has the spacecraft, or the tracker as one with limits of its
+        own.
+        """
         mission = self._context.missions.get(spacecraft)
         return mission is None or bool(tracker and tracker not in limited_trackers(mission))
 
     def acknowledge(
         self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
     ) -> records.AlarmWithActions:
-        """Acknowledge an alarm; with the quantity back in limits, or retired, it is cleared."""
+        """Acknowledge an alarm; an alarm back in limits, or of a retired subject, is cleared as
+        well.
+        """
         moment = utc_now().text
         return self._act(
             id,
@@ -117,7 +123,7 @@ class Alarms:
         comment: str | None = None,
         entry: Entry | None = None,
     ) -> records.AlarmWithActions:
-        """Shelve an alarm for some minutes."""
+        """Hide an alarm for a number of minutes (shelving)."""
         now = utc_now()
         until = shifted(now, 60.0 * minutes).text
         return self._act(
@@ -138,11 +144,11 @@ class Alarms:
     def comment(
         self, id: str, who: str, comment: str, entry: Entry | None = None
     ) -> records.AlarmWithActions:
-        """Comment on an alarm, cleared ones included."""
+        """Add a comment to an alarm, also to a cleared one."""
         return self._act(id, lambda _: ({}, ["commented"]), who, comment, utc_now().text, entry)
 
     def evaluate_by_clock(self) -> bool:
-        """Raise alarms of silent spacecraft and end expired shelving; whether there was any."""
+        """Raise alarms of silent spacecraft and end expired shelving; True if any was due."""
         moment = utc_now()
         with self._context.reading() as connection:
             due = is_due_by_clock(connection, self._context.missions, moment)
@@ -171,7 +177,7 @@ class Alarms:
 
 PREVIEW_DAYS = 7
 MOST_PREVIEWED = 50_000
-"""Batches of one preview: to read them takes about a second."""
+"""Greatest number of batches in one preview of a limit; reading them takes about a second."""
 MOST_EXCURSIONS = 50
 
 
@@ -182,7 +188,7 @@ class Limits:
         self._context = context
 
     def all(self, name: str, tracker: str | None = None) -> list[Limit]:
-        """The limit of every quantity of a spacecraft, or of one of its trackers."""
+        """Limits of all quantities of a spacecraft, or of one of its trackers."""
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker)
         with self._context.reading() as connection:
@@ -191,7 +197,7 @@ class Limits:
     def get(
         self, name: str, quantity: QuantityName, tracker: str | None = None
     ) -> records.LimitHistory:
-        """The limit of one quantity, the shipped limit, and the history of changes."""
+        """Limit of one quantity, with its shipped default and the history of changes."""
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
         with self._context.reading() as connection:
@@ -208,9 +214,9 @@ class Limits:
         entry: Entry | None = None,
         tracker: str | None = None,
     ) -> Limit:
-        """Set a limit, which holds from the next batch on; None restores the shipped one.
+        """Set a limit, in force from the next batch on; None restores the shipped default.
 
-        `entry` goes to the audit list with the change.
+        `entry` is the audit entry written with the change.
         """
         mission, moment = mission_named(self._context.missions, name), utc_now().text
         own = _checked_tracker(mission, tracker, quantity)
@@ -238,10 +244,10 @@ class Limits:
         days: int = PREVIEW_DAYS,
         tracker: str | None = None,
     ) -> records.LimitPreview:
-        """How a limit and the one in force evaluate the days up to the run's latest batch.
+        """Compare a proposed limit with the one in force over recorded batches of the latest days.
 
-        Of more than `MOST_PREVIEWED` batches it takes the latest ones.  They are evaluated in the
-        order of their time, whenever they came.
+        The period ends at the latest batch of the run; at most `MOST_PREVIEWED` batches are
+        evaluated, the latest ones, in order of batch time rather than arrival.
         """
         mission = self._context.mission(name)
         own = _checked_tracker(mission, tracker, quantity)
@@ -287,7 +293,7 @@ class Limits:
 def _trial(
     found: Preview, tried: LimitSettings, moment: Callable[[int], str]
 ) -> records.LimitTrial:
-    """A preview as the interface shows it; `moment` gives the text of a time in TAI ns."""
+    """Convert the preview of a limit to an API record; `moment` formats TAI nanoseconds."""
     return records.LimitTrial(
         settings=tried.model_dump(mode="json"),
         evaluated=found.evaluated,
@@ -311,9 +317,10 @@ def _trial(
 def _checked_tracker(
     mission: Mission, tracker: str | None, quantity: QuantityName | None = None
 ) -> str:
-    """The tracker whose limits are meant; empty for those of the spacecraft.
+    """Check the tracker whose limits are asked; empty for limits of the whole spacecraft.
 
-    Raises `BadInput` for one that has none of its own, and for a quantity that no tracker has.
+    Raises `BadInput` for a tracker without limits of its own, and for a quantity that trackers do
+    not have.
     """
     if tracker is None:
         return ""
@@ -328,5 +335,5 @@ def _checked_tracker(
 
 
 def open_part(app: App) -> Alarms:
-    """Alarms and limits of an open app."""
+    """Create the service for alarms and limits of an open app."""
     return Alarms(app.context)

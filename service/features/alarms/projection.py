@@ -1,8 +1,8 @@
-"""Alarms: limits evaluated against batches in the order of the record, and by the clock.
+"""Evaluation of limits: against batches in the order of recording, and against the clock.
 
-The evaluation is part of the transaction that moves the projector on: after a crash either
-both are stored or neither.  The row in `watches` is locked, so that several
-processes evaluate one after the other.
+The evaluation is part of the transaction that advances the projector: after a crash either both are
+stored or neither.  The row in `watches` is locked, so that several processes evaluate one after the
+other.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,12 +39,12 @@ _SAVE = prepared(
 
 
 def wants(connection: Connection, run: str) -> bool:
-    """True if the limits of a run are evaluated."""
+    """True if limits are evaluated for the batches of a run."""
     return bool(runs_with_alarms(connection, {run}))
 
 
 def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
-    """Evaluate the limits against new batches of the live run and of runs with alarms."""
+    """Evaluate limits against newly recorded batches of the live run and other runs with alarms."""
     groups: dict[tuple[str, str], list[RecordedResult]] = {}
     for each in new:
         if each.is_first and not each.is_ahead:
@@ -56,7 +56,7 @@ def apply(connection: Connection, new: Sequence[RecordedResult]) -> None:
 
 
 class LimitEvaluator:
-    """Evaluates new batches of one spacecraft in one run; its row in `watches` is locked."""
+    """Evaluates limits against new batches of a spacecraft and run; locks its row in `watches`."""
 
     def __init__(
         self, connection: Connection, spacecraft: str, run: str, new: Sequence[RecordedResult]
@@ -83,7 +83,7 @@ class LimitEvaluator:
         self._active = ActiveAlarms(connection, spacecraft, run)
 
     def evaluate(self) -> None:
-        """Evaluate every batch in the order of the record and save the state of the windows."""
+        """Evaluate all new batches in the order of recording, and save the sample windows."""
         due = self._due()
         row, newest = self._row, None
         latest_ns, received = row["time_ns"], row["received"]
@@ -116,9 +116,8 @@ class LimitEvaluator:
     def _check_silence(self, gap_s: float, latest: BatchRef, now: str) -> None:
         """Raise an alarm for the silence before a batch, and end it with the batch.
 
-        The gap is measured by the clock for live batches, elsewhere by the
-        batches' own times.  `latest` is the latest batch: this one, unless it
-        comes late.
+        The gap is measured by the clock for live batches, in other runs by the times of the
+        batches.  `latest` is the latest batch: the new one, unless it comes late.
         """
         limits = self._limits[SILENCE]
         low_s, high_s = limits.inner_bounds
@@ -131,11 +130,11 @@ class LimitEvaluator:
             self._active.observe(SILENCE, None, limits, Point(0.0, *latest), now)
 
     def _due(self) -> list[tuple[Subject, LimitSettings]]:
-        """The subjects that need an evaluation batch by batch; the others are done here.
+        """Subjects that need an evaluation batch by batch; all others are evaluated at once.
 
-        Most quantities are in limits all the time, and evaluating each batch by
-        itself takes as long as recording it.  An alarm that is back in limits
-        needs the latest value alone: of those before it nothing would be stored.
+        Most quantities stay in limits, and evaluating every batch by itself takes as long as
+        recording it.  An alarm that is back in limits needs only the latest value: nothing is
+        stored of earlier ones.
         """
         due = []
         for name, limits in self._limits.items():
@@ -158,26 +157,28 @@ class LimitEvaluator:
 
     @staticmethod
     def _samples(subject: Subject, new: Sequence[RecordedResult]) -> Iterator[Sample | None]:
-        """The contribution of each result to the value of a subject; None: nothing."""
+        """Contribution of each result to the value of a monitored subject; None if it has none."""
         sample_of = sampler(subject)
         for each in new:
             trackers = each.trackers and _by_tracker(each)
             yield sample_of(each.result, trackers or {})
 
     def _latest_in_window(self, subject: Subject, batch: Row, latest_ns: int) -> BatchRef:
-        """The latest batch of a subject's window: the one given, unless it comes late."""
+        """Latest batch in the sample window of a subject: the new batch, unless it comes late."""
         if batch["time_ns"] >= latest_ns:
             self._latest[subject] = batch["time_ns"], _reference(batch)
             return _reference(batch)
         known_ns, known = self._latest.get(subject, (None, None))
         if known is None or known_ns != latest_ns:
-            # It came before these batches, or has been pruned since.
+            # The latest batch was recorded before the new ones, or has been pruned since.
             known = self._recorded_at(latest_ns) or _reference(batch)
             self._latest[subject] = latest_ns, known
         return known
 
     def _recorded_at(self, time_ns: int) -> BatchRef | None:
-        """The last batch of a time that was recorded before the new ones; asked once."""
+        """Last batch with a given time that was recorded before the new batches; the answer is
+        cached.
+        """
         if time_ns not in self._earlier:
             query = (
                 select(batches.c.time, batches.c.id)
@@ -231,7 +232,7 @@ _MAX_SAVED = 64
 
 
 def _by_tracker(new: RecordedResult) -> Mapping[str, Row]:
-    """The values of each tracker of a result as those of a result of its own."""
+    """Values of each tracker in a result, as rows with the time of the result."""
     time_ns = {"time_ns": new.result["time_ns"]}
     return {row["tracker"]: row | time_ns for row in new.trackers}
 
@@ -246,13 +247,13 @@ def _reference(batch: Row) -> BatchRef:
 
 
 def silence_severity(limits: Mapping[Subject, LimitSettings], gap_s: float) -> Severity | None:
-    """The worst severity whose limit a gap between batches exceeds; None within limits."""
+    """Highest severity whose limit a gap between batches exceeds; None within limits."""
     exceeded = limits[SILENCE].severities_out(gap_s)
     return exceeded[-1] if exceeded else None
 
 
 def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> None:
-    """Raise the alarms of live spacecraft that are silent, and end shelving that has expired."""
+    """Raise alarms of live spacecraft that are silent, and end expired shelving."""
     for spacecraft in sorted(_silent(connection, missions, now)):
         row = _locked(connection, spacecraft, LIVE)
         if row is None:
@@ -272,14 +273,14 @@ def evaluate_by_clock(connection: Connection, missions: Mapping[str, Mission], n
 
 
 def is_due_by_clock(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> bool:
-    """True if `evaluate_by_clock` would change anything; it only reads."""
+    """True if an alarm of silence or an expired shelving is due; reads only."""
     if connection.execute(_expired(now).limit(1)).first() is not None:
         return True
     return bool(_silent(connection, missions, now))
 
 
 def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -> set[str]:
-    """The live spacecraft whose silence is worse than their alarm says so far."""
+    """Live spacecraft whose silence is more severe than their alarm states."""
     found = set()
     query = select(watches.c.spacecraft, watches.c.received).where(watches.c.run == LIVE)
     for row in connection.execute(query).mappings():
@@ -305,9 +306,10 @@ def _silent(connection: Connection, missions: Mapping[str, Mission], now: Utc) -
 
 
 def _last_received(connection: Connection, watch: Mapping[Any, Any], *before: Any) -> str:
-    """When the last live batch of a spacecraft came, by the record where that knows of a later one.
+    """Arrival time of the last live batch of a spacecraft, evaluated against limits or only
+    recorded.
 
-    Batches that came while the alarms were off are recorded, and were not evaluated.
+    Batches that arrived while alarms were off are recorded, but were not evaluated.
     """
     query = select(batches.c.received).join_from(
         results, batches, results.c.batch_id == batches.c.id
@@ -355,7 +357,7 @@ _VALUES = (
     "current_severity",
     "returned_at",
 )
-"""The columns that a new value can change without an action to note."""
+"""Columns of an alarm that a new value may change without a recorded action."""
 _UPDATE_VALUES = prepared(
     update(alarms)
     .where(alarms.c.id == bindparam("of_id"))
@@ -364,7 +366,9 @@ _UPDATE_VALUES = prepared(
 
 
 class ActiveAlarms:
-    """The alarms that are not cleared, by subject; their rows stay locked until the commit."""
+    """Alarms of a spacecraft and run that are not cleared, by subject; rows are locked until
+    commit.
+    """
 
     def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
         self._connection = connection
@@ -376,11 +380,11 @@ class ActiveAlarms:
         self._unsaved: set[Subject] = set()
 
     def has(self, subject: Subject) -> bool:
-        """True if a subject has an active alarm."""
+        """True if a monitored subject has an active alarm."""
         return subject in self._alarms
 
     def is_out(self, subject: Subject) -> bool:
-        """True if a subject has an active alarm and is out of limits."""
+        """True if a monitored subject has an active alarm and is out of limits."""
         return self.has(subject) and self._alarms[subject]["current_severity"] is not None
 
     def observe(
@@ -392,7 +396,9 @@ class ActiveAlarms:
         now: str,
         worst: Point | None = None,
     ) -> None:
-        """Apply a new value to the subject's alarm, or raise an alarm if it has none."""
+        """Apply a new value to the alarm of a subject; raise an alarm if there is none and it is
+        out of limits.
+        """
         alarm = self._alarms.get(subject)
         if alarm is None:
             if severity is not None:
@@ -419,7 +425,7 @@ class ActiveAlarms:
             del self._alarms[subject]
 
     def save(self) -> None:
-        """Write the latest values of the alarms that did not change otherwise."""
+        """Write the latest values of alarms that changed in nothing else."""
         if self._unsaved:
             found = [self._alarms[subject] for subject in sorted(self._unsaved)]
             rows = [

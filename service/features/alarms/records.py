@@ -1,4 +1,4 @@
-"""Limits with their history and preview, and alarms with the actions on them."""
+"""API records of limits, with their history and preview, and of alarms with their actions."""
 
 from typing import Annotated, Any, ClassVar
 
@@ -22,7 +22,7 @@ LimitList = list_record("LimitList", Limit, "The limits of a spacecraft.")
 
 
 class LimitHistory(Record, frozen=True, kw_only=True):
-    """One limit, the shipped limit, and the history of changes."""
+    """The limit of a quantity in force, its shipped default, and the history of changes."""
 
     limit: Limit
     default: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
@@ -30,7 +30,7 @@ class LimitHistory(Record, frozen=True, kw_only=True):
 
 
 class LimitExcursion(Record, frozen=True, kw_only=True):
-    """A time for which an alarm would have been out of limits."""
+    """A period in which an alarm would have been out of limits."""
 
     severity: Annotated[SeverityName, doc("The worst.")]
     start: Annotated[Moment, doc("Time of the batch that would have raised the alarm.")]
@@ -40,19 +40,19 @@ class LimitExcursion(Record, frozen=True, kw_only=True):
 
 
 class LimitTrial(Record, frozen=True, kw_only=True):
-    """How recorded batches are evaluated against a limit."""
+    """Evaluation of recorded batches against a limit."""
 
     settings: Annotated[dict[str, Any], DescribedAs(LimitSettings)]
     evaluated: int
-    """Batches at which there was a value: the mean over the latest minimum_count."""
+    """Number of evaluated values; each is the mean over the latest `minimum_count` batches."""
     beyond: dict[SeverityName, int]
-    """Values beyond the bounds of each severity, whatever hysteresis and duration are."""
+    """Number of values beyond the bounds of each severity, without hysteresis and duration."""
     alarms: Annotated[int, doc("How often the quantity would have left its limits.")]
     excursions: Annotated[list[LimitExcursion], doc("The latest of these, oldest first.")]
 
 
 class LimitPreview(Record, frozen=True, kw_only=True):
-    """A limit that is not set, and the one in force, over the same recorded batches."""
+    """Comparison of a proposed limit with the one in force, over the same recorded batches."""
 
     spacecraft: str
     run: str
@@ -70,7 +70,7 @@ AlarmPage = page_record("AlarmPage", Alarm, "A page of alarms.")
 
 
 class AlarmAction(Record, frozen=True, kw_only=True):
-    """A change of an alarm, by its value or by a person."""
+    """An entry in the history of an alarm, caused by a new value or by a user."""
 
     component: ClassVar[str] = "ActionOut"
     at: Stamp
@@ -83,14 +83,14 @@ class AlarmAction(Record, frozen=True, kw_only=True):
 
 
 class AlarmWithActions(Alarm, frozen=True, kw_only=True):
-    """An alarm with its history."""
+    """An alarm with the history of its actions."""
 
     component: ClassVar[str] = "AlarmRecord"
     actions: Annotated[list[AlarmAction], doc("Oldest first.")]
 
 
 class AlarmSpan(Struct, frozen=True, kw_only=True):
-    """A span of telemetry time in which an alarm was out of its limits, for a chart."""
+    """An interval of telemetry time in which an alarm was out of limits, for a chart."""
 
     id: Id
     quantity: QuantityName

@@ -1,4 +1,4 @@
-"""Routes of limits and of the alarms that they raise."""
+"""API routes of limits and alarms."""
 
 from typing import Annotated, ClassVar
 
@@ -37,7 +37,7 @@ AlarmId = Annotated[str, Path(description="The `id` of an alarm.")]
 
 
 class AlarmQuery(params.Query):
-    """Which alarms."""
+    """Query that selects alarms by run, spacecraft and state."""
 
     run: params.RunOrAll = "live"
     spacecraft: params.SpacecraftFilter = None
@@ -49,7 +49,7 @@ class AlarmQuery(params.Query):
 
 
 class LimitQuery(params.Query):
-    """Whose limits."""
+    """Query that selects the limits of a tracker instead of the whole spacecraft."""
 
     tracker: Annotated[
         Key | None,
@@ -61,7 +61,7 @@ class LimitQuery(params.Query):
 
 
 class LimitStatementQuery(params.StatementQuery, LimitQuery):
-    """Whose limits change, who changes them, and a comment on it."""
+    """Query for a change of a limit: the tracker, the author and a comment."""
 
 
 class _Statement(Wire):
@@ -70,20 +70,20 @@ class _Statement(Wire):
 
 
 class StatementIn(_Statement):
-    """The author of an action, and a comment."""
+    """The author of an action on an alarm, and a comment."""
 
     component: ClassVar[str] = "Said"
     model_config = ConfigDict(title=component)
 
 
 class ShelveIn(_Statement):
-    """How long to shelve an alarm."""
+    """Request body to shelve an alarm for a number of minutes."""
 
     minutes: Annotated[int, Field(ge=1, le=10_080, description="At most a week.")]
 
 
 class CommentIn(_Statement):
-    """A comment on an alarm."""
+    """Request body with a comment on an alarm."""
 
     comment: Annotated[
         str, Field(min_length=1, max_length=2_000), AfterValidator(params.without_nul)
@@ -91,19 +91,19 @@ class CommentIn(_Statement):
 
 
 class LimitTrialIn(Wire):
-    """A limit to try."""
+    """Request body with a limit to evaluate without setting it."""
 
     settings: LimitSettings
 
 
 class LimitPreviewQuery(LimitQuery, params.RunQuery):
-    """What a limit is tried on."""
+    """Query that selects the recorded batches for the preview of a limit."""
 
     days: Annotated[int, Field(ge=1, le=30, description="Up to the run's latest batch.")] = 7
 
 
 class LimitIn(_Statement):
-    """A new limit."""
+    """Request body with a new limit, its author and a comment."""
 
     settings: LimitSettings
 
@@ -146,7 +146,7 @@ def set_limit(
     app: AppDep,
     change: ChangeDep,
 ) -> Response:
-    """Set a limit; the previous one stays in the history."""
+    """Set the limit of a quantity; the previous one stays in the history."""
     asked = read_model(LimitIn, body)
     return json_response(_set(app, name, quantity, query.tracker, asked.settings, asked, change))
 
@@ -164,7 +164,7 @@ def preview_limit(
     body: JsonBody,
     app: AppDep,
 ) -> Response:
-    """Evaluate the latest days against a limit without setting it."""
+    """Evaluate recorded batches of the latest days against a limit without setting it."""
     asked = read_model(LimitTrialIn, body)
     limited = _quantity_with_limits(quantity)
     return json_response(
@@ -185,7 +185,7 @@ def reset_limit(
     app: AppDep,
     change: ChangeDep,
 ) -> Response:
-    """Restore the shipped limit; earlier limits stay in the history."""
+    """Restore the shipped limit of a quantity; earlier limits stay in the history."""
     return json_response(_set(app, name, quantity, query.tracker, None, query, change))
 
 
@@ -198,7 +198,7 @@ def _set(
     statement: LimitIn | LimitStatementQuery,
     change: ChangeDep,
 ) -> Limit:
-    """Set a limit, or without settings restore the shipped one."""
+    """Set the limit of a quantity, or restore the shipped one if `settings` is None."""
     limited, who = _quantity_with_limits(quantity), change.author(statement.who)
     return app.part(Alarms).limits.set(
         name,
@@ -223,7 +223,7 @@ def list_alarms(request: Request, query: FromQuery[AlarmQuery], app: AppDep) -> 
     "GET /alarms/{id}", Policy("read", "nothing"), Returns("The alarm.", records.AlarmWithActions)
 )
 def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
-    """One alarm with its history."""
+    """One alarm with the history of its actions."""
     return json_response(_visible_alarm(app, id, caller))
 
 
@@ -235,7 +235,7 @@ def get_alarm(id: AlarmId, app: AppDep, caller: CallerDep) -> Response:
     problems=(409,),
 )
 def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
-    """Acknowledge an alarm; it is cleared if the quantity is back in limits."""
+    """Acknowledge an alarm; an alarm back in limits is cleared."""
     asked = read_model(StatementIn, body)
     _visible_alarm(app, id, change.caller)
     who = change.author(asked.who)
@@ -250,7 +250,7 @@ def acknowledge_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDe
     problems=(409,),
 )
 def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
-    """Shelve an alarm for some minutes; it returns by itself."""
+    """Shelve an alarm for some minutes; shelving ends by itself."""
     asked = read_model(ShelveIn, body)
     _visible_alarm(app, id, change.caller)
     who = change.author(asked.who)
@@ -267,7 +267,7 @@ def shelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) ->
     problems=(409,),
 )
 def unshelve_alarm(id: AlarmId, body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
-    """Unshelve an alarm."""
+    """End the shelving of an alarm."""
     asked = read_model(StatementIn, body)
     _visible_alarm(app, id, change.caller)
     who = change.author(asked.who)
@@ -296,7 +296,7 @@ def _quantity_with_limits(quantity: str) -> QuantityName:
 
 
 def _visible_alarm(app: AppDep, id: str, caller: Caller) -> records.AlarmWithActions:
-    """An alarm of the caller's spacecraft; raises `NotFound` for those of others."""
+    """An alarm that the caller may see; raises `NotFound` for other callers' spacecraft."""
     found = app.part(Alarms).get(id)
     if not caller.may_see(found.spacecraft):
         raise NotFound(f"there is no alarm with the id {id[:80]!r}")

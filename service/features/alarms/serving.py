@@ -1,4 +1,4 @@
-"""Alarms that the clock raises, and shelving that ends, while the service serves."""
+"""Background task that raises alarms of silent spacecraft and ends expired shelving."""
 
 import asyncio
 import logging
@@ -19,12 +19,12 @@ EVERY_S = 1.0
 
 
 def check(settings: Settings) -> None:
-    """Alarms have no settings."""
+    """Do nothing: alarms have no settings to check."""
 
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Look every second for spacecraft that are silent, in the service that projects."""
+    """Check for silent spacecraft every second, in the process that runs the projector."""
     task = asyncio.create_task(_evaluate(app))
     try:
         yield

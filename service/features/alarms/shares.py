@@ -1,4 +1,4 @@
-"""Limits of quantities that are measured day by day, beside the batches."""
+"""Evaluation of limits on quantities that are measured once a day."""
 
 from sqlalchemy import Connection
 
@@ -11,11 +11,10 @@ from service.trends.limits import SampledDay
 
 
 def evaluate_day(connection: Connection, mission: Mission, day: SampledDay) -> None:
-    """Evaluate the limits of a quantity for a day that was recorded now.
+    """Evaluate the limits of a quantity against the samples of a newly recorded day.
 
-    Its samples are evaluated in the order of their time, as batches that arrive are: what
-    was out of limits within the day raises an alarm, and returns.  Of a later revision of the
-    day the state at its end counts alone.
+    Samples are evaluated in order of time, like arriving batches: an excursion within the day
+    raises an alarm that returns.  For a later revision of the day only the state at its end counts.
     """
     limits = limits_of(connection, mission)[day.quantity]
     samples, start = day.samples, day.start
@@ -25,7 +24,9 @@ def evaluate_day(connection: Connection, mission: Mission, day: SampledDay) -> N
     excursions = preview_of(samples, limits).excursions
 
     def at(time_ns: int, value: float | None = None) -> Point:
-        """The value at a time; by default the share over the latest until then."""
+        """Point at a time with a value; by default the mean over the latest samples up to that
+        time.
+        """
         if value is None:
             parts = [part for at_ns, part, _ in samples if at_ns <= time_ns]
             value = sum(parts[-limits.minimum_count :]) / limits.minimum_count

@@ -1,4 +1,4 @@
-"""Limits and alarms in the records.
+"""Stored limits and alarms: reading, listing and changing them in the database.
 
 Limits: those in force, and every one that was set before.  Alarms: lists, one with its history,
 what people do, and times out of limits.
@@ -41,7 +41,9 @@ _IN_FORCE = prepared(
 
 
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
-    """The limits in force for a spacecraft and its trackers: own ones in place of the shipped."""
+    """Limits in force for a spacecraft and its trackers: shipped defaults, replaced where others
+    are set.
+    """
     # Read with every batch; a process meets few missions.
     key = mission.digest, quantities.limited_names()
     shipped = _SHIPPED.get(key)
@@ -62,7 +64,7 @@ def _read(settings: str) -> LimitSettings:
 
 
 def list_limits(connection: Connection, mission: Mission, tracker: str = "") -> list[Limit]:
-    """The limit of every quantity, with its time and who set it; or every one of a tracker."""
+    """Limits of all quantities of a spacecraft or tracker, with their time and author."""
     rows = {
         row["quantity"]: row
         for row in _in_force(connection, mission.name)
@@ -77,7 +79,7 @@ def list_limits(connection: Connection, mission: Mission, tracker: str = "") -> 
 def limit_history(
     connection: Connection, mission: Mission, quantity: QuantityName, tracker: str = ""
 ) -> records.LimitHistory:
-    """The limit in force for a quantity, the shipped one, and every one set, newest first."""
+    """Limit in force for a quantity, its shipped default, and all earlier ones, newest first."""
     shipped = _inherited(connection, mission, tracker)[quantity]
     query = select(limits).where(*_place(mission, quantity, tracker)).order_by(limits.c.id.desc())
     rows = [dict(row) for row in connection.execute(query).mappings()]
@@ -97,7 +99,9 @@ def _place(mission: Mission, quantity: str, tracker: str) -> tuple[ColumnElement
 def _inherited(
     connection: Connection, mission: Mission, tracker: str
 ) -> Mapping[QuantityName, LimitSettings]:
-    """The limits that hold where none was set: the shipped ones, or a tracker's spacecraft's."""
+    """Limits that hold unless set: the shipped defaults, for a tracker the limits of its
+    spacecraft.
+    """
     shipped = quantities.default_limits(mission)
     if not tracker:
         return shipped
@@ -116,7 +120,9 @@ def set_limit(
     now: str,
     tracker: str = "",
 ) -> Limit:
-    """Set a limit from now on; None restores the shipped one.  The one before stays in history."""
+    """Set a limit from now on, None for the shipped default; the previous limit stays in the
+    history.
+    """
     before = *_place(mission, quantity, tracker), limits.c.until.is_(None)
     connection.execute(update(limits).where(*before).values(until=now))
     row = {
@@ -143,7 +149,7 @@ def shown_limit(
     row: Any | None,
     tracker: str = "",
 ) -> Limit:
-    """A limit as the interface shows it; without a row the shipped one."""
+    """Limit as an API record; without a database row the shipped default."""
     own = None if row is None else row["settings"]
     return Limit(
         spacecraft=spacecraft,
@@ -177,7 +183,7 @@ def list_alarms(
     cursor: str | None,
     now: str,
 ) -> Page[models.Alarm]:
-    """Alarms, the newest first; without a run those of every run."""
+    """One page of alarms in a state, newest first; of all runs if `run` is None."""
     chosen = _in_state(state, now)
     if run is not None:
         chosen.append(alarms.c.run == run)
@@ -195,7 +201,7 @@ def list_alarms(
 
 
 def active_alarms(connection: Connection, run: str, now: str) -> list[models.Alarm]:
-    """The alarms of a run that are not cleared, in the order of `present_rank`.
+    """Alarms of a run that are not cleared, sorted by `present_rank`, then newest first.
 
     Of equals the newest is first.
     """
@@ -205,7 +211,7 @@ def active_alarms(connection: Connection, run: str, now: str) -> list[models.Ala
 
 
 def read_alarm(connection: Connection, id: str, now: str) -> records.AlarmWithActions:
-    """An alarm with all that was noted of it, oldest first; raises `NotFound`."""
+    """An alarm with all its recorded actions, oldest first; raises `NotFound`."""
     alarm = _stored(connection, id)
     query = select(alarm_actions).where(alarm_actions.c.alarm_id == id).order_by(alarm_actions.c.id)
     shown = ("at", "action", "who", "comment", "severity", "value", "time")
@@ -225,7 +231,7 @@ def act(
     comment: str | None,
     now: str,
 ) -> records.AlarmWithActions:
-    """Apply a step of the state machine to an alarm, and note who did it and their comment."""
+    """Apply a transition of the state machine to an alarm, and record its author and comment."""
     alarm = _stored(connection, id, lock=True)
     changes, actions = step(alarm)
     change(connection, alarm, changes, actions, now, who=who, comment=comment)
@@ -242,7 +248,7 @@ def change(
     who: str | None = None,
     comment: str | None = None,
 ) -> Row:
-    """Change a stored alarm, record the actions and add an event; returns the changed alarm."""
+    """Update a stored alarm, record the actions and add an event; returns the changed alarm."""
     if changes:
         connection.execute(update(alarms).where(alarms.c.id == alarm["id"]).values(changes))
     alarm = {**alarm, **changes}
@@ -266,7 +272,7 @@ def change(
 
 
 def shown_alarm(alarm: Any, now: str) -> models.Alarm:
-    """A stored alarm as the interface shows it."""
+    """Convert a database row of an alarm to an API record."""
     return models.Alarm(**_fields(alarm, now))
 
 
@@ -333,18 +339,18 @@ def _in_state(state: StateFilter, now: str) -> list[ColumnElement[bool]]:
 
 
 MOST = 200
-"""Alarms of a period that are read, the newest: more could not be told apart on a chart."""
+"""Greatest number of alarms read for a period, the newest; more would be illegible on a chart."""
 _LEFT, _RETURNED = ("raised", "left_again"), "returned"
 TimeOut = tuple[str, str | None]
-"""A span from when to when; None: it still lasts."""
+"""Start and end of an interval as UTC texts; the end is None while the interval lasts."""
 
 
 def alarm_spans(
     connection: Connection, run: str, spacecraft: str, start: Utc, end: Utc
 ) -> list[records.AlarmSpan]:
-    """The spans of telemetry time in which alarms were out of their limits, oldest first.
+    """Intervals of telemetry time in which alarms were out of limits, oldest first.
 
-    Those that touch the period from `start` to before `end`, of the newest alarms.
+    Only intervals that touch the period from `start` up to `end` count, and only the newest alarms.
     """
     # Texts are in the order of time but for the length of their fractions.
     chosen = (
@@ -375,7 +381,7 @@ def alarm_spans(
 
 
 def times_out(connection: Connection, found: Sequence[models.Alarm]) -> list[list[TimeOut]]:
-    """Intervals in telemetry time in which each alarm's value was out of its limits."""
+    """For each alarm, the intervals of telemetry time in which its value was out of limits."""
     actions: dict[str, list[tuple[str, str | None]]] = {alarm.id: [] for alarm in found}
     noted = (
         select(alarm_actions.c.alarm_id, alarm_actions.c.action, alarm_actions.c.time)

@@ -1,4 +1,4 @@
-"""The states of an alarm: raised, latched, acknowledged, shelved, cleared.
+"""State machine of an alarm: raised, latched, acknowledged, shelved, cleared.
 
         out of limits                 acknowledged and back in limits
     ───────────────────► ACTIVE ─────────────────────────────────────► CLEARED
@@ -28,7 +28,7 @@ AlarmUpdate = tuple[Changes, list[AlarmActionName]]
 
 
 def state_of(alarm: AlarmColumns, now: str) -> AlarmState:
-    """The state of an alarm at a time; times are UTC texts of one form."""
+    """State of an alarm at a time; times are UTC texts of one format."""
     if alarm["cleared_at"] is not None:
         return "cleared"
     if alarm["shelved_until"] is not None and alarm["shelved_until"] > now:
@@ -39,7 +39,7 @@ def state_of(alarm: AlarmColumns, now: str) -> AlarmState:
 def raised(
     severity: Severity, limits: LimitSettings, point: Point, now: str, worst: Point | None = None
 ) -> AlarmUpdate:
-    """A new alarm; `worst` is the worst value since it went out of limits, if not this one."""
+    """Columns and actions of a new alarm; `worst` is the worst value since limits were left."""
     columns = {
         "severity": severity.word,
         "current_severity": severity.word,
@@ -67,9 +67,9 @@ def observed(
     now: str,
     worst: Point | None = None,
 ) -> AlarmUpdate:
-    """A new value for an active alarm: out of limits by a severity, or within them (None).
+    """Columns and actions for a new value of an active alarm; `severity` is None within limits.
 
-    `worst` is the worst value since it went out of them, if not this one.
+    `worst` is the worst value since limits were left, if that is not `point`.
     """
     was = _severity(alarm["current_severity"])
     changes: Changes = _at("latest", point)
@@ -97,9 +97,9 @@ def observed(
 def acknowledged(
     alarm: AlarmColumns, who: str, now: str, *, is_retired: bool = False
 ) -> AlarmUpdate:
-    """Acknowledged by `who`; raises `WrongState` if it was already, or is cleared.
+    """Acknowledge an alarm for `who`; raises `WrongState` if acknowledged before, or cleared.
 
-    The alarm of a retired subject, which gets no value any more, is cleared with it.
+    The alarm of a retired subject, which gets no more values, is cleared as well.
     """
     _require_active(alarm)
     if alarm["acknowledged_at"] is not None and not is_retired:
@@ -111,7 +111,7 @@ def acknowledged(
 
 
 def shelved(alarm: AlarmColumns, who: str, until: str, now: str) -> AlarmUpdate:
-    """Shelved until a time; shelving it again replaces that time."""
+    """Shelve an alarm until a time; shelving again replaces the time."""
     _require_active(alarm)
     return {"shelved_at": now, "shelved_by": who, "shelved_until": until}, ["shelved"]
 
@@ -125,7 +125,7 @@ def unshelved(alarm: AlarmColumns) -> AlarmUpdate:
 
 
 def expired(alarm: AlarmColumns, now: str) -> AlarmUpdate:
-    """No longer shelved, if that time is over; otherwise nothing changes."""
+    """End the shelving of an alarm if its time is over; otherwise change nothing."""
     over = alarm["cleared_at"] is None and (alarm["shelved_until"] or "~") <= now
     changes: Changes = {"shelved_at": None, "shelved_by": None, "shelved_until": None}
     return (changes, ["shelf_expired"]) if over else ({}, [])

@@ -1,4 +1,4 @@
-"""The tables of limits and alarms: what the service watches."""
+"""Database tables of limits, of their evaluation, and of alarms."""
 
 import sqlalchemy as sa
 
@@ -42,12 +42,12 @@ watches = sa.Table(
     metadata,
     sa.Column("spacecraft", Name, primary_key=True),
     sa.Column("run", RunName, primary_key=True),
-    # The latest batch looked at: its time, its id, and when it came.
+    # The latest evaluated batch: its time, its id, and its time of arrival.
     sa.Column("time", Moment, nullable=False),
     sa.Column("time_ns", sa.BigInteger, nullable=False),
     sa.Column("batch_id", Id, nullable=False),
     sa.Column("received", Moment, nullable=False),
-    # The latest batches' values, and since when each quantity is out of its limits.
+    # Values of the latest batches, and the time since when each quantity is out of limits.
     sa.Column("state", sa.Text, nullable=False),
     info={BOUND: "how far the evaluation of limits is"},
 )

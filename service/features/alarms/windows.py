@@ -1,8 +1,8 @@
-"""Values of a quantity over its latest batches, evaluated against limits.
+"""Sliding window over a quantity's values of the latest batches, evaluated against limits.
 
-The latest batches are those of the latest batch times, in whatever order they arrived:
-one that comes late is inserted in order of time, or left out if it is older.  A preview
-evaluates a series in the same way.
+The window is ordered by batch time, whatever the order of arrival: a late batch is inserted in its
+place, or left out if it is older than the window.  A preview evaluates a recorded series in the
+same way.
 """
 
 from bisect import insort
@@ -17,11 +17,13 @@ from service.trends.limits import LimitSettings, Sample, Severity
 from service.vectors import Vector
 
 SLACK = 1e-9
-"""A share of the largest part: far more than sums in another order differ by."""
+"""Tolerance for rounding, as a share of the largest summand, when sums in another order are
+compared.
+"""
 
 
 BatchRef = tuple[str, str | None]
-"""The time and the id of a batch."""
+"""Time and id of a batch."""
 
 
 class Point(NamedTuple):
@@ -34,9 +36,9 @@ class Point(NamedTuple):
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The value over the latest batches and its severity, None within limits.
+    """Mean value over the latest batches, with its severity; None within limits.
 
-    `worst` is the value furthest beyond the bounds of that severity since it left them.
+    `worst` is the value furthest beyond the bounds of the severity since they were left.
     """
 
     value: float
@@ -46,21 +48,21 @@ class Evaluated:
 
 @dataclass
 class SampleWindow:
-    """The latest values of a quantity, and since when they are out of which limit."""
+    """Latest samples of a quantity, and the time since when each limit is exceeded."""
 
     samples: list[Sample] = field(default_factory=list)
     since_ns: dict[Severity, int] = field(default_factory=dict)
     worst: dict[Severity, Point] = field(default_factory=dict)
-    """The value furthest beyond each limit that they are out of, since then."""
+    """For each exceeded severity, the value furthest beyond its bound since then."""
     _known_within: LimitSettings | None = field(default=None, compare=False, repr=False)
-    """The limits that every sample is known to be within by itself."""
+    """Limits that each single sample of the window is known to be within."""
 
     def add(
         self, sample: Sample, limits: LimitSettings, latest: BatchRef = ("", None)
     ) -> Evaluated | None:
-        """Add one batch's sample and evaluate the latest; None while there are too few.
+        """Add the sample of one batch and evaluate the window; None with too few samples.
 
-        `latest` names the batch of the latest time, this one included.
+        `latest` names the batch with the latest time, the new one included.
         """
         self._known_within = None
         insort(self.samples, sample)
@@ -72,17 +74,17 @@ class SampleWindow:
         return Evaluated(value, severity, None if severity is None else self.worst[severity])
 
     def value(self, limits: LimitSettings) -> float | None:
-        """The value over the latest samples; None while there are too few."""
+        """Mean value over the samples of the window; None with too few samples."""
         if len(self.samples) < limits.minimum_count:
             return None
         _, parts, wholes = zip(*self.samples, strict=True)
         return float(sum(parts) / sum(wholes))
 
     def add_if_within(self, samples: Sequence[Sample], limits: LimitSettings) -> bool:
-        """Add many samples at once, if none of them could change the severity.
+        """Add several samples at once, provided that none of them could change the severity.
 
-        True: `add` for one after the other would be within limits each time, as the
-        window was before.  False: nothing is added, and they must be added one by one.
+        True: adding the samples one by one with `add` would give values within limits every time,
+        as before.  False: nothing is added, and the samples must be added one by one.
         """
         if self.since_ns:
             return False
@@ -106,7 +108,7 @@ class SampleWindow:
         return within
 
     def severity_at(self, point: Point, time_ns: int, limits: LimitSettings) -> Severity | None:
-        """The worst severity whose bounds the value has been out of for `duration_s`."""
+        """Highest severity whose bounds have been exceeded for at least `duration_s`."""
         worst = None
         for severity in Severity if self.since_ns else limits.severities_out(point.value):
             if not limits.out(severity, point.value, self._was_out(severity, limits)):
@@ -122,14 +124,16 @@ class SampleWindow:
         return worst
 
     def _was_out(self, severity: Severity, limits: LimitSettings) -> bool:
-        """True if the values are out of a bound so far: of a wider one only if they passed it."""
+        """True if the bound of a severity was exceeded up to now; a wider bound must have been
+        passed.
+        """
         if severity not in self.since_ns:
             return False
         worst = self.worst.get(severity)
         return worst is None or limits.beyond(severity, worst.value) > 0
 
     def to_json(self) -> Any:
-        """The window as plain values."""
+        """Window of samples as JSON values, for the database."""
         kept: dict[str, Any] = {
             "samples": self.samples,
             "since_ns": {s.word: t for s, t in self.since_ns.items()},
@@ -141,7 +145,7 @@ class SampleWindow:
 
     @classmethod
     def from_json(cls, kept: Any) -> "SampleWindow":
-        """A window as it was kept."""
+        """Restore a window of samples from JSON values."""
         since_ns = {Severity[word.upper()]: time_ns for word, time_ns in kept["since_ns"].items()}
         # A window of a version that kept no worst values has none: the next value is the worst.
         worst = {
@@ -160,10 +164,10 @@ def _all_within(values: Sequence[float], limits: LimitSettings) -> bool:
 
 
 def _means(samples: Sequence[Sample], count: int, known: int) -> list[float]:
-    """The mean over the latest `count` after each sample beyond the `known` ones.
+    """Means over the latest `count` samples at each sample after the first `known` ones.
 
-    The least and the greatest are widened: as differences of sums from the start
-    they may differ in the last digits from sums of their own.
+    The least and the greatest mean are widened by the rounding error of differences of running
+    sums.
     """
     part = list(accumulate((each[1] for each in samples), initial=0.0))
     whole = list(accumulate((each[2] for each in samples), initial=0.0))
@@ -179,10 +183,10 @@ def _means(samples: Sequence[Sample], count: int, known: int) -> list[float]:
 
 @dataclass
 class Excursion:
-    """A time for which a value would have been out of its limits, as an alarm counts it.
+    """A period in which a value would have been out of limits, counted like one alarm.
 
-    `start_ns` is the batch that would have raised the alarm, `end_ns` the first one that was
-    back in limits; None: it lasts to the end of the series.
+    `start_ns` is the time of the batch that would have raised the alarm, `end_ns` that of the first
+    batch back in limits; None if there is none.
     """
 
     severity: Severity
@@ -194,7 +198,7 @@ class Excursion:
 
 @dataclass(frozen=True)
 class Preview:
-    """How many values were evaluated, how many lay beyond each severity, and every excursion."""
+    """Result of evaluating a series: number of values, number beyond each severity, excursions."""
 
     evaluated: int = 0
     beyond: dict[Severity, int] = field(default_factory=lambda: dict.fromkeys(Severity, 0))
@@ -202,10 +206,10 @@ class Preview:
 
 
 def preview_of(samples: Sequence[Sample], limits: LimitSettings) -> Preview:
-    """Evaluate samples in the order of their time, as batches that arrive in order would be.
+    """Evaluate a recorded series against limits, in order of time, as if its batches arrived now.
 
-    A value is the mean over the latest `minimum_count` samples.  `beyond` counts the
-    values beyond the bounds, without hysteresis or duration.
+    A value is the mean over the latest `minimum_count` samples.  `beyond` counts the values beyond
+    the bounds, without hysteresis or duration.
     """
     values, time_ns = _values(samples, limits.minimum_count)
     found = Preview(len(values), {s: _count_beyond(values, limits, s) for s in Severity}, [])
@@ -226,7 +230,7 @@ def preview_of(samples: Sequence[Sample], limits: LimitSettings) -> Preview:
 
 
 def preview_of_gaps(time_ns: Sequence[int], limits: LimitSettings) -> Preview:
-    """The same for the time without a batch, in seconds: each gap is evaluated by itself."""
+    """Evaluate gaps between batches, in seconds, against limits of silence, each by itself."""
     alone = {"minimum_count": 1, "duration_s": 0.0, "hysteresis": 0.0}
     settings = LimitSettings.model_validate(limits.model_dump() | alone)
     gaps = [(later, (later - earlier) / 1e9, 1.0) for earlier, later in pairwise(time_ns)]
@@ -234,7 +238,7 @@ def preview_of_gaps(time_ns: Sequence[int], limits: LimitSettings) -> Preview:
 
 
 def _values(samples: Sequence[Sample], count: int) -> tuple[Vector, Vector]:
-    """The mean over the latest `count` samples at each of them, and its time."""
+    """Means over `count` consecutive samples, and the time of the last sample of each."""
     if len(samples) < count:
         return np.empty(0), np.empty(0, dtype=np.int64)
     time_ns, parts, wholes = zip(*samples, strict=True)
@@ -255,7 +259,9 @@ def _count_beyond(values: Vector, limits: LimitSettings, severity: Severity) -> 
 def _evaluated(
     values: Vector, time_ns: Vector, limits: LimitSettings
 ) -> Iterator[tuple[int, Evaluated]]:
-    """The values that could change a severity, with their times; the others are within limits."""
+    """Evaluate a series, skipping long stretches within limits; yields the times and values left
+    over.
+    """
     low, high = limits.inner_bounds
     out = np.flatnonzero((values < low) | (values > high))
     window = SampleWindow()

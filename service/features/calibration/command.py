@@ -1,4 +1,4 @@
-"""`acquire calibrate`: alignment, distortion and clocks of trackers from recorded batches."""
+"""Command `acquire calibrate`: alignment, distortion and clocks from recorded batches."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from service.features.calibration.estimates import CalibrationRun
 
 RECORDED_BY = "acquire calibrate"
-"""The author of a calibration that the command records."""
+"""Author under which the command records a calibration."""
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `calibrate` and its options."""
     parser = arguments.add_command(
         commands, "calibrate", run, first="--run --start --end --output --record"
     )
@@ -131,5 +131,5 @@ def _write_mission(parsed: Namespace, result: "CalibrationRun") -> None:
 
 
 def _mission_file(parsed: Namespace) -> Path:
-    """The file that the spacecraft's mission is read from: a site's own before the shipped one."""
+    """Path of a spacecraft's mission file; a site's file takes precedence over a shipped one."""
     return arguments.mission_and_file(parsed.spacecraft)[1]

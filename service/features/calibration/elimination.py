@@ -1,8 +1,8 @@
-"""Normal equations with every batch's attitude eliminated, and which unknowns stars do not show.
+"""Normal equations with the attitudes eliminated, and the test which unknowns are observable.
 
-The attitude of a batch meets only its own stars.  Eliminating it block by block (the
-Schur complement) leaves a small system of the unknowns alone, the same as that of a
-least squares over all attitudes and unknowns together.
+The attitude of a batch affects its own stars only.  Eliminating it block by block (Schur
+complement) leaves a small system of the unknowns alone, equivalent to a least squares over all
+attitudes and unknowns together.
 """
 
 import math
@@ -19,7 +19,7 @@ from service.missions.mission import Tracker
 from service.vectors import Matrix, Vector
 
 ATTITUDE_PRIOR = 1.0
-"""Information (1/rad^2) on every attitude: keeps a batch solvable that lost all stars but one."""
+"""A priori information (1/rad^2) on every attitude, so that a batch with one star is solvable."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Normal:
         return Normal(*(one - another for one, another in pairs))
 
     def solution(self, free: Indices) -> Vector:
-        """The step (p,) that is zero but for the unknowns `free`."""
+        """Step (p,) of the normal equations, zero except for the unknowns `free`."""
         step = np.zeros(len(self.right))
         if len(free):
             inner = self.matrix[np.ix_(free, free)]
@@ -54,17 +54,19 @@ class Normal:
         return step
 
     def squares_after(self, step: Vector) -> float:
-        """The weighted sum of squares with a step (p,) of the unknowns and the best attitudes."""
+        """Weighted sum of squared residuals after a step (p,) of the unknowns, with optimal
+        attitudes.
+        """
         return float(self.squares - 2.0 * self.right @ step + step @ self.matrix @ step)
 
 
 @dataclass(frozen=True, eq=False)
 class Eliminated:
-    """Normal equations in which every attitude is eliminated.
+    """Normal equations from which the attitude of every batch is eliminated.
 
-    `blocks` are those of each block of batches.  `whiten` (K, 3, 3) are the inverted
-    Cholesky factors L^-1 of the attitudes' own blocks and `coupling` (3 K, p) is L^-1 times
-    what ties them to the unknowns; both are None where the attitudes are known.
+    `blocks` holds one system per block of batches.  `whiten` (K, 3, 3) are the inverted Cholesky
+    factors L^-1 of the attitudes' own blocks and `coupling` (3 K, p) is L^-1 times the blocks that
+    couple attitudes and unknowns; both are None if the attitudes are known.
     """
 
     parts: Sequence[Linearised]
@@ -74,17 +76,17 @@ class Eliminated:
 
     @property
     def normal(self) -> Normal:
-        """The equations of all batches."""
+        """Sum of the normal equations of all batches."""
         first, *others = self.blocks
         return sum(others, start=first)
 
     def steps(
         self, normal: Normal, residual: Vector, weight: Weights, free: Indices
     ) -> tuple[Vector, Vector, float]:
-        """The steps of the unknowns (p,) and turns (K, 3) that weighted residuals (2, n) ask for.
+        """Steps of the unknowns (p,) and of the attitudes (K, 3) for weighted residuals (2, n).
 
-        The matrix stays that of `normal`, whatever its weights were.  The third value is the
-        length of the step in sigmas: of all unknowns, or without any of one attitude, as rms.
+        The matrix is that of `normal`, whatever weights it was built with.  The third value is the
+        length of the step in sigmas: of all unknowns, or rms over the attitudes if there are none.
         """
         pulled = weight * residual
         right = np.zeros(len(normal.right))
@@ -107,7 +109,7 @@ class Eliminated:
         return step, turns, _length(normal, step) if len(free) else of_attitudes
 
     def change(self, step: Vector, turns: Vector, stars: int) -> Vector:
-        """The change of the residuals (2, n) by such steps."""
+        """Change of the residuals (2, n) by steps of the unknowns and turns of the attitudes."""
         found = np.empty((2, stars))
         for part in self.parts:
             by = part.flat
@@ -130,9 +132,9 @@ def eliminate(
     edges: Indices,
     attitudes_known: bool = False,
 ) -> Eliminated:
-    """The normal equations of all stars (n); `residual` (2, n) and `weight` (n,) in their order.
+    """Build the normal equations of all stars (n) from `residual` (2, n) and `weight` (n,).
 
-    `edges` (f + 1,) are the batches at which blocks begin, and their number at the end.
+    `edges` (f + 1,) are the first batches of the blocks, and the number of batches at the end.
     """
     batches = int(edges[-1])
     matrix = np.zeros((len(edges) - 1, unknowns + 1, unknowns + 1))
@@ -171,7 +173,7 @@ def eliminate(
 
 
 def _normals(matrix: Matrix, full: Matrix) -> tuple[Normal, ...]:
-    """Blocks (f, p + 1, p + 1), the residuals their last row, as equations."""
+    """Normal equations from blocks (f, p + 1, p + 1) whose last row holds the residuals."""
     return tuple(
         Normal(block[:-1, :-1], -block[:-1, -1], float(block[-1, -1]), own)
         for block, own in zip(matrix, full, strict=True)
@@ -179,7 +181,7 @@ def _normals(matrix: Matrix, full: Matrix) -> tuple[Normal, ...]:
 
 
 def _add_blocks(into: Matrix, part: Linearised, weight: Weights) -> None:
-    """Add what a tracker's stars say of each attitude to the blocks (3, 3, K)."""
+    """Add the information of a tracker's stars on each attitude to its block (3, 3, K)."""
     by, batch = part.by_attitude, part.stars.batch
     for i in range(3):
         for j in range(i, 3):
@@ -193,10 +195,12 @@ def _add_blocks(into: Matrix, part: Linearised, weight: Weights) -> None:
 Marks = npt.NDArray[np.bool_]
 
 LEAST_SHARE = 1e-9
-"""The share of an unknown's information that attitudes and other unknowns must leave of it."""
+"""Least share of an unknown's information that must remain after attitudes and other unknowns."""
 
 ORDER: tuple[Kind, ...] = ("alignment", "scale", "distortion", "temperature", "time_tag")
-"""The order of kinds: of unknowns that the stars do not tell apart, the later is not observable."""
+"""Priority of the kinds of unknowns: of two that stars cannot separate, the later is not
+observable.
+"""
 
 REASONS: dict[Kind, str] = {
     "alignment": "too few batches in which this tracker and another both have identified stars",
@@ -215,17 +219,17 @@ ONE_CLOCK = "it looks like a turn of the body; {first} is taken to have the righ
 
 @dataclass(frozen=True)
 class NotObservable:
-    """Something that these stars cannot show, and the reason."""
+    """An unknown that the stars do not determine, and the reason."""
 
     name: str
     reason: str
 
 
 def observable(normal: Normal, unknowns: Sequence[Unknown]) -> Marks:
-    """Marks of the unknowns (p,) that the normal equations determine.
+    """Mask of the unknowns (p,) that the normal equations determine.
 
-    An unknown is dropped where the attitudes and the unknowns before it in `ORDER` leave
-    nothing of its information, and then where its sigma is beyond what is plausible.
+    An unknown is dropped if the attitudes and the unknowns before it in `ORDER` leave none of its
+    information, and then if its sigma is implausibly large.
     """
     order = sorted(
         range(len(unknowns)),
@@ -265,7 +269,7 @@ def _share_left(normal: Normal, kept: Sequence[int], at: int) -> float:
 
 
 def inverse(matrix: Matrix) -> Matrix:
-    """The inverse of a positive definite matrix whose rows have different units."""
+    """Inverse of a positive definite matrix whose rows have different units."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     return np.asarray(np.linalg.inv(matrix * np.outer(scale, scale)) * np.outer(scale, scale))
 
@@ -277,7 +281,7 @@ def not_observable(
     attitudes_known: bool,
     time_tag: bool,
 ) -> tuple[NotObservable, ...]:
-    """The unknowns that were dropped, and what no star shows, by name."""
+    """Dropped unknowns, and properties that star observations never determine, with reasons."""
     found = [
         NotObservable(each.name, REASONS[each.kind])
         for each, kept in zip(unknowns, marks, strict=True)

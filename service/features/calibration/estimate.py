@@ -1,8 +1,8 @@
 """Joint calibration of trackers from the identified stars of many batches.
 
-A robust least squares of Gauss and Newton over all unknowns and the attitude of every
-batch, which is eliminated (attitude-free estimation: Bierman & Shuster; Shuster, Pitone
-& Bierman 1991).  Stars count by Huber's weights; those far off are left out.
+A robust Gauss-Newton least squares over all unknowns and the attitude of every batch, which is
+eliminated (attitude-free estimation: Bierman & Shuster; Shuster, Pitone & Bierman 1991).  Stars
+have Huber's weights; outliers are left out.
 """
 
 import math
@@ -29,20 +29,20 @@ from service.vectors import Matrix, Vector
 
 ROUNDS, LINEARISATIONS = 30, 6
 LEAST_FREEDOM = 20
-"""Residuals beyond what determines the unknowns: these give their scale to about a sixth."""
+"""Least excess of residuals over unknowns: their scale is then known to about a sixth."""
 FAR_RAD = 2e-3
-"""The step above which the derivatives are computed anew."""
+"""Length of a step, in radians, above which the derivatives are computed again."""
 LEAVE_OUT_FROM = 2
-"""The round from which on stars far off are left out: before, the fit itself may be off."""
+"""Iteration from which outliers are left out; earlier the fit itself may still be off."""
 RECOUNTED = 0.005
-"""Sigmas are computed anew where more stars than this share were left out: half the change."""
+"""Share of newly left out stars above which sigmas are computed again."""
 SETTLED = 0.1
-"""A step so many sigmas long, all unknowns together, is the last: what follows is a tenth of it."""
+"""Length of a step, in sigmas of all unknowns, below which the iteration ends."""
 
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The estimate of the trackers from the stars of a stretch.
+    """Calibration of trackers estimated from identified stars of a period.
 
     `value` (p,) and `covariance` (p, p) are of `unknowns`, in the unit of each.  `stars`
     (n) are those that were used, ordered by tracker and batch; `residual` (n, 2) is
@@ -65,12 +65,12 @@ class Calibration:
 
     @property
     def sigma(self) -> Vector:
-        """One standard deviation (p,) of each unknown, in its unit."""
+        """Standard deviation (p,) of each estimated unknown, in its unit."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
     def used(self) -> Marks:
-        """The stars (n,) that were not left out."""
+        """Mask (n,) of the stars that were not left out as outliers."""
         return self.weight > 0.0
 
     @property
@@ -79,7 +79,9 @@ class Calibration:
         return math.sqrt(float(np.sum(self.residual[self.used] ** 2)) / max(self.freedom, 1))
 
     def value_of(self, name: str) -> tuple[float, float]:
-        """Value and sigma of an unknown, in its unit; raises `BadInput` without such a one."""
+        """Value and sigma of the unknown with a name, in its unit; raises `BadInput` if not
+        estimated.
+        """
         for at, each in enumerate(self.unknowns):
             if each.name == name:
                 return float(self.value[at]), float(self.sigma[at])
@@ -88,12 +90,12 @@ class Calibration:
 
 @dataclass(eq=False)
 class Fit:
-    """A fit, on its way and where it has settled.
+    """State of the iterated least squares fit of a calibration.
 
-    `values` (p,) are all unknowns, in radians and seconds, `marks` (p,) those that are
-    free; the others are zero.  `residual` is (2, n) in sigmas, `scale` the sigma that
-    residuals have in these.  `reduced` has unit weights for the stars `counted` and
-    none for others.
+    `values` (p,) are all unknowns, in radians and seconds, `marks` (p,) the mask of the free ones;
+    the others are zero.  `residual` is (2, n) in sigmas, `scale` the measured sigma of these
+    residuals.  `reduced` are normal equations in which the stars `counted` have weight one and the
+    others zero.
     """
 
     parts: Sequence[linearise.TrackerStars]
@@ -109,20 +111,20 @@ class Fit:
 
     @property
     def free(self) -> Indices:
-        """The unknowns that are estimated."""
+        """Indices of the unknowns that are estimated."""
         return np.flatnonzero(self.marks)
 
     @property
     def used(self) -> Marks:
-        """The stars (n,) that are not left out."""
+        """Mask (n,) of the stars that are not left out as outliers."""
         return self.weight > 0.0
 
 
 def calibrate(stars: IdentifiedStars, model: Model) -> Calibration:
-    """The unknowns of a model, by the stars of a stretch.
+    """Estimate the unknowns of a camera and alignment model from the stars of a period.
 
-    Unknowns that the stars do not show are left as the mission has them and named in
-    `not_observable`.  Raises `BadInput` where there are fewer residuals than unknowns.
+    Unknowns that the stars do not determine keep the mission's values and are named in
+    `not_observable`.  Raises `BadInput` if there are fewer residuals than unknowns.
     """
     stars = stars.usable(model.attitudes_known)
     start = begun(stars, model)
@@ -132,12 +134,12 @@ def calibrate(stars: IdentifiedStars, model: Model) -> Calibration:
 
 
 def fit(stars: IdentifiedStars, model: Model) -> Fit:
-    """The fit of a model to stars that are in the order of `by_tracker`."""
+    """Fit a calibration model to stars that are sorted as by `by_tracker`."""
     return _run(begun(stars, model), stars, model)
 
 
 def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
-    """Settle again and again, from where the last time ended, until that moves nothing."""
+    """Repeat the linearised fit from its last result until a repetition changes nothing."""
     for number in range(LINEARISATIONS):
         steps, far = _settle(found, stars, model, number > 0)
         if steps == 1 and not far:
@@ -145,14 +147,14 @@ def _run(found: Fit, stars: IdentifiedStars, model: Model) -> Fit:
         if far:
             found.counted = found.used
             found.reduced = _reduced(found, model)
-            # Stars that were left out may have been all that showed an unknown.
+            # An unknown may have been observable by stars only that are left out now.
             found.marks = found.marks & observable(found.reduced.normal, found.unknowns)
             found.values = np.where(found.marks, found.values, 0.0)
     return found
 
 
 def begun(stars: IdentifiedStars, model: Model) -> Fit:
-    """A fit at the mission's present settings, all stars with full weight."""
+    """Starting point of a fit: the mission's present settings, all stars with full weight."""
     unknowns = unknowns_of(stars.trackers, model)
     parts = linearise.prepared(stars, unknowns, model.reference_temperature_c)
     values, every = np.zeros(len(unknowns)), np.ones(len(stars), dtype=np.bool_)
@@ -167,9 +169,9 @@ def begun(stars: IdentifiedStars, model: Model) -> Fit:
 
 
 def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tuple[int, bool]:
-    """Move a fit to where linear equations with robust weights settle.
+    """Iterate robust weights on fixed linear equations until the steps are small.
 
-    How many steps that took, and whether they led far.
+    Returns the number of steps, and True if the result is far from the point of linearisation.
     """
     free, normal = found.free, found.reduced.normal
     moved, turned = np.zeros(len(found.values)), np.zeros((stars.batches, 3))
@@ -195,7 +197,7 @@ def _settle(found: Fit, stars: IdentifiedStars, model: Model, near: bool) -> tup
 
 
 def _reduced(found: Fit, model: Model) -> Eliminated:
-    """The normal equations where the fit stands."""
+    """Normal equations linearised at the present values of a fit."""
     arguments = found.values, found.attitude, found.residual, found.counted
     return _eliminated(found.parts, *arguments, model)
 
@@ -224,9 +226,9 @@ def _residuals(
 
 
 def degrees_of_freedom(stars: IdentifiedStars, model: Model, used: Marks) -> int:
-    """Two a star less three an attitude; the unknowns are not taken off.
+    """Number of residuals less three per attitude; the unknowns are not subtracted.
 
-    A batch of which fewer than two stars are left determines no attitude, and adds none.
+    A batch with fewer than two remaining stars determines no attitude, and adds nothing.
     """
     if model.attitudes_known:
         return 2 * int(used.sum())
@@ -235,7 +237,7 @@ def degrees_of_freedom(stars: IdentifiedStars, model: Model, used: Marks) -> int
 
 
 def calibration_of(stars: IdentifiedStars, model: Model, settled: Fit, before: Fit) -> Calibration:
-    """Values and covariance of a fit, in units, with the residuals before it."""
+    """Calibration from a settled fit: values, covariance in their units, residuals before."""
     free, used = settled.free, settled.used
     if float(np.mean(used != settled.counted)) > RECOUNTED:
         settled.counted = used
@@ -266,29 +268,29 @@ def calibration_of(stars: IdentifiedStars, model: Model, settled: Fit, before: F
 
 
 HUBER = 2.0
-"""Bound of a star's residual, both tangents together, in sigmas.
+"""Bound of Huber's weight on a star's residual, both tangents together, in sigmas.
 
-Estimates keep 96 % of the efficiency that least squares has with Gaussian errors.
+Estimates keep 96 % of the efficiency of least squares with Gaussian errors.
 """
 WRONG = 5.0
-"""A residual beyond so many sigmas is no measurement of that star (Gaussian: 4 in a million)."""
+"""Length of a residual, in sigmas, above which a star is an outlier (Gaussian: 4 in a million)."""
 MEDIAN_RADIUS = math.sqrt(2.0 * math.log(2.0))
-"""Median of the length of two Gaussian residuals, in sigmas."""
+"""Median length of a vector of two Gaussian residuals, in sigmas."""
 
 
 def scale_of(residual: Vector, used: int, freedom: int) -> float:
-    """Sigma of one residual of (2, n) by their median length.
+    """Robust sigma of residuals (2, n) from their median length.
 
-    `used` residuals have `freedom` degrees of freedom: the fit has made them smaller.
+    `used` residuals have `freedom` degrees of freedom, since the fit has made them smaller.
     """
     length = np.hypot(residual[0], residual[1])
     return max(float(np.median(length)) / MEDIAN_RADIUS * math.sqrt(used / max(freedom, 1)), 1e-12)
 
 
 def weights(residual: Vector, scale: float, leave_out: bool) -> linearise.Weights:
-    """Weights (n,) of stars with these residuals (2, n).
+    """Huber weights (n,) of stars with residuals (2, n).
 
-    With `leave_out` those beyond `WRONG` have none.
+    With `leave_out` residuals beyond `WRONG` have weight zero.
     """
     length = np.hypot(residual[0], residual[1]) / scale
     weight = np.minimum(1.0, HUBER / np.maximum(length, 1e-300))
@@ -296,30 +298,30 @@ def weights(residual: Vector, scale: float, leave_out: bool) -> linearise.Weight
 
 
 def covariance_factor(residual: Vector, scale: float, freedom: int) -> float:
-    """The factor of the inverse of the unweighted normal matrix (Huber 1981, 7.6).
+    """Factor from the inverse of the unweighted normal matrix to the covariance (Huber 1981, 7.6).
 
-    The mean square of the bounded residuals over the square of the mean slope of the
-    bound; `residual` (2, n) are those of the stars that were not left out.
+    The mean square of the bounded residuals over the square of the mean slope of the bound;
+    `residual` (2, n) holds only stars that were not left out.
     """
     length = np.hypot(residual[0], residual[1]) / scale
     bounded = np.minimum(length, HUBER) * scale
-    # Beyond the bound only the direction across the residual still moves it.
+    # Beyond the bound only a change across the residual still changes the bounded value.
     slope = np.where(length <= HUBER, 1.0, 0.5 * HUBER / np.maximum(length, 1e-300))
     return float(np.sum(bounded**2)) / max(freedom, 1) / float(slope.mean()) ** 2
 
 
 # The degree of the distortion, chosen by blocks of time that the fit has not seen.
 #
-# The stretch is cut into consecutive blocks of batches.  Each block is predicted from the
-# others; only its attitudes are its own.  The smallest degree is taken whose residuals are
-# no worse than the best by more than chance: one standard error over the blocks.
+# The batches are cut into consecutive blocks.  Each block is predicted from the others, with
+# only its attitudes fitted.  The smallest degree is taken whose residuals are worse than the
+# best by no more than one standard error over the blocks.
 
 BLOCKS = 10
 
 
 @dataclass(frozen=True)
 class HeldOut:
-    """How well a distortion of a degree predicts blocks of time that it was not fitted to.
+    """Prediction error of a distortion of some degree on blocks of time outside of its fit.
 
     `residual_over_sigma` is a root mean square per degree of freedom, in the stars'
     sigmas; `chosen` marks the degree to use.
@@ -333,9 +335,10 @@ class HeldOut:
 def calibrate_with_chosen_degree(
     stars: IdentifiedStars, model: Model, blocks: int = BLOCKS
 ) -> tuple[Calibration, tuple[HeldOut, ...]]:
-    """`calibrate` with the best degree up to that of the model, and what each degree gave.
+    """Calibrate with the best distortion degree up to the model's; also return the error of each
+    degree.
 
-    Raises `BadInput` where there are too few stars for the model's own degree.
+    Raises `BadInput` if there are too few stars for the model's own degree.
     """
     usable = stars.usable(model.attitudes_known)
     tried = held_out(usable, model, fit(usable, model), blocks)
@@ -346,10 +349,10 @@ def calibrate_with_chosen_degree(
 def held_out(
     stars: IdentifiedStars, model: Model, settled: Fit, blocks: int = BLOCKS
 ) -> tuple[HeldOut, ...]:
-    """Every degree up to the model's by held-out blocks, around a settled fit of the model.
+    """Cross-validate every distortion degree up to the model's by held-out blocks of batches.
 
-    The fit is linear there: leaving out a block subtracts its normal equations.  Stars
-    that the fit left out are left out here.
+    The settled fit is linear near its solution: leaving out a block subtracts its normal equations.
+    Stars left out by the fit stay left out.
     """
     edges = _edges(stars.batches, blocks)
     derivatives = [
@@ -380,7 +383,7 @@ def _edges(batches: int, blocks: int) -> Indices:
 
 
 def _from_zero(normal: Normal, values: Vector) -> Normal:
-    """Equations of steps from `values`, as equations of the unknowns themselves."""
+    """Convert equations for steps from `values` to equations for the unknowns themselves."""
     return replace(
         normal,
         right=normal.right + normal.matrix @ values,
@@ -395,7 +398,7 @@ def _free(settled: Fit, degree: int) -> Indices:
 
 
 def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
-    """The sum of squares of each block with the unknowns that the other blocks give."""
+    """Sum of squares of each block, predicted with unknowns from the other blocks."""
     total = sum(by_block[1:], start=by_block[0])
     if len(by_block) == 1:
         return np.array([total.squares])
@@ -403,7 +406,7 @@ def _predicted_squares(by_block: list[Normal], free: Indices) -> Vector:
 
 
 def _no_worse(excess: Vector) -> bool:
-    """True if squares over blocks exceed others by no more than a standard error of the sum."""
+    """True if the sum of excess squares over blocks is within one standard error."""
     n = len(excess)
     error = float(np.std(excess, ddof=1)) * math.sqrt(n) if n > 1 else 0.0
     return float(excess.sum()) <= error

@@ -1,4 +1,4 @@
-"""Trackers calibrated from recorded batches, and what is recorded and shown of it."""
+"""Calibration of trackers from recorded batches: request, sampling, estimate and report."""
 
 import math
 import time
@@ -49,17 +49,17 @@ from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector
 CALIBRATION_SAMPLE = 2_000
 LARGEST_CHOSEN_DEGREE = 5
 LONGEST_WAIT_S = 120.0
-"""The wait for a thread of the solver, while others keep them all at work."""
+"""Longest wait in seconds for a free thread of the solver."""
 
 Step = Callable[[int, int], object]
-"""Told after each batch: how many are done, and of how many."""
+"""Callback for progress after each batch: number done, total number."""
 
 
 @dataclass(frozen=True)
 class CalibrationRequest:
-    """The unknowns of a calibration, and the batches that it is estimated from.
+    """Request for a calibration: the unknowns to estimate, and the batches to use.
 
-    Without `trackers` all of the mission's; the first of them is the reference.  Without
+    Without `trackers` all of the mission's are calibrated; the first one is the reference.  Without
     a `degree` the distortion's is chosen, up to `LARGEST_CHOSEN_DEGREE`.
     """
 
@@ -76,7 +76,7 @@ class CalibrationRequest:
     sample: int = CALIBRATION_SAMPLE
 
     def require(self, mission: Mission, trackers_field: str = "trackers") -> None:
-        """Raise `BadInput` for trackers that the mission has not, and for a useless model."""
+        """Raise `BadInput` for trackers that the mission lacks, or a model without unknowns."""
         for name in self.trackers:
             mission.tracker(name, trackers_field)
         if self.degree is not None and not 0 <= self.degree <= LARGEST_DEGREE:
@@ -86,16 +86,16 @@ class CalibrationRequest:
             raise BadInput(Fault("degree", "leaves nothing to estimate", "0"))
 
     def model(self, degree: int) -> Model:
-        """The unknowns, with a distortion of this degree."""
+        """Calibration model with the requested unknowns and a distortion of a degree."""
         return Model(self.alignment, self.scale, degree, time_tag=self.time_tag)
 
 
 @dataclass(frozen=True)
 class CalibrationRun:
-    """A calibration with the batches it came from.
+    """An estimated calibration with the batches used for it.
 
-    `total` batches are in the period, `sampled` were run again and `used` had identified
-    stars; `refused` no longer fit the mission.  `tried` is empty where the degree was given.
+    `total` batches are in the period, `sampled` were processed again and `used` had identified
+    stars; `refused` no longer fit the mission.  `tried` is empty if the degree was requested.
     """
 
     mission: Mission
@@ -108,17 +108,17 @@ class CalibrationRun:
     first: str | None
     last: str | None
     magnitudes: tuple[MagnitudeCalibration, ...] = ()
-    """The magnitudes of each calibrated tracker; empty where they were not asked for."""
+    """Magnitude calibration of each calibrated tracker; empty if not requested."""
 
     @property
     def calibrated_magnitudes(self) -> dict[str, Magnitudes]:
-        """The settings of every tracker's magnitudes, with what was found, by its name."""
+        """Magnitude settings of every tracker by name, updated with the calibration."""
         names = [each.name for each in self.found.stars.trackers]
         return calibrated_settings(self.mission.trackers, self.magnitudes, names)
 
     @property
     def covariance(self) -> Matrix:
-        """The covariance of all unknowns, magnitudes last: these share nothing with the others."""
+        """Covariance of all unknowns; magnitudes are last, uncorrelated with the others."""
         blocks = [self.found.covariance, *(each.covariance for each in self.magnitudes)]
         size = sum(len(each) for each in blocks)
         whole, first = np.zeros((size, size)), 0
@@ -130,7 +130,7 @@ class CalibrationRun:
 
 
 class Estimator:
-    """Estimates calibrations; nothing is recorded and no setting is changed."""
+    """Estimates calibrations from recorded batches, without recording them or changing settings."""
 
     def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
@@ -142,10 +142,10 @@ class Estimator:
         mission: Mission,
         step: Step = lambda done, total: None,
     ) -> CalibrationRun:
-        """The calibration that the batches of a run give.
+        """Calibrate the trackers of a mission from batches of a run.
 
-        Batches are identified anew by verified identification, which does not look at the
-        tolerances.  Raises `BadInput` where there are too few identified stars.
+        Batches are processed again with verified identification, which does not depend on the
+        tolerances.  Raises `BadInput` if there are too few identified stars.
         """
         names = set(wanted.trackers or (each.name for each in mission.trackers))
         selected = ResultFilter(wanted.run or LIVE, wanted.spacecraft, wanted.start, wanted.end)
@@ -181,7 +181,7 @@ class Estimator:
         return CalibrationRun(mission, found, tried, *counts, *ends, of_magnitudes)
 
     def _run_again(self, batch: ObservationBatch, mission: Mission) -> Acquisition:
-        """The acquisition of a batch; while the threads are at work on others it waits."""
+        """Acquire a recorded batch again, waiting while the solver's threads are busy."""
         until_s = time.monotonic() + LONGEST_WAIT_S
         while True:
             try:
@@ -217,11 +217,11 @@ COLORS = (
     "so that magnitudes of very blue and very red stars stay off"
 )
 MAP_CELLS = 12
-"""Cells of a residual map across the field of view."""
+"""Number of cells across the field of view in a map of residuals."""
 
 
 def result_of(run: CalibrationRun) -> records.CalibrationResult:
-    """A calibration as a record, without its covariance."""
+    """Convert an estimated calibration to an API record, without its covariance."""
     found = run.found
     return records.CalibrationResult(
         batches=records.CalibrationBatches(
@@ -258,7 +258,7 @@ def result_of(run: CalibrationRun) -> records.CalibrationResult:
 
 
 def unknowns_of(run: CalibrationRun) -> list[records.CalibrationUnknown]:
-    """The names of the estimated parameters, in the order of the covariance."""
+    """Estimated parameters with values and sigmas, in the order of the covariance."""
     found = run.found
     names = [each.name for each in found.stars.trackers]
     of_positions = [
@@ -287,13 +287,13 @@ def unknowns_of(run: CalibrationRun) -> list[records.CalibrationUnknown]:
 
 
 def not_observable_of(run: CalibrationRun) -> list[NotObservable]:
-    """The unknowns that the stars do not show."""
+    """Parameters that the stars do not determine, of positions and of magnitudes."""
     of_magnitudes = (each.not_observable for each in run.magnitudes)
     return [*run.found.not_observable, *chain.from_iterable(of_magnitudes)]
 
 
 def residuals_by_tracker(found: Calibration) -> list[records.CalibrationResiduals]:
-    """The rms of each tracker's residuals of used stars, before and after."""
+    """Root mean square residuals of each tracker's used stars, before and after calibration."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     rows = []
     for index, tracker in enumerate(found.stars.trackers):
@@ -317,7 +317,7 @@ def _rms(values: Vector) -> float:
 
 
 def notes(run: CalibrationRun) -> list[str]:
-    """Remarks on the parts of this calibration that a mission file cannot hold."""
+    """Remarks on results of a calibration that a mission file cannot hold."""
     kinds = {each.kind for each in run.found.unknowns}
     remarks = [VECTORS] if kinds & {"scale", "distortion"} else []
     remarks += [TIME_TAGS] if "time_tag" in kinds else []
@@ -325,7 +325,7 @@ def notes(run: CalibrationRun) -> list[str]:
 
 
 def _colors_differ(run: CalibrationRun) -> bool:
-    """True if the calibrated trackers do not have one colour term within the noise of a star."""
+    """True if the colour terms of calibrated trackers differ by more than the noise of one star."""
     settings = run.calibrated_magnitudes
     colors = [settings[each.name].color_mag for each in run.mission.trackers]
     least = min(each.magnitude_sigma_mag for each in run.mission.trackers)
@@ -333,7 +333,7 @@ def _colors_differ(run: CalibrationRun) -> bool:
 
 
 def _maps(found: Calibration) -> Iterator[records.ResidualMap]:
-    """The mean residuals of used stars in the cells of each tracker's focal plane."""
+    """Mean residuals of used stars in cells of each tracker's focal plane."""
     sigma_arcsec = found.stars.sigma_rad[:, None] * ARCSEC_PER_RADIAN
     both = np.hstack([found.before * sigma_arcsec, found.residual * sigma_arcsec])
     measured_deg = np.degrees(found.stars.measured_rad)
@@ -368,7 +368,7 @@ def _maps(found: Calibration) -> Iterator[records.ResidualMap]:
 def calibrated_geometry(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
 ) -> list[TrackerGeometry]:
-    """Every tracker of a mission with what a calibration changes of it."""
+    """Geometry of every tracker of a mission, updated with a calibration."""
     return [
         _calibrated_tracker(
             each.model_copy(update={"magnitudes": magnitudes[each.name]}),
@@ -395,7 +395,7 @@ def _values(lines: Lines) -> dict[str, Any]:
 def mission_file_lines(
     mission: Mission, found: Calibration, magnitudes: Mapping[str, Magnitudes]
 ) -> str:
-    """The lines of a mission file that a calibration changes, as TOML."""
+    """Lines of a mission file that a calibration changes, as TOML."""
     parts = []
     for each in mission.trackers:
         changes = tracker_lines(each, found)

@@ -1,4 +1,4 @@
-"""The identified stars of acquired batches, as a calibration takes them."""
+"""Selection of identified stars and their magnitudes from acquired batches, for a calibration."""
 
 from collections.abc import Collection
 from typing import Any
@@ -20,9 +20,9 @@ Columns = dict[str, Any]
 
 
 def identified_stars(acquisition: Acquisition, trackers: Collection[str]) -> IdentifiedStars | None:
-    """The stars of one batch that were uniquely identified, of the trackers of these names.
+    """Uniquely identified stars of one batch, for the trackers with the given names.
 
-    None where the batch has no attitude, or no such star.
+    None if the batch has no attitude, or no such star.
     """
     if acquisition.solution is None:
         return None
@@ -57,9 +57,10 @@ def identified_stars(acquisition: Acquisition, trackers: Collection[str]) -> Ide
 def identified_magnitudes(
     acquisition: Acquisition, trackers: Collection[str], color_bv_mag: Vector
 ) -> MagnitudeStars | None:
-    """The magnitudes of the same stars; `color_bv_mag` (N,) are the colours of the star catalog.
+    """Magnitudes of uniquely identified stars of a batch; `color_bv_mag` (N,) are the catalog's
+    colours.
 
-    None where the batch has no attitude, or no such star with a magnitude.
+    None if the batch has no attitude, or no such star with a magnitude.
     """
     if acquisition.solution is None:
         return None
@@ -79,7 +80,7 @@ def identified_magnitudes(
 
 
 def _shared(star: Indices) -> Marks:
-    """Marks of stars whose identity another one has too: one of them must be wrong."""
+    """Mask of stars that share their catalog star with another: one of the two must be wrong."""
     names, count = np.unique(star, return_counts=True)
     return np.isin(star, names[count > 1])
 
@@ -87,7 +88,9 @@ def _shared(star: Indices) -> Marks:
 def _of_tracker(
     acquisition: Acquisition, sent: TrackerStars, chosen: Indices, star: Indices
 ) -> Columns:
-    """Angles and catalog directions of the chosen stars; `star` are their catalog rows."""
+    """Columns of measured angles and catalog directions of chosen stars; `star` are their catalog
+    rows.
+    """
     mission, batch = acquisition.mission, acquisition.batch
     calibration = mission.tracker(sent.tracker, "observations").calibration
     vector, angles_deg = sent.vector[chosen], sent.angles_deg[chosen]

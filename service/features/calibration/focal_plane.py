@@ -1,4 +1,4 @@
-"""Residuals of a tracker over its focal plane, before and after a calibration."""
+"""Chart of a tracker's residuals over its focal plane, before and after a calibration."""
 
 import math
 from collections.abc import Sequence
@@ -9,20 +9,20 @@ from service.features.calibration.records import ResidualCell, ResidualMap
 from service.web.console.charts.focal_plane import LEAST_STARS, SIZE, arrow, round_below
 
 LONGEST_RESIDUAL = 1.3
-"""The length of the longest arrow, in cells."""
+"""Length of the longest arrow of a residual chart, in cells."""
 
 Side = Literal["before", "after"]
 
 
 @dataclass(frozen=True)
 class ResidualPicture:
-    """Chart of residuals over the focal plane; an arrow of `key_arcsec` is `key_px` long."""
+    """Chart of residuals as arrows over a focal plane; `key_arcsec` is drawn `key_px` long."""
 
     title: str
     tracker: str
     radius_deg: float
     cells: tuple[tuple[float, float, int], ...]
-    """Left and upper edge, and the number of stars."""
+    """Left and upper edge of each cell of the chart, and its number of stars."""
     side: float
     arrows: str
     key_arcsec: float
@@ -31,9 +31,9 @@ class ResidualPicture:
 
 
 def residual_pictures(map: ResidualMap) -> tuple[ResidualPicture, ...]:
-    """Before, after at the same scale, and after with longer arrows.
+    """Residual charts: before calibration, after at the same scale, and after with longer arrows.
 
-    A cell of fewer than `LEAST_STARS` has no arrow.
+    A cell with fewer than `LEAST_STARS` stars has no arrow.
     """
     longest = {side: _longest(map.cells, side) for side in ("before", "after")}
     return (

@@ -1,7 +1,7 @@
-"""Residuals of identified stars, and how each depends on the attitudes and the unknowns.
+"""Residuals of identified stars, and their derivatives by attitudes and calibration unknowns.
 
-A star's residual is observed minus predicted along two tangents, in sigmas.  Observed
-is the direction of the measured angles through calibration and correction; predicted is
+A star's residual is observed minus predicted along two tangents, in sigmas.  Observed is the
+direction of the measured angles after calibration and correction; predicted is
 
     p = M^T exp(-[e x]) exp(-[w (t + tau) x]) A r,
 
@@ -37,13 +37,13 @@ STRETCH, SKEW = "stretch", "skew"
 
 @dataclass(frozen=True)
 class Model:
-    """The unknowns of a calibration.
+    """Choice of the unknowns that a calibration estimates.
 
-    `degree` is that of the distortion, 2-D Legendre polynomials; below 1 there is none.
-    With a `reference_temperature_c` alignment, scale and the linear distortion change with
-    the temperature, and the other unknowns are those at the reference.  With
-    `attitudes_known` the batches' attitudes are not estimated: the alignment of every
-    tracker to the body is an unknown.  Raises `BadInput` for a degree that is too large.
+    `degree` is the degree of the distortion, in 2-D Legendre polynomials; 0 for none.  With a
+    `reference_temperature_c` alignment, scale and the linear distortion depend on temperature, and
+    the other unknowns are the values at the reference.  With `attitudes_known` the attitudes of
+    batches are not estimated: the alignment of every tracker to the body is an unknown.  Raises
+    `BadInput` for a degree that is too large.
     """
 
     alignment: bool = True
@@ -61,13 +61,13 @@ class Model:
 
 @dataclass(frozen=True)
 class Unknown:
-    """One number that is estimated of a tracker.
+    """One estimated parameter of a tracker.
 
-    `term` is the body axis of an alignment; of a distortion `stretch` (h by x, v by -y),
-    `skew` (h by y, v by x), or the angle and the two degrees: ("h", 2, 1) adds
-    P2(x) P1(y) to h.  A dependence on temperature has the kind it changes in
-    `of`.  `unit` is that of values given outside, `per_unit` the value of one such unit
-    inside, in radians and seconds.  `degree` is 0 where it is none of the distortion.
+    `term` is the body axis of an alignment; for a distortion `stretch` (h by x, v by -y), `skew` (h
+    by y, v by x), or the angle and the two degrees: ("h", 2, 1) adds P2(x) P1(y) to h.  A
+    dependence on temperature has the changed kind in `of`.  `unit` is the unit shown to users,
+    `per_unit` one such unit in radians or seconds.  `degree` is 0 unless the parameter belongs to
+    the distortion.
     """
 
     tracker: int
@@ -91,20 +91,22 @@ PLAUSIBLE: dict[Kind, float] = {
     "distortion": 3600.0,
     "time_tag": 1.0,
 }
-"""In the unit of each kind: stars that leave a sigma beyond it do not show the unknown."""
+"""Largest sigma, in the unit of each kind, with which an unknown still counts as observable."""
 PLAUSIBLE_CHANGE_C = 100.0
-"""Over a change by so many degrees a dependence on temperature is held against these."""
+"""Change of temperature over which a temperature coefficient is judged by `PLAUSIBLE`, in degrees
+C.
+"""
 ARCSEC = 1.0 / ARCSEC_PER_RADIAN
 
 
 def largest_sigma(unknown: Unknown) -> float:
-    """The sigma, in the unknown's unit, beyond which it counts as not observable."""
+    """Sigma, in the unit of the unknown, above which it counts as not observable."""
     per_degree = PLAUSIBLE_CHANGE_C if unknown.of is not None else 1.0
     return PLAUSIBLE[unknown.shape] / per_degree
 
 
 def unknowns_of(trackers: Sequence[Tracker], model: Model) -> list[Unknown]:
-    """Every unknown of a model, tracker by tracker; those of one kind follow each other."""
+    """Unknowns of a calibration model, tracker by tracker and grouped by kind."""
     found: list[Unknown] = []
     for index, tracker in enumerate(trackers):
         free = index > 0 or model.attitudes_known
@@ -131,7 +133,7 @@ def _alignment(index: int, name: str) -> list[Unknown]:
 
 
 def _distortion(index: int, name: str, degree: int) -> list[Unknown]:
-    """Scale and rotation left out of the linear terms, the constants altogether."""
+    """Distortion unknowns up to a degree, without constants, scale and rotation."""
     terms: list[tuple[str, int, int]] = []
     if degree >= 1:
         terms += [(STRETCH, 1, 0), (SKEW, 0, 1)]
@@ -166,13 +168,12 @@ Weights = npt.NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class TrackerStars:
-    """The constants of one tracker's stars (n), whatever the unknowns are.
+    """Fixed data of one tracker's stars (n) during a calibration, independent of the unknowns.
 
-    `rows` are their places among all stars, `columns` (q,) those of the tracker's
-    unknowns among all.  `tangent` (n, 2, 3) are the two directions, in tracker axes,
-    along which residuals are taken.  `bending` are the tracker's unknowns that change the
-    angles, each with its place and the change of h and of v (n,) in radians by one unit of
-    it inside.  `temperature_c` counts from the reference.
+    `rows` are the places of the stars among all stars, `columns` (q,) those of the tracker's
+    unknowns among all unknowns.  `tangent` (n, 2, 3) are the two directions, in tracker axes, along
+    which residuals are taken.  `bending` are the unknowns that change the angles, each with its
+    place and the change of h and of v (n,) per radian.  `temperature_c` counts from the reference.
     """
 
     tracker: Tracker
@@ -190,7 +191,7 @@ class TrackerStars:
     bending: tuple[tuple[int, Vector, Vector], ...]
 
     def places(self, *kinds: str, of_temperature: bool = False) -> list[int]:
-        """The places of the tracker's unknowns of these kinds."""
+        """Indices of the tracker's unknowns of the given kinds, among its own."""
         return [
             place
             for place, each in enumerate(self.unknowns)
@@ -200,7 +201,7 @@ class TrackerStars:
 
 @dataclass(frozen=True, eq=False)
 class Linearised:
-    """The derivatives of one tracker's residuals (2, n), in sigmas.
+    """Derivatives of one tracker's residuals (2, n), in sigmas.
 
     `by_unknown` (q, 2, n) is by the tracker's unknowns, in radians and seconds;
     `by_attitude` (n, 2, 3) by a small rotation d of the batch's attitude about the body
@@ -213,13 +214,15 @@ class Linearised:
 
     @property
     def flat(self) -> Vector:
-        """`by_unknown` as a matrix (q, 2 n)."""
+        """Derivatives by the unknowns, reshaped to a matrix (q, 2 n)."""
         count, angles, n = self.by_unknown.shape
         return self.by_unknown.reshape(count, angles * n)
 
     @cached_property
     def by_turns(self) -> Any:
-        """`by_attitude` as a sparse matrix (2 n, 3 K), K up to the last batch of the tracker."""
+        """Derivatives by the attitudes as a sparse matrix (2 n, 3 K), K up to the tracker's last
+        batch.
+        """
         from scipy.sparse import csr_array
 
         n = len(self.stars.batch)
@@ -234,7 +237,9 @@ class Linearised:
 def prepared(
     stars: IdentifiedStars, unknowns: Sequence[Unknown], reference_temperature_c: float | None
 ) -> list[TrackerStars]:
-    """The stars of each tracker that has some; `stars` are in the order of `usable`."""
+    """Group stars by tracker for a calibration, without trackers that have none; sorted as by
+    `usable`.
+    """
     from_c = 0.0 if reference_temperature_c is None else reference_temperature_c
     edges = np.searchsorted(stars.tracker, np.arange(len(stars.trackers) + 1))
     return [
@@ -286,9 +291,9 @@ def _of_tracker(
 def _bend(
     unknown: Unknown, x: Vector, y: Vector, vander: Vector, radius_rad: float
 ) -> tuple[Vector, Vector]:
-    """The change of h and of v by one of the unknown; `vander` (2, degree + 1, n) is P of x, y.
+    """Change of h and of v per unit of an unknown; `vander` (2, degree + 1, n) are P(x) and P(y).
 
-    One radian of a distortion is so much at the edge of the field.
+    A distortion of one radian moves a star at the edge of the field by one radian.
     """
     kind, i, j = unknown.term
     if unknown.shape == "scale":
@@ -302,7 +307,7 @@ def _bend(
 
 
 def directions(angles_rad: Vector) -> Vector:
-    """Unit vectors (n, 3) in tracker axes of true angles h, v (n, 2)."""
+    """Unit vectors (n, 3) in tracker axes from undistorted angles h, v (n, 2)."""
     tangents = np.tan(angles_rad)
     z = 1.0 / np.sqrt(1.0 + np.sum(tangents**2, axis=1))
     return np.column_stack([tangents * z[:, None], z])
@@ -319,7 +324,7 @@ def _tangents(direction: Vector) -> Vector:
 
 
 def _corrected_angles(stars: TrackerStars, values: Vector) -> Vector:
-    """The angles h, v (n, 2) with the corrections of `values` (p,)."""
+    """Measured angles h, v (n, 2) with scale and distortion corrections from the unknowns (p,)."""
     own, angles = values[stars.columns], stars.angles_rad.copy()
     for place, by_h, by_v in stars.bending:
         if own[place]:
@@ -329,7 +334,7 @@ def _corrected_angles(stars: TrackerStars, values: Vector) -> Vector:
 
 
 def _predicted(stars: TrackerStars, values: Vector, attitude: Matrix) -> tuple[Vector, Matrix]:
-    """The catalog directions (n, 3) in tracker axes, and body_from_tracker with misalignment."""
+    """Catalog directions (n, 3) in tracker axes, and the misaligned rotation to body axes."""
     own = values[stars.columns]
     aligned = stars.places("alignment")
     turned = own[aligned] if aligned else np.zeros(3)
@@ -347,10 +352,10 @@ def _predicted(stars: TrackerStars, values: Vector, attitude: Matrix) -> tuple[V
 
 
 def residuals(stars: TrackerStars, values: Vector, attitude: Matrix) -> Vector:
-    """Observed minus predicted (2, n) in sigmas along the tangents.
+    """Residuals, observed minus predicted direction, (2, n) in sigmas along two tangents.
 
-    `values` (p,) are all unknowns in radians and seconds, `attitude` (K, 3, 3) those of
-    the batches.
+    `values` (p,) are all unknowns in radians and seconds, `attitude` (K, 3, 3) the attitudes of the
+    batches.
     """
     observed = directions(_corrected_angles(stars, values))
     predicted, _ = _predicted(stars, values, attitude)
@@ -359,7 +364,7 @@ def residuals(stars: TrackerStars, values: Vector, attitude: Matrix) -> Vector:
 
 
 def linearised(stars: TrackerStars, values: Vector, attitude: Matrix) -> Linearised:
-    """The derivatives of `residuals`."""
+    """Derivatives of a tracker's residuals by unknowns and attitudes."""
     own = values[stars.columns]
     predicted, body_from_tracker = _predicted(stars, values, attitude)
     angles = _corrected_angles(stars, values)
@@ -389,7 +394,7 @@ def linearised(stars: TrackerStars, values: Vector, attitude: Matrix) -> Lineari
 
 
 def _by_angles(stars: TrackerStars, angles_rad: Vector) -> Vector:
-    """The derivatives (2, 2, n) of the residuals by h, and by v."""
+    """Derivatives (2, 2, n) of the residuals by the angles h and v."""
     direction = directions(angles_rad)
     slope = direction[:, 2, None] / np.cos(angles_rad) ** 2
     along = np.einsum("nri,ni->nr", stars.tangent, direction)
@@ -400,7 +405,7 @@ def _by_angles(stars: TrackerStars, angles_rad: Vector) -> Vector:
 
 
 def _left_jacobian(rotation_rad: Vector) -> Matrix:
-    """The derivative d exp([e x]) / de as a turn from the left, to the first order in e."""
+    """Left Jacobian of SO(3), d exp([e x]) / de, to first order in the rotation vector e."""
     x, y, z = rotation_rad
     return np.eye(3) + 0.5 * np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 

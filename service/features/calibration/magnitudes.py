@@ -26,9 +26,9 @@ from service.vectors import Matrix, Vector
 ZERO, SCALE, COLOR = "magnitude zero", "magnitude scale", "magnitude colour"
 UNITS = {ZERO: "mag", SCALE: "1", COLOR: "mag/mag"}
 PLAUSIBLE = {ZERO: 1.0, SCALE: 0.3, COLOR: 0.5}
-"""A sigma in the unit of each: stars that leave a larger one do not show the unknown."""
+"""Largest sigma, in the unit of each, with which a magnitude unknown still counts as observable."""
 LARGEST = {ZERO: 20.0, SCALE: 0.4, COLOR: 1.0}
-"""A value beyond it is that of no tracker: what it sends is constant, or in another unit."""
+"""Largest plausible value of a magnitude unknown; more means constant data or other units."""
 REASONS = {
     ZERO: "too few different stars with a magnitude",
     SCALE: "the stars are all about as bright as each other",
@@ -36,20 +36,22 @@ REASONS = {
     "magnitude zero",
 }
 LEAST_STARS = 10
-"""Different stars for each number that is estimated: fewer do not tell how much they scatter."""
+"""Least number of different stars per estimated unknown: fewer give no reliable scatter."""
 LEAST_SPREAD_MAG = 0.05
-"""The spread of magnitudes or colours, rms, that the other unknowns must leave."""
+"""Least rms spread of magnitudes or colours that must remain after the other unknowns."""
 HUBER, WRONG = 1.5, 5.0
-"""Bounds of a residual in sigmas: beyond the first it counts less, beyond the second not at all."""
+"""Bounds of a residual in sigmas: above the first its weight decreases, above the second it is
+zero.
+"""
 ROUNDS = 50
 SETTLED_MAG = 1e-6
 MEDIAN_SIZE = 0.6744897501960817
-"""Median of the size of a Gaussian residual, in sigmas."""
+"""Median absolute value of a Gaussian residual, in sigmas."""
 
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeStars:
-    """Observations (n,) of identified stars that have a magnitude.
+    """Observations (n,) of identified stars that have a measured magnitude.
 
     `tracker` are indices into the trackers and `star` rows of the star catalog.  `observed_mag`
     is as corrected by the settings in force, `catalog_mag` the instrument magnitude of the run
@@ -65,7 +67,8 @@ class MagnitudeStars:
 
 @dataclass(frozen=True, eq=False)
 class MagnitudeCalibration:
-    """The terms of a tracker's magnitudes: `value` (p,) and `covariance` (p, p) of `names`.
+    """Magnitude calibration of a tracker: `value` (p,) and `covariance` (p, p) of the terms
+    `names`.
 
     The zero point is that of a star of magnitude `pivot_mag` and colour `pivot_bv_mag`.
     `scatter_mag` is the sigma of one observation.
@@ -83,17 +86,17 @@ class MagnitudeCalibration:
 
     @property
     def sigma(self) -> Vector:
-        """One standard deviation (p,) of each."""
+        """Standard deviation (p,) of each magnitude term."""
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     def value_of(self, name: str) -> float:
-        """The value of an unknown; 0 where it was not estimated."""
+        """Value of a magnitude term; 0 if not estimated."""
         return float(self.value[self.names.index(name)]) if name in self.names else 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class _Line:
-    """Values (p,), their covariance (p, p), the sigma of one observation, and which are `used`."""
+    """Fitted line: values (p,), covariance (p, p), sigma of one observation, mask of used ones."""
 
     value: Vector
     covariance: Matrix
@@ -102,7 +105,7 @@ class _Line:
 
 
 def joined(parts: Sequence[MagnitudeStars]) -> MagnitudeStars | None:
-    """The observations of several batches; None where there is none."""
+    """Concatenate the observations of several batches; None without any."""
     if not parts:
         return None
     names = ("tracker", "star", "observed_mag", "catalog_mag", "color_bv_mag")
@@ -114,10 +117,10 @@ def joined(parts: Sequence[MagnitudeStars]) -> MagnitudeStars | None:
 def calibrate_magnitudes(
     stars: MagnitudeStars | None, trackers: Sequence[str], settings: Mapping[str, Magnitudes]
 ) -> tuple[MagnitudeCalibration, ...]:
-    """Every tracker's magnitudes; what its stars do not show is left out and named.
+    """Calibrate the magnitudes of every tracker; terms that its stars do not determine are named.
 
-    So is what would change the settings of a tracker, by its name, to ones that no mission file
-    may have.
+    A result that would give a tracker magnitude settings outside of the range of mission files is
+    dropped and named as well.
     """
     found = []
     for index, name in enumerate(trackers):
@@ -134,10 +137,11 @@ def calibrate_magnitudes(
 def calibrated_settings(
     trackers: Sequence[Tracker], found: Sequence[MagnitudeCalibration], names: Sequence[str]
 ) -> dict[str, Magnitudes]:
-    """The settings of a mission's trackers by name with what was found of those of `names`.
+    """Magnitude settings of all trackers by name, updated with the calibrations of the trackers
+    `names`.
 
-    `trackers` are with the settings that the observations were corrected with.  The run catalog
-    has the mean colour term of all trackers, so that each is right at its median colour.
+    `trackers` have the settings that the observations were corrected with.  The run catalog has the
+    mean colour term of all trackers, so that each is right at its median colour.
     """
     by_name = {names[each.tracker]: each for each in found if each.names}
     change = sum(each.value_of(COLOR) for each in by_name.values()) / len(trackers)
@@ -183,7 +187,7 @@ def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> Magni
     kept = _with_spread(columns, stars.star[own])
     reasons = dict(REASONS)
     while kept:
-        # A star of unknown colour says nothing where a colour term is estimated.
+        # A star of unknown colour cannot be used to estimate a colour term.
         rows = colored if COLOR in kept else np.ones(len(own), dtype=np.bool_)
         design = np.column_stack([columns[name] for name in kept])[rows]
         line = _robust_line(design, off[rows], stars.star[own][rows])
@@ -213,7 +217,7 @@ def _of_tracker(stars: MagnitudeStars | None, index: int, tracker: str) -> Magni
 
 
 def _beyond(names: Sequence[str], line: _Line) -> list[str]:
-    """The unknowns that the stars do not show, or show to be what they cannot be."""
+    """Magnitude unknowns with a sigma too large to count as observable, or an implausible value."""
     sigma = np.sqrt(np.diag(line.covariance))
     return [
         name
@@ -239,9 +243,9 @@ def _with_spread(columns: dict[str, Vector], star: Indices) -> list[str]:
 
 
 def _robust_line(design: Matrix, off: Vector, star: Indices) -> _Line | None:
-    """The line of `design` (n, p); None where what is left of the observations shows none.
+    """Robust line fit with the columns of `design` (n, p); None if the remaining data are singular.
 
-    The covariance sums what each star pulls at the values (Huber 1967; Liang & Zeger 1986).
+    The covariance sums the contributions of each star (Huber 1967; Liang & Zeger 1986).
     """
     try:
         return _fitted(design, off, star)
@@ -260,7 +264,7 @@ def _fitted(design: Matrix, off: Vector, star: Indices) -> _Line:
         scatter = max(size * math.sqrt(n / max(n - p, 1)), 1e-6)
         length = np.abs(residual) / scatter
         weight = np.minimum(1.0, HUBER / np.maximum(length, 1e-300))
-        # Before the line has found its place, a good star may look wrong.
+        # In the first iterations the line may be far off, and a good star look wrong.
         weight[(length > WRONG) & (number > 2)] = 0.0
         step = np.linalg.solve(
             design.T @ (design * weight[:, None]), design.T @ (weight * residual)
@@ -269,7 +273,7 @@ def _fitted(design: Matrix, off: Vector, star: Indices) -> _Line:
         if number > 2 and float(np.abs(step).max()) < SETTLED_MAG:
             break
     residual = off - design @ value
-    # Beyond the bound a residual does not pull any harder, and has no slope.
+    # Beyond the bound the weighted residual is constant, with slope zero.
     slope = (np.abs(residual) <= HUBER * scatter).astype(np.float64)
     inverse = np.linalg.inv(design.T @ (design * slope[:, None]))
     _, place = np.unique(star, return_inverse=True)

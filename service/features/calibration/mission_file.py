@@ -1,4 +1,6 @@
-"""A calibration as settings of a mission: alignment, focal plane and magnitudes of trackers."""
+"""Conversion of a calibration to mission settings: alignment, focal plane and magnitudes of
+trackers.
+"""
 
 import math
 import re
@@ -32,13 +34,12 @@ def calibrated_mission_text(
     in_force: Mission | None = None,
     magnitudes: Mapping[str, Magnitudes] | None = None,
 ) -> str:
-    """The text of a mission file with a calibration's alignment, scale and distortion.
+    """Text of a mission file with a calibration's alignment, scale and distortion written into it.
 
-    `in_force` are the settings that the calibration started from, where these are not the
-    file's: what differs is written, too.  `magnitudes` are the calibrated ones of trackers by
-    name; others stay as in `in_force`.  Everything else stays as it is.  Raises
-    `BadConfiguration` for a file whose trackers are not laid out as `[[trackers]]` with each
-    axis in one line.
+    `in_force` are the settings that the calibration started from, if they are not the file's:
+    differences are written as well.  `magnitudes` are the calibrated ones of trackers by name;
+    others stay as in `in_force`.  All other lines stay unchanged.  Raises `BadConfiguration` for a
+    file whose trackers are not laid out as `[[trackers]]` with each axis in one line.
     """
     mission = parse_mission(text, file)
     lines = text.splitlines()
@@ -63,10 +64,9 @@ def calibrated_mission_text(
 def tracker_lines(
     tracker: Tracker, found: Calibration, own: Tracker | None = None
 ) -> dict[str, Lines]:
-    """The keys of a tracker, and of its `calibration`, that change, each with its value as TOML.
+    """Changed keys of a tracker and of its table `calibration`, each with its value as TOML.
 
-    `own` is the tracker as the mission file has it, where the calibration did not start from
-    that.
+    `own` is the tracker as in the mission file, if the calibration started from other settings.
     """
     lines = _corrected(tracker, found)
     if own is None:
@@ -82,7 +82,7 @@ def tracker_lines(
 
 
 def magnitude_lines(magnitudes: Magnitudes, own: Tracker) -> Lines:
-    """The keys of the table `magnitudes` of a tracker of the mission file, if they change."""
+    """Keys of the table `magnitudes` for a tracker in a mission file; empty if unchanged."""
     if magnitudes == own.magnitudes:
         return {}
     return {name: repr(value) for name, value in magnitudes.model_dump().items()}
@@ -109,7 +109,9 @@ def _vector(axis: Matrix) -> str:
 
 
 def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
-    """The table `calibration`: the present polynomials with the corrections added to them."""
+    """Table `calibration` of a mission file: the present polynomials plus the estimated
+    corrections.
+    """
     present = tracker.calibration
     scale = present.scale + sum(value for each, value in bent.items() if each.kind == "scale")
     added = _polynomials_deg(bent, tracker.field_of_view_radius_deg)
@@ -132,7 +134,7 @@ def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
 def _polynomials_deg(
     bent: Mapping[Unknown, float], radius_deg: float
 ) -> tuple[dict[tuple[int, int], float], ...]:
-    """Polynomials added to h and v, in degrees, by powers of the measured h and v in degrees."""
+    """Polynomials to add to h and v, in degrees, as coefficients of powers of measured h and v."""
     size = max((each.degree for each in bent), default=0) + 1
     series = np.zeros((2, size, size))
     for each, value in bent.items():
@@ -160,7 +162,9 @@ def _polynomials_deg(
 
 
 def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
-    """Replace the keys of the tracker at `index`, and its table `calibration`, in place."""
+    """Replace the changed keys of tracker number `index` and its tables in the lines of a mission
+    file.
+    """
     places = [at for at, line in enumerate(lines) if _TRACKERS.match(line)]
     if index >= len(places):
         return
@@ -176,7 +180,9 @@ def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
 
 
 def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> None:
-    """Put a table of the tracker that begins at a line in its place, or after its own keys."""
+    """Write a table of the tracker that begins at a line: in the old table's place, or after its
+    keys.
+    """
     end = next((at for at in range(begin, len(lines)) if _HEADER.match(lines[at])), len(lines))
     following = next(
         (at for at in range(begin, len(lines)) if _TRACKERS.match(lines[at])), len(lines)
@@ -198,7 +204,7 @@ def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> No
 
 
 def _holds(edited: Mission, before: Mission, expected: Mapping[str, Mapping[str, Lines]]) -> bool:
-    """True if the edited mission has every change, and is the same but for these."""
+    """True if the edited mission has all expected changes and no others."""
     for old, new in zip(before.trackers, edited.trackers, strict=True):
         wanted = expected[old.name]
         for key, value in wanted["tracker"].items():

@@ -1,6 +1,6 @@
-"""The page of a spacecraft's calibration: what was found, what it would change, what holds.
+"""Console page for the calibration of a spacecraft: results, proposed changes, settings in force.
 
-Its chart shows the parameters of trackers over the versions of a calibration, with their sigmas.
+A chart shows the parameters of trackers over the versions of a calibration, with their sigmas.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -31,12 +31,12 @@ from service.web.requests.access import Policy
 WIDTH, HEIGHT, PAD = 420.0, 96.0, 10.0
 SIGMAS = 1.0
 STAR_MAG = 5.0
-"""V of the star, of a Sun-like colour, by which zero points are compared."""
+"""V magnitude of the star, with the Sun's colour, at which zero points are compared."""
 
 
 @dataclass(frozen=True)
 class Point:
-    """One version's value; `low` and `high` are the ends of its error bar."""
+    """Value of a parameter in one version of a calibration; `low` and `high` end its error bar."""
 
     version: int
     time: str
@@ -50,7 +50,9 @@ class Point:
 
 @dataclass(frozen=True)
 class ParameterHistory:
-    """A parameter by the time of its batches; `top` and `bottom` are the ends of the chart."""
+    """Chart of a parameter against the time of its batches; `top` and `bottom` are values at its
+    edges.
+    """
 
     name: str
     unit: str
@@ -62,7 +64,7 @@ class ParameterHistory:
 
     @property
     def line(self) -> str:
-        """The path through all points."""
+        """SVG path through all points of the chart."""
         places = (f"{each.x:.1f} {each.y:.1f}" for each in self.points)
         return "M" + "L".join(places)
 
@@ -70,9 +72,9 @@ class ParameterHistory:
 def parameter_histories(
     versions: Sequence[CalibrationSummary], file: Mission
 ) -> list[ParameterHistory]:
-    """Alignment, scale and magnitudes by the mission file's, and time tags, of versions done.
+    """Charts of alignment, scale, magnitudes and time tags over all completed calibration versions.
 
-    All are counted from the same settings, whatever was in force when they were estimated.
+    All values are relative to the mission file, whatever settings were in force at the estimate.
     """
     found: dict[tuple[str, str], list[Point]] = {}
     for each in versions:
@@ -120,7 +122,9 @@ def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str)
 
 
 def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:
-    """The rotation about the body axes from one alignment to another; small angles."""
+    """Rotation vector about the body axes from one alignment to another, in arcsec, for small
+    angles.
+    """
     axes = [tracker.x_axis_body, tracker.y_axis_body, tracker.z_axis_body]
     turn = np.column_stack(axes) @ before.T
     vector = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -159,7 +163,7 @@ CERTAIN_SIGMAS = 3.0
 
 
 class CalibrationPageQuery(PageQuery):
-    """Which version; by default the latest that is done."""
+    """Query that selects a version of the calibration; by default the latest that is done."""
 
     version: Annotated[int | None, Field(ge=1)] = None
 
@@ -170,7 +174,9 @@ class CalibrationPageQuery(PageQuery):
 def calibration_page(
     name: str, query: FromQuery[CalibrationPageQuery], context: ContextDep
 ) -> Response:
-    """Residual maps, parameters and their history, and what was adopted when."""
+    """Console page with residual maps, parameters and their history, and adoptions of a
+    calibration.
+    """
     app = context.app
     in_force = app.adoptions.in_force(name)
     versions = app.part(Calibrations).page(name, SHOWN).items
@@ -200,7 +206,7 @@ def calibration_page(
 
 
 def _recorded(context: PageContext, name: str) -> int:
-    """How many live batches of a spacecraft there are."""
+    """Number of recorded live batches of a spacecraft."""
     live = [each for each in context.app.runs.all([name]) if each.run == LIVE]
     return live[0].batches if live else 0
 
@@ -208,7 +214,7 @@ def _recorded(context: PageContext, name: str) -> int:
 def _shown(
     read: Callable[[str], Calibration], versions: Sequence[CalibrationSummary], version: int | None
 ) -> Calibration | None:
-    """The version that is asked for, or the latest that is done; raises `NotFound`."""
+    """Calibration with the requested version, or the latest that is done; raises `NotFound`."""
     for each in versions:
         if each.version == version or (version is None and each.state == "done"):
             return read(each.id)

@@ -1,4 +1,4 @@
-"""Calibrations: begun, computed beside other work, recorded, tried, read, and adopted."""
+"""Service for calibrations: start, computation in the background, recording, trial and adoption."""
 
 import logging
 import math
@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 
 class Calibrations:
-    """Estimates and records calibrations; no setting is changed."""
+    """Starts, records, reads and tries calibrations; settings change only by adoption."""
 
     def __init__(
         self,
@@ -67,15 +67,15 @@ class Calibrations:
     def of_spacecraft(
         self, wanted: CalibrationRequest, step: Step = lambda done, total: None
     ) -> CalibrationRun:
-        """The calibration that the batches of a run give; nothing is recorded.
+        """Calibrate a mission from batches of a run without recording the result.
 
-        Raises `BadInput` where there are too few identified stars.
+        Raises `BadInput` if there are too few identified stars.
         """
         mission = mission_named(self._context.missions, wanted.spacecraft)
         return self._estimator.estimate(wanted, mission, step)
 
     def record(self, wanted: CalibrationRequest, found: CalibrationRun, who: str) -> Calibration:
-        """Record a calibration that was computed here."""
+        """Record a calibration that is already computed."""
         id = self._ids.new()
         row = self._row(id, wanted, found.mission, who)
         changes = found_columns(found) | {"done": found.sampled, "total": found.sampled}
@@ -90,9 +90,9 @@ class Calibrations:
     def start(
         self, wanted: CalibrationRequest, who: str, entry: Entry | None = None
     ) -> Calibration:
-        """Record a calibration as begun, and compute it beside other work, one after the other.
+        """Record a calibration as started, and queue its computation in a background thread.
 
-        Raises `BadInput` for trackers that the mission has not, `Busy` where too many wait.
+        Raises `BadInput` for trackers that the mission lacks, `Busy` if too many calibrations wait.
         """
         mission = mission_named(self._context.missions, wanted.spacecraft)
         wanted.require(mission)
@@ -116,7 +116,7 @@ class Calibrations:
     def page(
         self, spacecraft: str | None = None, limit: int = 100, cursor: str | None = None
     ) -> Page[CalibrationSummary]:
-        """Calibrations, newest first."""
+        """One page of calibrations, newest first."""
         if spacecraft is not None:
             self._context.mission(spacecraft)
         with self._context.reading() as connection:
@@ -132,9 +132,10 @@ class Calibrations:
         sample: int = COMPARE_SAMPLE,
         limit_s: float = math.inf,
     ) -> Comparison:
-        """Recorded batches with the settings in force (`a`), and with a calibration (`b`).
+        """Process recorded batches with the settings in force (`a`) and with a calibration (`b`).
 
-        Without a `run` the batches of the calibration's run.  The comparison is not recorded.
+        Without a `run` the batches of the calibration's run are taken.  The comparison is not
+        recorded.
         """
         calibration = self.get(id)
         result = calibration.result
@@ -149,9 +150,9 @@ class Calibrations:
     def adopt(
         self, id: str, who: str, note: str = "", entry: Entry | None = None
     ) -> CalibrationAdoption:
-        """Let new batches be processed with a calibration.
+        """Process new batches with a calibration from now on.
 
-        Raises `WrongState` for one that is not done, is in force already, or knows other
+        Raises `WrongState` for a calibration that is not done, is in force already, or has other
         trackers than the mission.
         """
         found = self.get(id)
@@ -161,12 +162,12 @@ class Calibrations:
         return self._adoptions.adopt(found.spacecraft, trackers, found.id, who, note, entry)
 
     def interrupt(self) -> None:
-        """Close the calibrations that a stopped process left unfinished."""
+        """Mark calibrations that a stopped process left unfinished as interrupted."""
         now = utc_now().text
         self._context.change(lambda connection: interrupt_calibrations(connection, now))
 
     def close(self) -> None:
-        """End the calibration that is computed, and those that wait."""
+        """Stop the calibration that is being computed, and drop the queued ones."""
         self._background.close()
 
     def _row(self, id: str, wanted: CalibrationRequest, mission: Mission, who: str) -> Row:
@@ -195,7 +196,7 @@ SAVED_EVERY_S = 0.5
 
 
 class BackgroundCalibrations:
-    """A thread that computes calibrations and records what they come to."""
+    """A thread that computes queued calibrations and records their results."""
 
     def __init__(self, context: Context, estimator: Estimator) -> None:
         self._context, self._estimator = context, estimator
@@ -214,7 +215,7 @@ class BackgroundCalibrations:
     ) -> None:
         """Queue a calibration once `begin` has recorded it.
 
-        Raises `Busy` where too many wait, `Stopping` while the service closes.
+        Raises `Busy` if too many wait, `Stopping` while the service closes.
         """
         with self._lock:
             if self._closing:
@@ -231,7 +232,7 @@ class BackgroundCalibrations:
             raise
 
     def close(self) -> None:
-        """End the calibration that is computed, and those that wait."""
+        """Stop the calibration that is being computed, and drop the queued ones."""
         with self._lock:
             self._closing = True
         self._closed.set()
@@ -270,14 +271,14 @@ class BackgroundCalibrations:
 
 
 class _Progress:
-    """Notes how far a calibration is."""
+    """Records the progress of a calibration in the database, at most every half second."""
 
     def __init__(self, context: Context, id: str, is_closing: Callable[[], bool]) -> None:
         self._context, self._id, self._is_closing = context, id, is_closing
         self._next_s = 0.0
 
     def step(self, done: int, total: int) -> None:
-        """Raises `Stopping` where the service stops."""
+        """Record progress; raises `Stopping` if the service stops."""
         if self._is_closing():
             raise Stopping("the service is stopping")
         now_s = time.monotonic()
@@ -292,7 +293,7 @@ class _Progress:
 
 
 def found_columns(run: CalibrationRun) -> Row:
-    """The columns of a calibration that is done."""
+    """Database columns of a completed calibration."""
     return {
         "state": "done",
         "ended": utc_now().text,
@@ -302,6 +303,8 @@ def found_columns(run: CalibrationRun) -> Row:
 
 
 def open_part(app: App) -> Calibrations:
-    """Calibrations of an open app, which ends what an ended service left of them."""
+    """Create the calibration service of an open app, which ends calibrations left by a stopped
+    service.
+    """
     app.single_projector.ends_left_work(unfinished_calibrations, interrupt_calibrations)
     return Calibrations(app.context, app.submissions, app.comparisons, app.adoptions)

@@ -1,4 +1,4 @@
-"""Calibrations in the records: what was asked, how far they are, and what was found."""
+"""Stored calibrations: the request, the progress, and the result."""
 
 import json
 from collections.abc import Collection
@@ -31,7 +31,7 @@ UnknownKind = Literal["alignment", "scale", "distortion", "temperature", "time_t
 
 
 class CalibrationBatches(Record, frozen=True, kw_only=True):
-    """The batches that a calibration came from."""
+    """Numbers of batches that a calibration used, and their period."""
 
     total: Annotated[Count, doc("Batches in the period.")]
     sampled: Annotated[Count, doc("Batches that were processed again.")]
@@ -42,7 +42,7 @@ class CalibrationBatches(Record, frozen=True, kw_only=True):
 
 
 class CalibrationHeldOut(Record, frozen=True, kw_only=True):
-    """How well a distortion of a degree predicts blocks of time that it was not fitted to."""
+    """Prediction error of a distortion of some degree on blocks of time outside of its fit."""
 
     degree: Count
     residual_over_sigma: float
@@ -50,7 +50,7 @@ class CalibrationHeldOut(Record, frozen=True, kw_only=True):
 
 
 class CalibrationResiduals(Record, frozen=True, kw_only=True):
-    """Root mean square of a tracker's residuals per axis, before and after."""
+    """Root mean square of a tracker's residuals per axis, before and after calibration."""
 
     tracker: str
     stars: Count
@@ -72,7 +72,7 @@ class CalibrationUnknown(Record, frozen=True, kw_only=True):
 
 
 class CalibrationNotObservable(Record, frozen=True, kw_only=True):
-    """Something that the stars cannot show, and why."""
+    """A parameter that the stars do not determine, and the reason."""
 
     name: str
     reason: str
@@ -98,7 +98,7 @@ class ResidualMap(Record, frozen=True, kw_only=True):
 
 
 class CalibrationResult(Record, frozen=True, kw_only=True):
-    """What the stars say of the trackers."""
+    """Result of a calibration: parameters, residuals, and the settings to change."""
 
     batches: CalibrationBatches
     stars: Count
@@ -116,7 +116,7 @@ class CalibrationResult(Record, frozen=True, kw_only=True):
 
 
 class CalibrationProgress(Record, frozen=True, kw_only=True):
-    """What every calibration has from its start on."""
+    """Fields of every calibration, present from its start on."""
 
     component: ClassVar[str] = ""
     id: Id
@@ -145,7 +145,7 @@ class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
 
 
 class Calibration(CalibrationProgress, frozen=True, kw_only=True):
-    """A calibration: what was asked, how far it is, and what was found."""
+    """A calibration: its request, its progress and its result."""
 
     request: MissionSettings
     fault: str | None
@@ -167,7 +167,7 @@ _SUMMARY = tuple(calibrations.c[name] for name in (*_PLAIN, "mission_digest", "r
 
 
 def add_calibration(connection: Connection, row: Row) -> None:
-    """Record a calibration that begins, as the next version of its spacecraft."""
+    """Insert a calibration that begins, as the next version of its spacecraft."""
     latest = select(func.max(calibrations.c.version)).where(
         calibrations.c.spacecraft == row["spacecraft"]
     )
@@ -176,12 +176,12 @@ def add_calibration(connection: Connection, row: Row) -> None:
 
 
 def change_calibration(connection: Connection, id: str, changes: Row) -> None:
-    """Note the progress of a calibration, or its end."""
+    """Store the progress or the result of a calibration."""
     connection.execute(update(calibrations).where(calibrations.c.id == id).values(changes))
 
 
 def unfinished_calibrations(connection: Connection) -> set[str]:
-    """The ids of the calibrations that are computed, or wait for that."""
+    """Ids of the calibrations that are being computed or are queued."""
     unfinished = calibrations.c.state.in_(UNFINISHED)
     return set(connection.scalars(select(calibrations.c.id).where(unfinished)))
 
@@ -189,9 +189,9 @@ def unfinished_calibrations(connection: Connection) -> set[str]:
 def interrupt_calibrations(
     connection: Connection, now: str, only: Collection[str] | None = None
 ) -> None:
-    """Close the calibrations that a stopped process left unfinished; with `only`, of these alone.
+    """Mark unfinished calibrations as interrupted; with `only`, just the ones with these ids.
 
-    One that another process is at work on is set to what it came to when that process ends it.
+    A calibration that another process is still computing gets its result when it ends.
     """
     left = [calibrations.c.state.in_(UNFINISHED)]
     if only is not None:
@@ -200,7 +200,7 @@ def interrupt_calibrations(
 
 
 def read_calibration(connection: Connection, id: str) -> Calibration:
-    """One calibration with all that was found; raises `NotFound`."""
+    """Read a calibration with its complete result; raises `NotFound`."""
     row = connection.execute(select(calibrations).where(calibrations.c.id == id)).mappings().first()
     if row is None:
         raise NotFound(f"there is no calibration with the id {shown_value(id)}")
@@ -216,7 +216,7 @@ def read_calibration(connection: Connection, id: str) -> Calibration:
 def list_calibrations(
     connection: Connection, spacecraft: str | None, limit: int, cursor: str | None
 ) -> Page[CalibrationSummary]:
-    """Calibrations, newest first; a cursor is the id of the last one shown."""
+    """One page of calibrations, newest first; the cursor is the id of the last one shown."""
     query = select(*_SUMMARY).order_by(calibrations.c.id.desc()).limit(limit + 1)
     if spacecraft is not None:
         query = query.where(calibrations.c.spacecraft == spacecraft)

@@ -1,4 +1,4 @@
-"""Trackers calibrated from recorded batches: estimated, tried, adopted and taken back."""
+"""API routes for calibrations of trackers: start, read, try, adopt and revert."""
 
 from typing import Annotated, Self
 
@@ -38,7 +38,7 @@ CalibrationId = Annotated[str, Path(description="The `id` of a calibration.")]
 
 
 class _Period(Wire):
-    """The batches that are used."""
+    """Period of the batches to use."""
 
     start: params.Start = None
     end: params.End = None
@@ -50,7 +50,7 @@ class _Period(Wire):
 
 
 class CalibrationIn(_Period):
-    """What is calibrated, and with which batches."""
+    """Request body for a calibration: the parameters to estimate and the batches to use."""
 
     spacecraft: Key
     run: RunName = "live"
@@ -82,7 +82,7 @@ class CalibrationIn(_Period):
     who: Who = None
 
     def request(self) -> CalibrationRequest:
-        """What is asked, without the author."""
+        """Convert the body to a request for the calibration service, without the author."""
         return CalibrationRequest(**{name: getattr(self, name) for name in _ASKED})
 
 
@@ -90,14 +90,16 @@ _ASKED = tuple(name for name in CalibrationIn.model_fields if name != "who")
 
 
 class CalibrationTrialIn(_Period):
-    """The batches that a calibration is tried over; without a run those of the calibration's."""
+    """Request body for a trial of a calibration; without a run the batches of the calibration's
+    run.
+    """
 
     run: RunName | None = None
     sample: SampleSize = COMPARE_SAMPLE
 
 
 class _Signed(Wire):
-    """Who changes the calibration in force, and why."""
+    """Author and note of a change of the calibration in force."""
 
     who: Who = None
     note: Annotated[
@@ -108,11 +110,11 @@ class _Signed(Wire):
 
 
 class CalibrationAdoptIn(_Signed):
-    """The author of an adoption, and the reason."""
+    """Request body for the adoption of a calibration."""
 
 
 class CalibrationRevertIn(_Signed):
-    """What the spacecraft goes back to."""
+    """Request body to return to an earlier adoption or to the mission file."""
 
     to: Annotated[
         Key | None, Field(description="The `id` of an earlier adoption; null: the mission file.")
@@ -120,7 +122,7 @@ class CalibrationRevertIn(_Signed):
 
 
 class CalibrationQuery(Query):
-    """Which calibrations."""
+    """Query that selects calibrations by spacecraft."""
 
     spacecraft: params.SpacecraftFilter = None
     limit: params.PageLimit = 100
@@ -191,7 +193,7 @@ def try_calibration(id: CalibrationId, body: JsonBody, app: AppDep, caller: Call
 def adopt_calibration(
     id: CalibrationId, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
-    """Let new batches of the spacecraft be processed with a calibration."""
+    """Process new batches of the spacecraft with a calibration from now on."""
     asked = read_model(CalibrationAdoptIn, body)
     _visible(app, id, change.caller)
     who = change.author(asked.who)
@@ -204,7 +206,7 @@ def adopt_calibration(
     Returns("The calibration in force.", CalibrationInForce),
 )
 def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
-    """The calibration that new batches use, and what held when."""
+    """The calibration in force for new batches of a spacecraft, and the history of adoptions."""
     return json_response(app.adoptions.in_force(name))
 
 
@@ -218,14 +220,14 @@ def get_calibration_in_force(name: SpacecraftPath, app: AppDep) -> Response:
 def revert_calibration(
     name: SpacecraftPath, body: JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
-    """Go back to an earlier adoption, or to the mission file."""
+    """Return to an earlier adopted calibration, or to the mission file."""
     asked = read_model(CalibrationRevertIn, body)
     who = change.author(asked.who)
     return json_response(app.adoptions.revert(name, asked.to, who, asked.note, change.entry()))
 
 
 def _visible(app: AppDep, id: str, caller: Caller) -> models.Calibration:
-    """A calibration of the caller's spacecraft; raises `NotFound` for those of others."""
+    """A calibration that the caller may see; raises `NotFound` for other callers' spacecraft."""
     found = app.part(Calibrations).get(id)
     if not caller.may_see(found.spacecraft):
         raise NotFound(f"there is no calibration with the id {shown_value(id)}")

@@ -1,4 +1,4 @@
-"""Calibrations that an earlier process left unfinished end as the service starts."""
+"""Start-up task that ends calibrations left unfinished by an earlier process."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -12,12 +12,14 @@ from service.web.requests.metrics import Metrics
 
 
 def check(settings: Settings) -> None:
-    """Calibrations have no settings."""
+    """Do nothing: calibrations have no settings to check."""
 
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Close what was left, where no other service may be at work on it."""
+    """Mark left calibrations as interrupted at start-up, unless another service may be computing
+    them.
+    """
     # A command may run beside the service that computes a calibration.
     if app.store.lock is None:
         await run_sync(app.part(Calibrations).interrupt)

@@ -1,4 +1,4 @@
-"""The identified stars of many batches, as columns."""
+"""Table of identified stars of many batches, the input of a calibration."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -13,7 +13,7 @@ from service.vectors import Matrix, Vector
 Indices = npt.NDArray[np.int64]
 
 LEAST_STARS = 2
-"""One star leaves its batch's attitude open and says nothing of a tracker."""
+"""Least number of stars of a batch: one star alone determines no attitude, so no calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,18 +56,18 @@ class IdentifiedStars:
 
     @property
     def batches(self) -> int:
-        """The number of batches."""
+        """Number of batches in the table."""
         return len(self.time_s)
 
     def chosen(self, rows: npt.NDArray[np.int64] | npt.NDArray[np.bool_]) -> "IdentifiedStars":
-        """The stars of these rows; the batches stay as they are."""
+        """Table with the stars in the given rows; the batches stay unchanged."""
         return replace(self, **{name: getattr(self, name)[rows] for name in _OF_STARS})
 
     def usable(self, attitudes_known: bool) -> "IdentifiedStars":
-        """The stars by tracker and batch, without batches of fewer than two.
+        """Stars sorted by tracker and batch, without batches of fewer than two stars.
 
-        Such a batch says something only where its attitude is known.  Raises `BadInput`
-        where no batch is left.
+        Batches with one star are kept if attitudes are known.  Raises `BadInput` if no batch is
+        left.
         """
         stars = self if attitudes_known else self._with_enough_stars()
         return stars.chosen(np.lexsort((stars.batch, stars.tracker)))
@@ -102,7 +102,7 @@ _OF_BATCHES = ("time_s", "attitude", "rates_rad_per_s")
 
 
 def joined(parts: Sequence[IdentifiedStars]) -> IdentifiedStars:
-    """The stars of parts (at least one), each of its own batches, as one in order of time."""
+    """Merge tables of identified stars from disjoint batches into one, in order of time."""
     shift = np.cumsum([0, *(part.batches for part in parts)])
     columns = {
         name: np.concatenate([getattr(part, name) for part in parts])

@@ -1,4 +1,4 @@
-"""Calibrations as text for a terminal."""
+"""Calibration results as text for a terminal."""
 
 from typing import Any
 
@@ -13,7 +13,9 @@ CERTAIN_SIGMAS = 3.0
 
 
 def calibration_text(result: CalibrationRun) -> str:
-    """Parameters with sigmas, residuals before and after, and what the stars do not show."""
+    """Format a calibration: parameters with sigmas, residuals, and unknowns that are not
+    observable.
+    """
     found = result.found
     summary = (
         f"{result.used} of {result.sampled} batches had identified stars ({result.total} in the "
@@ -53,6 +55,6 @@ def _residual_lines(found: Calibration) -> list[str]:
 
 
 def calibration_json(result: CalibrationRun) -> dict[str, Any]:
-    """The result as `GET /api/v1/calibrations/{id}` has it, with its covariance."""
+    """Result of a calibration as in `GET /api/v1/calibrations/{id}`, with its covariance."""
     found: dict[str, Any] = msgspec.to_builtins(estimates.result_of(result))
     return found | {"covariance": result.covariance.tolist()}
