@@ -30,9 +30,7 @@ ALL_RECOMMENDED = "all that is recommended"
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """Alternative mission settings for a trial: an identifier, and tolerances that replace the
-    mission's.
-    """
+    """Alternative mission settings for a trial: an identifier, and tolerances to replace."""
 
     name: str
     identifier: Identifier
@@ -130,18 +128,14 @@ def trial_counts(acquisition: Acquisition, verified: Sequence[Identification]) -
 def variant_outcome(
     variant: Variant, counts: Sequence[TrialCounts], present: Sequence[TrialCounts] | None
 ) -> VariantOutcome:
-    """Star counts summed over a sample, and their change against the same batches under present
-    settings.
-    """
+    """Star counts summed over a sample, and their change against the present settings."""
     sums = {name: sum(getattr(each, name) for each in counts) for name in (*OUTCOMES, "other_star")}
     change = None if present is None else _change(counts, present)
     return VariantOutcome(variant, len(counts), **sums, change=change)
 
 
 def _change(counts: Sequence[TrialCounts], present: Sequence[TrialCounts]) -> Interval | None:
-    """Change of the share of unique stars, in percentage points, with the variance of a ratio
-    estimator.
-    """
+    """Change of the share of stars not unique, in percentage points, with its 95 % interval."""
     stars = np.array([each.observed for each in counts], float)
     lost = np.array(
         [before.unique - after.unique for after, before in zip(counts, present, strict=True)],
@@ -337,9 +331,7 @@ def mission_variants(mission: Mission) -> Iterator[tuple[str, Mission]]:
 def _mission_trials(
     mission: Mission, sample: "_SampledBatches", run_with: RunWith, pace: WorkLimit
 ) -> Iterator[VariantOutcome]:
-    """Star counts of sampled batches processed with changed missions, one changed setting at a
-    time.
-    """
+    """Star counts of sampled batches with changed missions, one changed setting at a time."""
     cases = [
         case
         for case in sample.cases[:MOST_WITH_MISSION]

@@ -462,9 +462,7 @@ class Part:
 
     @property
     def points(self) -> float | None:
-        """Change of the share of ambiguous stars, in percentage points; None without an earlier
-        share.
-        """
+        """Change of the share of ambiguous stars in percentage points; None: no earlier share."""
         return None if self.before is None else 100.0 * (self.share.value - self.before.value)
 
     @property
@@ -476,9 +474,7 @@ class Part:
 
 
 def parts(now: StarTable, before: StarTable | None) -> list[Part]:
-    """Ambiguous shares of groups of stars: all, by tracker, bright and faint, inner and outer
-    field.
-    """
+    """Ambiguous shares of groups of stars: all, by tracker, brightness and place in the field."""
     found = [_part("all stars", now, before, lambda t: np.ones(len(t.batch), bool))]
     if len(now.trackers) > 1:
         found += [_part(name, now, before, _of_tracker(name)) for name in now.trackers]
@@ -518,7 +514,5 @@ def _part(
 
 
 def common_rivals(now: StarTable) -> list[tuple[str, int]]:
-    """Most frequent groups of rival catalog stars, with the number of ambiguous stars for each
-    group.
-    """
+    """Most frequent groups of rival catalog stars, with their numbers of ambiguous stars."""
     return [(", ".join(names), n) for names, n in Counter(now.rivals).most_common(COMMON)]

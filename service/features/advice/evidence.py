@@ -154,9 +154,7 @@ def merged(parts: Iterable[Evidence]) -> Evidence:
 
 
 def _uniquely_identified(result: TrackerResult) -> npt.NDArray[np.bool_]:
-    """Mask of unique stars, except where two observed stars share a catalog star: one must be
-    wrong.
-    """
+    """Mask of unique stars; two observed stars with one catalog star are excluded."""
     star = result.identification.star
     names, count = np.unique(star, return_counts=True)
     return result.identification.unique & ~np.isin(star, names[count > 1])

@@ -111,9 +111,7 @@ def _latest(parts: Sequence[MeasuredInnovations]) -> list[MeasuredInnovations]:
 def _segment_sums(
     parts: Sequence[MeasuredInnovations],
 ) -> tuple[Full, Full, int] | None:
-    """Left matrices (segments, 2, 2) and right sides (segments, 2) of both equations, summed by
-    segment.
-    """
+    """Left matrices (segments, 2, 2) and right sides (segments, 2) of both equations by segment."""
     used = [part for whole in parts for part in _unbroken(whole)]
     if not used:
         return None
@@ -147,9 +145,7 @@ def _principal_axes(parts: Sequence[MeasuredInnovations]) -> Full:
 
 
 def _rows(part: MeasuredInnovations, axes: Full) -> Iterator[list[float]]:
-    """Coefficients and right sides of the two equations for each measurement, summed over three
-    axes.
-    """
+    """Coefficients and right sides of two equations per measurement, summed over three axes."""
     z = part.innovation_arcsec @ axes
     predicted, measured = (
         np.einsum("ji,njk,ki->ni", axes, full_matrices(each), axes)
@@ -199,17 +195,13 @@ def _axis_rows(
 
 
 FITS = (0.85, 1.18)
-"""Range of the sigma ratio that still counts as fitting: it changes no attitude by more than a
-sigma.
-"""
+"""Range of the sigma ratio that still fits: it changes no attitude by more than a sigma."""
 Subject = Literal["gyro", "attitudes"]
 
 
 @dataclass(frozen=True)
 class InnovationFinding:
-    """Ratio of true to assumed sigma for the gyro or the attitudes, and the advice; None if
-    unknown.
-    """
+    """Ratio of true to assumed sigma for the gyro or the attitudes, with advice; None: unknown."""
 
     subject: Subject
     ratio: Interval | None

@@ -16,9 +16,7 @@ from service.web.console.page import ContextDep, FromQuery, console_page
 from service.web.requests.access import Policy
 
 FIRST_SAMPLE, FIRST_LIMIT_S = 60, 1.5
-"""Sample size (batches) and time limit (seconds) of the first view, before a larger sample is
-asked.
-"""
+"""Sample size (batches) and time limit (seconds) of the first view of the advice page."""
 
 
 class AdviceForm(AdviceQuery):
@@ -42,9 +40,7 @@ def with_settings(text: str) -> Markup:
 
 @console_page("/advice/{name}", "Advice", Policy("read", "path"), section="/")
 def advice_page(name: str, query: FromQuery[AdviceForm], context: ContextDep) -> Response:
-    """Console page with recommended tolerances, noise, magnitudes and alignment, and trial
-    outcomes.
-    """
+    """Console page with recommended tolerances, noise, magnitudes, alignment, trial outcomes."""
     is_first = "sample" not in query.model_fields_set and not query.tolerance
     asked = query.asked() | ({"sample": FIRST_SAMPLE} if is_first else {})
     advice = context.app.part(AdviceService).of_spacecraft(

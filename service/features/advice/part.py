@@ -91,9 +91,7 @@ class AdviceService:
     def ambiguity(
         self, name: str, run: str, start: Utc, end: Utc, earlier_s: float = DAY_S
     ) -> Ambiguity:
-        """Explain the ambiguous stars of a period, compared with the period `earlier_s` seconds
-        before.
-        """
+        """Explain ambiguous stars of a period, compared with the period `earlier_s` before."""
         now = self._stars(name, run, start, end)
         before = self._stars(name, run, shifted(start, -earlier_s), shifted(end, -earlier_s))
         earlier = before if before.batches else None

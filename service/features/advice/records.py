@@ -106,9 +106,7 @@ class AlignmentAdvice(Record, frozen=True, kw_only=True):
     rotation_arcsec: Annotated[list[Estimate], Field(min_length=3, max_length=3)] | None
     """Rotation vector of the tracker about the body axes."""
     axes_body: Annotated[list[Components], Field(min_length=3, max_length=3)] | None
-    """Measured x, y and z axes of the tracker in the body frame; null if the sample does not fix
-    them.
-    """
+    """Measured x, y and z axes of the tracker in the body frame; null: not determined."""
     batches: Count
     verdict: Literal["off", "fits", "no_verdict"]
     action: Action
@@ -119,9 +117,7 @@ class InnovationAdvice(Record, frozen=True, kw_only=True):
     """Noise of the gyro or the attitudes, estimated from the filter's innovations."""
 
     subject: Literal["gyro", "attitudes"]
-    """Noise that is judged: `gyro`, sigma_v of the mission, or `attitudes`, the recorded
-    covariances.
-    """
+    """Judged noise: `gyro`, sigma_v of the mission, or `attitudes`, the recorded covariances."""
     ratio: Estimate | None
     """Ratio of true to assumed standard deviation; null with too little data."""
     measurements: Annotated[Count, doc("Innovations that were used.")]
@@ -142,9 +138,7 @@ class Trial(Record, frozen=True, kw_only=True):
     ambiguous: Count
     unmatched: Count
     named_otherwise: Count
-    """Stars that are unique both in this trial and under `verified`, but as different catalog
-    stars.
-    """
+    """Stars unique both in this trial and under `verified`, but as different catalog stars."""
     change_points: Estimate | None
     """Change of the share of stars that are not unique, in percentage points, relative to votes
     with     the present settings; null: not compared.

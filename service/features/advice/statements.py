@@ -25,9 +25,7 @@ _APRIORI = ("cross_product_deg", "pole_difference_deg", "pole_angle_deg")
 
 @dataclass(frozen=True)
 class FileChange:
-    """A line to write into the mission file: its table, the tracker if the table has several, the
-    text.
-    """
+    """A line to write into the mission file: its table, its tracker if any, and the text."""
 
     table: Literal["zone", "tolerances", "catalog", "trackers", "gyro"]
     tracker: str | None

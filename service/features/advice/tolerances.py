@@ -33,9 +33,7 @@ Differences = Callable[[Evidence], tuple[Vector, npt.NDArray[np.int64]]]
 
 @dataclass(frozen=True)
 class Tolerance:
-    """Description of a tolerance: name, symbol, unit, test, limits, and the differences that it
-    bounds.
-    """
+    """Description of a tolerance: name, symbol, unit, test, limits, and bounded differences."""
 
     name: str
     symbol: str
@@ -43,9 +41,7 @@ class Tolerance:
     unit: Literal["deg", "mag"]
     what: str
     test: str | None
-    """Name of the switch in the mission's `tests` that activates the tolerance; None: always
-    active.
-    """
+    """Name of the switch in the mission's `tests` for the tolerance; None: always active."""
     in_caps: bool
     most: float
     """Largest value of the tolerance that a mission file accepts."""

@@ -19,9 +19,7 @@ CERTAIN_CHI2 = 16.266
 CLOSE = 0.2
 """Relative error of a sigma that is tolerated without recommending a change."""
 CERTAIN = 0.999
-"""Confidence of the intervals that show a change of noise; high, because several changes are
-tested.
-"""
+"""Confidence of the intervals that show a change of noise; high, since several are tested."""
 SCAN_SIGMAS = 4.5
 """Threshold in sigmas for a noisier period; constant noise passes in 1 of 500 samples of 200."""
 
@@ -259,9 +257,7 @@ def _magnitudes(tracker: Tracker, index: int, stars: StarEvidence) -> MagnitudeF
 
 
 def alignment_findings(mission: Mission, evidence: Evidence) -> list[AlignmentFinding]:
-    """Rotation of each further tracker relative to the first, over batches where both have an
-    attitude.
-    """
+    """Rotation of each further tracker relative to the first, over batches with both attitudes."""
     first, *others = mission.trackers
     by_batch = {fit.batch: fit for fit in evidence.fits if fit.tracker == 0}
     return [

@@ -244,9 +244,7 @@ def _has_tracker(context: PageContext, alarm: Alarm) -> bool:
 
 
 def _end(alarm: Alarm) -> Utc:
-    """End of the period shown for an alarm: some time after its raise, or its latest batch if
-    later.
-    """
+    """End of the period shown for an alarm: after its raise and its latest batch."""
     after = shifted(recorded_utc(alarm.raised.time), AFTER_S)
     # The latest batch belongs to the period, the end of which does not.
     latest = second_after(alarm.latest.time)
@@ -316,9 +314,7 @@ class LimitsQuery(PageQuery):
 
 @console_page("/spacecraft/{name}/limits", "Limits", Policy("read", "path"), section="/alarms")
 def limits_page(name: str, query: FromQuery[LimitsQuery], context: ContextDep) -> Response:
-    """Console page with the limits of every quantity, to preview and change them, with their
-    history.
-    """
+    """Console page to see, preview and change the limits of every quantity, with their history."""
     app, tracker = context.app, query.tracker
     limits = app.part(Alarms).limits.all(name, tracker)
     return context.rendered(

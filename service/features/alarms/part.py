@@ -76,9 +76,7 @@ class Alarms:
             return alarm_spans(connection, run, spacecraft, start, end)
 
     def times_out(self, found: Sequence[Alarm]) -> list[list[TimeOut]]:
-        """For each alarm, the intervals in which its value was out of limits; see
-        `state.times_out`.
-        """
+        """For each alarm, the intervals in which it was out of limits; see `state.times_out`."""
         with self._context.reading() as connection:
             return times_out(connection, found)
 
@@ -88,18 +86,14 @@ class Alarms:
             return state.read_alarm(connection, known_id(id, "alarm"), utc_now().text)
 
     def is_retired(self, spacecraft: str, tracker: str | None) -> bool:
-        """True if no loaded mission has the spacecraft, or the tracker as one with limits of its
-        own.
-        """
+        """True if no loaded mission has the spacecraft, or the tracker with its own limits."""
         mission = self._context.missions.get(spacecraft)
         return mission is None or bool(tracker and tracker not in limited_trackers(mission))
 
     def acknowledge(
         self, id: str, who: str, comment: str | None = None, entry: Entry | None = None
     ) -> records.AlarmWithActions:
-        """Acknowledge an alarm; an alarm back in limits, or of a retired subject, is cleared as
-        well.
-        """
+        """Acknowledge an alarm; clear it if back in limits, or if its subject is retired."""
         moment = utc_now().text
         return self._act(
             id,

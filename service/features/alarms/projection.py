@@ -176,9 +176,7 @@ class LimitEvaluator:
         return known
 
     def _recorded_at(self, time_ns: int) -> BatchRef | None:
-        """Last batch with a given time that was recorded before the new batches; the answer is
-        cached.
-        """
+        """Last batch of a given time that was recorded before the new batches; cached."""
         if time_ns not in self._earlier:
             query = (
                 select(batches.c.time, batches.c.id)
@@ -366,9 +364,7 @@ _UPDATE_VALUES = prepared(
 
 
 class ActiveAlarms:
-    """Alarms of a spacecraft and run that are not cleared, by subject; rows are locked until
-    commit.
-    """
+    """Uncleared alarms of a spacecraft and run by subject; rows are locked until commit."""
 
     def __init__(self, connection: Connection, spacecraft: str, run: str) -> None:
         self._connection = connection
@@ -396,9 +392,7 @@ class ActiveAlarms:
         now: str,
         worst: Point | None = None,
     ) -> None:
-        """Apply a new value to the alarm of a subject; raise an alarm if there is none and it is
-        out of limits.
-        """
+        """Apply a new value to the alarm of a subject; raise an alarm if needed."""
         alarm = self._alarms.get(subject)
         if alarm is None:
             if severity is not None:

@@ -41,9 +41,7 @@ _IN_FORCE = prepared(
 
 
 def limits_of(connection: Connection, mission: Mission) -> LimitsInForce:
-    """Limits in force for a spacecraft and its trackers: shipped defaults, replaced where others
-    are set.
-    """
+    """Limits in force for a spacecraft and its trackers: shipped defaults unless set."""
     # Read with every batch; a process meets few missions.
     key = mission.digest, quantities.limited_names()
     shipped = _SHIPPED.get(key)
@@ -99,9 +97,7 @@ def _place(mission: Mission, quantity: str, tracker: str) -> tuple[ColumnElement
 def _inherited(
     connection: Connection, mission: Mission, tracker: str
 ) -> Mapping[QuantityName, LimitSettings]:
-    """Limits that hold unless set: the shipped defaults, for a tracker the limits of its
-    spacecraft.
-    """
+    """Limits that hold unless set: shipped defaults, for a tracker those of its spacecraft."""
     shipped = quantities.default_limits(mission)
     if not tracker:
         return shipped
@@ -120,9 +116,7 @@ def set_limit(
     now: str,
     tracker: str = "",
 ) -> Limit:
-    """Set a limit from now on, None for the shipped default; the previous limit stays in the
-    history.
-    """
+    """Set a limit from now on, None for the shipped default; the old one stays in the history."""
     before = *_place(mission, quantity, tracker), limits.c.until.is_(None)
     connection.execute(update(limits).where(*before).values(until=now))
     row = {

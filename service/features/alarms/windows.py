@@ -17,9 +17,7 @@ from service.trends.limits import LimitSettings, Sample, Severity
 from service.vectors import Vector
 
 SLACK = 1e-9
-"""Tolerance for rounding, as a share of the largest summand, when sums in another order are
-compared.
-"""
+"""Rounding tolerance of sums in different order, as a share of the largest summand."""
 
 
 BatchRef = tuple[str, str | None]
@@ -124,9 +122,7 @@ class SampleWindow:
         return worst
 
     def _was_out(self, severity: Severity, limits: LimitSettings) -> bool:
-        """True if the bound of a severity was exceeded up to now; a wider bound must have been
-        passed.
-        """
+        """True if a severity's bound is exceeded up to now; a wider bound must be passed first."""
         if severity not in self.since_ns:
             return False
         worst = self.worst.get(severity)
@@ -259,9 +255,7 @@ def _count_beyond(values: Vector, limits: LimitSettings, severity: Severity) -> 
 def _evaluated(
     values: Vector, time_ns: Vector, limits: LimitSettings
 ) -> Iterator[tuple[int, Evaluated]]:
-    """Evaluate a series, skipping long stretches within limits; yields the times and values left
-    over.
-    """
+    """Evaluate a series, skipping stretches within limits; yields the remaining values."""
     low, high = limits.inner_bounds
     out = np.flatnonzero((values < low) | (values > high))
     window = SampleWindow()

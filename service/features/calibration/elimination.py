@@ -54,9 +54,7 @@ class Normal:
         return step
 
     def squares_after(self, step: Vector) -> float:
-        """Weighted sum of squared residuals after a step (p,) of the unknowns, with optimal
-        attitudes.
-        """
+        """Weighted sum of squared residuals after a step (p,), with optimal attitudes."""
         return float(self.squares - 2.0 * self.right @ step + step @ self.matrix @ step)
 
 
@@ -198,9 +196,7 @@ LEAST_SHARE = 1e-9
 """Least share of an unknown's information that must remain after attitudes and other unknowns."""
 
 ORDER: tuple[Kind, ...] = ("alignment", "scale", "distortion", "temperature", "time_tag")
-"""Priority of the kinds of unknowns: of two that stars cannot separate, the later is not
-observable.
-"""
+"""Priority of kinds of unknowns: of two that stars cannot separate, the later is dropped."""
 
 REASONS: dict[Kind, str] = {
     "alignment": "too few batches in which this tracker and another both have identified stars",

@@ -79,9 +79,7 @@ class Calibration:
         return math.sqrt(float(np.sum(self.residual[self.used] ** 2)) / max(self.freedom, 1))
 
     def value_of(self, name: str) -> tuple[float, float]:
-        """Value and sigma of the unknown with a name, in its unit; raises `BadInput` if not
-        estimated.
-        """
+        """Value and sigma of a named unknown, in its unit; raises `BadInput` if not estimated."""
         for at, each in enumerate(self.unknowns):
             if each.name == name:
                 return float(self.value[at]), float(self.sigma[at])

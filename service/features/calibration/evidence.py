@@ -88,9 +88,7 @@ def _shared(star: Indices) -> Marks:
 def _of_tracker(
     acquisition: Acquisition, sent: TrackerStars, chosen: Indices, star: Indices
 ) -> Columns:
-    """Columns of measured angles and catalog directions of chosen stars; `star` are their catalog
-    rows.
-    """
+    """Measured angles and catalog directions of chosen stars; `star` are their catalog rows."""
     mission, batch = acquisition.mission, acquisition.batch
     calibration = mission.tracker(sent.tracker, "observations").calibration
     vector, angles_deg = sent.vector[chosen], sent.angles_deg[chosen]

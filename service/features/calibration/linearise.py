@@ -93,9 +93,7 @@ PLAUSIBLE: dict[Kind, float] = {
 }
 """Largest sigma, in the unit of each kind, with which an unknown still counts as observable."""
 PLAUSIBLE_CHANGE_C = 100.0
-"""Change of temperature over which a temperature coefficient is judged by `PLAUSIBLE`, in degrees
-C.
-"""
+"""Change of temperature, in degrees C, over which a temperature coefficient is judged."""
 ARCSEC = 1.0 / ARCSEC_PER_RADIAN
 
 
@@ -220,9 +218,7 @@ class Linearised:
 
     @cached_property
     def by_turns(self) -> Any:
-        """Derivatives by the attitudes as a sparse matrix (2 n, 3 K), K up to the tracker's last
-        batch.
-        """
+        """Derivatives by attitudes as a sparse matrix (2 n, 3 K), K up to the last batch."""
         from scipy.sparse import csr_array
 
         n = len(self.stars.batch)
@@ -237,9 +233,7 @@ class Linearised:
 def prepared(
     stars: IdentifiedStars, unknowns: Sequence[Unknown], reference_temperature_c: float | None
 ) -> list[TrackerStars]:
-    """Group stars by tracker for a calibration, without trackers that have none; sorted as by
-    `usable`.
-    """
+    """Group stars by tracker for a calibration, without empty trackers; sorted as by `usable`."""
     from_c = 0.0 if reference_temperature_c is None else reference_temperature_c
     edges = np.searchsorted(stars.tracker, np.arange(len(stars.trackers) + 1))
     return [

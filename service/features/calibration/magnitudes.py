@@ -40,9 +40,7 @@ LEAST_STARS = 10
 LEAST_SPREAD_MAG = 0.05
 """Least rms spread of magnitudes or colours that must remain after the other unknowns."""
 HUBER, WRONG = 1.5, 5.0
-"""Bounds of a residual in sigmas: above the first its weight decreases, above the second it is
-zero.
-"""
+"""Bounds of a residual in sigmas: above the first its weight falls, above the second it is 0."""
 ROUNDS = 50
 SETTLED_MAG = 1e-6
 MEDIAN_SIZE = 0.6744897501960817

@@ -1,6 +1,4 @@
-"""Conversion of a calibration to mission settings: alignment, focal plane and magnitudes of
-trackers.
-"""
+"""Conversion of a calibration to mission settings: alignment, focal plane and magnitudes."""
 
 import math
 import re
@@ -109,9 +107,7 @@ def _vector(axis: Matrix) -> str:
 
 
 def _focal_plane(tracker: Tracker, bent: Mapping[Unknown, float]) -> Lines:
-    """Table `calibration` of a mission file: the present polynomials plus the estimated
-    corrections.
-    """
+    """Table `calibration` of a mission file: present polynomials plus estimated corrections."""
     present = tracker.calibration
     scale = present.scale + sum(value for each, value in bent.items() if each.kind == "scale")
     added = _polynomials_deg(bent, tracker.field_of_view_radius_deg)
@@ -162,9 +158,7 @@ def _polynomials_deg(
 
 
 def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
-    """Replace the changed keys of tracker number `index` and its tables in the lines of a mission
-    file.
-    """
+    """Replace the changed keys of tracker number `index` in the lines of a mission file."""
     places = [at for at, line in enumerate(lines) if _TRACKERS.match(line)]
     if index >= len(places):
         return
@@ -180,9 +174,7 @@ def _edit(lines: list[str], index: int, changes: Mapping[str, Lines]) -> None:
 
 
 def _write_table(lines: list[str], begin: int, table: str, changes: Lines) -> None:
-    """Write a table of the tracker that begins at a line: in the old table's place, or after its
-    keys.
-    """
+    """Write a table of the tracker that begins at a line: over the old table, or after its keys."""
     end = next((at for at in range(begin, len(lines)) if _HEADER.match(lines[at])), len(lines))
     following = next(
         (at for at in range(begin, len(lines)) if _TRACKERS.match(lines[at])), len(lines)

@@ -50,9 +50,7 @@ class Point:
 
 @dataclass(frozen=True)
 class ParameterHistory:
-    """Chart of a parameter against the time of its batches; `top` and `bottom` are values at its
-    edges.
-    """
+    """Chart of a parameter against the time of its batches, from `bottom` to `top` in value."""
 
     name: str
     unit: str
@@ -122,9 +120,7 @@ def _of_magnitudes(name: str, trackers: Sequence[TrackerGeometry], tracker: str)
 
 
 def _turned_arcsec(tracker: TrackerGeometry, before: np.ndarray) -> list[float]:
-    """Rotation vector about the body axes from one alignment to another, in arcsec, for small
-    angles.
-    """
+    """Rotation vector about the body axes between two alignments, in arcsec; small angles."""
     axes = [tracker.x_axis_body, tracker.y_axis_body, tracker.z_axis_body]
     turn = np.column_stack(axes) @ before.T
     vector = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
@@ -174,9 +170,7 @@ class CalibrationPageQuery(PageQuery):
 def calibration_page(
     name: str, query: FromQuery[CalibrationPageQuery], context: ContextDep
 ) -> Response:
-    """Console page with residual maps, parameters and their history, and adoptions of a
-    calibration.
-    """
+    """Console page with residual maps, parameter history and adoptions of a calibration."""
     app = context.app
     in_force = app.adoptions.in_force(name)
     versions = app.part(Calibrations).page(name, SHOWN).items

@@ -303,8 +303,6 @@ def found_columns(run: CalibrationRun) -> Row:
 
 
 def open_part(app: App) -> Calibrations:
-    """Create the calibration service of an open app, which ends calibrations left by a stopped
-    service.
-    """
+    """Create the calibration service of an open app; ends calibrations of a stopped service."""
     app.single_projector.ends_left_work(unfinished_calibrations, interrupt_calibrations)
     return Calibrations(app.context, app.submissions, app.comparisons, app.adoptions)

@@ -90,9 +90,7 @@ _ASKED = tuple(name for name in CalibrationIn.model_fields if name != "who")
 
 
 class CalibrationTrialIn(_Period):
-    """Request body for a trial of a calibration; without a run the batches of the calibration's
-    run.
-    """
+    """Request body for a trial of a calibration; by default with the calibration's run."""
 
     run: RunName | None = None
     sample: SampleSize = COMPARE_SAMPLE

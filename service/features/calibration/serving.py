@@ -17,9 +17,7 @@ def check(settings: Settings) -> None:
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Mark left calibrations as interrupted at start-up, unless another service may be computing
-    them.
-    """
+    """Mark leftover calibrations as interrupted at start-up, unless another service is running."""
     # A command may run beside the service that computes a calibration.
     if app.store.lock is None:
         await run_sync(app.part(Calibrations).interrupt)

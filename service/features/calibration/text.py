@@ -13,9 +13,7 @@ CERTAIN_SIGMAS = 3.0
 
 
 def calibration_text(result: CalibrationRun) -> str:
-    """Format a calibration: parameters with sigmas, residuals, and unknowns that are not
-    observable.
-    """
+    """Format a calibration: parameters with sigmas, residuals, undetermined parameters."""
     found = result.found
     summary = (
         f"{result.used} of {result.sampled} batches had identified stars ({result.total} in the "

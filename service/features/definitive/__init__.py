@@ -1,4 +1,4 @@
-"""The definitive attitude: recorded days filtered and smoothed with their gyro, and live ones."""
+"""Definitive attitude: recorded days filtered and smoothed with gyro data, and live filtering."""
 
 from service.feature import Feature
 

@@ -1,13 +1,12 @@
-"""The filter of an unfinished stretch, carried on as more is recorded.
+"""Attitude filter for live data, continued from stored states as more data are recorded.
 
-What is given is always the whole record of the window, and what comes out depends on it alone:
-it is what `day.grade_day` would give at the last epoch, of the same record.  States at marks
-along the stretch are kept, so that only what is new is filtered; a late measurement, or other
-settings, drop the marks after it.
+The input is always the whole record of the window, and the result depends on it alone: it equals
+the result of `day.grade_day` at the last epoch of the same record.  Filter states at regular marks
+are kept, so that only new data are filtered; a late measurement, or other settings, drop the later
+marks.
 
-The window does not grow with the day, as that of `day.window_of` does: a look reads at most seven
-hours of attitudes at any time of the day, and the gyro samples of these hours; where batches have
-stopped and the gyro goes on, those of up to 13 hours.
+The window does not grow with the day, unlike that of `day.window_of`: at most seven hours of
+attitudes and gyro samples are read, or 13 hours of gyro samples if batches have stopped.
 """
 
 import hashlib
@@ -36,16 +35,16 @@ from service.missions.mission import Mission
 from service.times import HOUR_S, Utc, bucket_start, shifted
 
 MARK_NS = 600 * 10**9
-"""A mark ends with the last epoch of each ten minutes of TAI."""
+"""Interval between stored filter states, in nanoseconds: each ends ten minutes of TAI."""
 
 
 def live_window(latest: Utc) -> tuple[Utc, Utc]:
-    """The time whose record a live filter depends on, its end excluded.
+    """Period of the record that a live filter reads for a latest batch; the end is excluded.
 
-    It begins six hours before the UTC hour of the latest batch: late batches and blocks within it
-    are filtered in their order, earlier ones change nothing.  It moves on once an hour, because
-    a filter that begins at another moment has to filter everything again.  The end leaves room
-    for gyro samples while trackers give no attitude: six hours after the hour of the last one.
+    The period begins six hours before the UTC hour of the latest batch: late batches and blocks
+    within it are filtered in their order, earlier ones change nothing.  It moves once an hour,
+    because a filter that begins at another moment has to filter everything again.  The end leaves
+    room for gyro samples without attitudes: six hours after the hour of the last attitude.
     """
     hour = bucket_start(latest.bucket(HOUR_S), HOUR_S)
     return shifted(hour, -WARM_UP_S), shifted(hour, HOUR_S + WARM_UP_S)
@@ -53,7 +52,7 @@ def live_window(latest: Utc) -> tuple[Utc, Utc]:
 
 @dataclass(frozen=True, eq=False)
 class Mark:
-    """The filter's state after an epoch, and the digest of all that led to it."""
+    """Filter state after an epoch, and a digest of the model and data that led to it."""
 
     digest: bytes
     state: FilterState
@@ -61,22 +60,22 @@ class Mark:
 
 @dataclass(frozen=True, eq=False)
 class Carried:
-    """The filtered attitude at the last epoch: one sample, and the model of its stretch."""
+    """Filtered attitude at the last epoch: one sample, and the motion model used."""
 
     model: Model
     sample: GradedSamples
 
 
 class CarriedFilter:
-    """Filters the last stretch of a record again and again; it is not thread-safe."""
+    """Filters the last unbroken interval of a record repeatedly; not thread-safe."""
 
     def __init__(self) -> None:
         self._marks: list[Mark] = []
         self.filtered = 0
-        """Epochs that were filtered so far: fewer than were given if marks were of use."""
+        """Number of epochs filtered so far; stored states save repeating earlier ones."""
 
     def carry_on(self, recorded: Recorded, mission: Mission) -> Carried | None:
-        """The filtered attitude at the last epoch of a record; None where no filter can start."""
+        """Filtered attitude at the last epoch of a record; None if no filter can start."""
         stretch = last_stretch(recorded, mission)
         if stretch is None:
             self._marks.clear()
@@ -108,10 +107,10 @@ class CarriedFilter:
 
 
 def last_stretch(recorded: Recorded, mission: Mission) -> Stretch | None:
-    """The stretch that a record ends with, or None.
+    """Last unbroken interval of a record, as input of the filter; None without any.
 
-    Gyro samples come in blocks: measurements after the last sample wait for it, as long as a
-    gap may be.
+    Gyro samples arrive in blocks: measurements later than the last sample wait for more samples, up
+    to the longest gap.
     """
     found = cut(recorded, mission).stretches
     if not found:
@@ -129,14 +128,14 @@ def _end_ns(stretch: Stretch) -> int:
 
 
 def _epochs(stretch: Stretch) -> Nanoseconds:
-    """The times at which a stretch may be divided."""
+    """Times at which the filter's input may be divided."""
     if stretch.gyro is not None:
         return stretch.gyro.tai_ns
     return np.union1d(stretch.attitudes.tai_ns, stretch.directions.tai_ns)
 
 
 def _parts(stretch: Stretch) -> Iterator[Stretch]:
-    """The stretch, divided where ten minutes end: filtered one by one they give the same."""
+    """Divide filter input at every ten minutes of TAI, which leaves the result unchanged."""
     times = _epochs(stretch)
     ends = np.append(np.flatnonzero(np.diff(times // MARK_NS)), len(times) - 1)
     before, first = np.iinfo(np.int64).min, 0
@@ -157,7 +156,7 @@ def _parts(stretch: Stretch) -> Iterator[Stretch]:
 
 
 def _between(times_ns: Nanoseconds, after: int, last: int) -> slice:
-    """The places of rising times after one and not after another."""
+    """Slice of ascending times that are after `after` and not after `last`."""
     first, end = np.searchsorted(times_ns, [after, last], side="right").tolist()
     return slice(first, end)
 

@@ -1,4 +1,4 @@
-"""Panels of the grades of an attitude with marks of rejected values, and strips along time."""
+"""Chart panels of filtered and smoothed attitudes, with rejected values and status strips."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAx
 
 @dataclass(frozen=True)
 class GradePanel:
-    """One axis.  `marks` are of rejected values; those beyond an edge stand at it."""
+    """Chart of one axis; `marks` show rejected values, clipped to the edge."""
 
     axis: str
     traces: tuple[Trace, ...]
     band: str
     marks: str
     bounds: tuple[int, ...]
-    """Heights of horizontal lines."""
+    """Vertical positions of horizontal lines."""
     note: str
-    """The range of the values, and what else there is to say."""
+    """Caption of the panel: the range of values and remarks."""
     scale: "Scale"
     unit: str
 
     @property
     def ticks(self) -> list[tuple[float, str]]:
-        """Values of the vertical axis: percent from the top, and their text."""
+        """Tick marks of the vertical axis: percent from the top, and text."""
         values = self.scale.ticks()
         heights = 100.0 * self.scale.y(np.array(values)) / self.scale.height
         texts = [f"{value:.6g}".replace("-", "−") + self.unit for value in values]
@@ -37,7 +37,7 @@ class GradePanel:
 
 @dataclass(frozen=True)
 class GradeChart:
-    """Panels of one unit; `rows` are the same as a table: the axis, then a cell a column."""
+    """Chart with a panel per axis in one unit; `rows` hold the same data as a table."""
 
     id: str
     title: str
@@ -49,7 +49,7 @@ class GradeChart:
 
 
 def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> str:
-    """A cross at each value."""
+    """SVG path with a cross at every finite value."""
     known = np.isfinite(value)
     x, y = axis.x(time_ns[known]), np.clip(scale.y(value[known]), 8, HEIGHT - 8)
     places = zip(x.tolist(), y.tolist(), strict=True)
@@ -57,10 +57,10 @@ def marks_of(time_ns: Integers, value: Vector, axis: TimeAxis, scale: Scale) -> 
 
 
 def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) -> Mask:
-    """Marks of the moments (n,) that belong together with the one before.
+    """Mask (n,) of moments that a chart joins to the moment before.
 
-    They do unless they are farther apart than three parts of the period and three times what
-    is usual, or `same` (n,) says that they are not of the same stretch.
+    Moments are not joined if they are farther apart than both three parts of the period and three
+    times the usual step, or if `same` (n,) is False because they are of different intervals.
     """
     step = np.diff(time_ns, prepend=time_ns[:1])
     part = (axis.end.tai_ns - axis.start.tai_ns) / parts
@@ -69,7 +69,7 @@ def joined_moments(time_ns: Integers, axis: TimeAxis, parts: int, same: Mask) ->
 
 
 def scale_of(values: Mapping[str, Vector], *, is_log: bool = False) -> Scale | None:
-    """A scale that holds all known values; None where none is known."""
+    """Vertical scale that includes all finite values; None without any."""
     found = np.concatenate([each[np.isfinite(each)] for each in values.values()])
     if is_log:
         found = found[found > 0.0]
@@ -93,7 +93,7 @@ WORDS = {
 
 @dataclass(frozen=True)
 class Strip:
-    """Bars by their kind as one path each; kinds differ in height, so that colour only helps."""
+    """Strip of bars along time, one SVG path per kind; kinds differ in height and colour."""
 
     id: str
     title: str
@@ -103,7 +103,7 @@ class Strip:
 
 
 def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
-    """Strips of the filter's model, and of the quality of both grades."""
+    """Status strips: motion model of the filter, and status of filtered and smoothed attitudes."""
     drawn = [
         Strip(
             "model",
@@ -128,7 +128,7 @@ def strips(found: GradesOfPeriod, axis: TimeAxis) -> list[Strip]:
 def _bars(
     kinds: Sequence[str], left: Integers, right: Integers, tops: dict[str, int]
 ) -> dict[str, str]:
-    """A path for each kind; bars of a kind that touch are one."""
+    """SVG path for each kind of bar; touching bars of a kind are merged."""
     paths = dict.fromkeys(tops, "")
     begin = end = None
     before = ""

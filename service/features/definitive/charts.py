@@ -1,6 +1,6 @@
-"""Attitude, rate and their standard deviations about the body axes over a period, in panels.
+"""Charts of attitude, rate and standard deviations about the body axes over a period.
 
-Also by grade, with gyro bias, differences from the smoothed attitude and innovations.
+Also charts of gyro bias, measured minus smoothed attitudes, and innovations.
 """
 
 from dataclasses import replace
@@ -30,21 +30,22 @@ from service.web.console.formatting import level
 
 AXES = ("x", "y", "z")
 SMALL_DEG, SMALL_DEG_PER_S = 0.05, 0.005
-"""Values that are all below these are given in arcseconds."""
+"""Bounds below which all values of a chart are shown in arcseconds."""
 
 
 BOUND = 3.0
-"""Sigmas to either side."""
+"""Half width of the drawn error band, in sigmas."""
 WIDEST = 2.0
-"""Usual bounds, that a chart of bounds reaches to."""
+"""Half height of a chart, in multiples of the usual error band."""
 
 
 def grade_charts(
     found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker | None = None
 ) -> list[GradeChart]:
-    """The charts of a period, in the order of the page; without those that have no value.
+    """Charts of filtered and smoothed attitudes in a period, in page order; empty ones are left
+    out.
 
-    With a tracker the first one is where its boresight points.
+    With a tracker the first chart shows the direction of its boresight.
     """
     drawn = [] if tracker is None else [direction_chart(found, axis, tracker)]
     drawn += [_attitude(found, axis), _rate(found, axis), _sigma(found, axis)]
@@ -64,7 +65,7 @@ def _known(status: Integers) -> Mask:
 
 
 def _by_grade(found: GradesOfPeriod, name: str) -> dict[str, Vector]:
-    """A value (n, ...) by grade, NaN where there is no attitude."""
+    """Values (n, ...) of filtered and smoothed attitudes by grade, NaN without an attitude."""
     return {
         grade: np.where(_known(each.status)[:, None], getattr(each, name), np.nan)
         for grade, each in found.samples.items()
@@ -72,7 +73,7 @@ def _by_grade(found: GradesOfPeriod, name: str) -> dict[str, Vector]:
 
 
 def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> GradeChart | None:
-    """Right ascension, declination and roll of a boresight; no line crosses the wrap at 360 deg."""
+    """Chart of a boresight's right ascension, declination and roll; lines break at 360 degrees."""
     samples = found.samples["smoothed"]
     known = _known(samples.status)
     if not known.any():
@@ -106,7 +107,7 @@ def direction_chart(found: GradesOfPeriod, axis: TimeAxis, tracker: Tracker) -> 
 
 
 def _attitude(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
-    """The turn from the first good smoothed attitude."""
+    """Chart of the rotation from the first good smoothed attitude."""
     samples = found.samples["smoothed"]
     known = _known(samples.status)
     if not known.any():
@@ -148,10 +149,10 @@ def _rate(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
 
 
 def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
-    """One sigma of the attitude of each grade, on a logarithmic scale.
+    """Chart of the attitude's standard deviation by grade, on a logarithmic scale.
 
-    The scale is that of good attitudes: others, as at a start, may be far beyond and are drawn at
-    the edge.
+    The scale fits good attitudes; other values, as after a start, may lie far outside and are drawn
+    at the edge.
     """
     by_grade = {
         grade: np.sqrt(np.maximum(each[:, [0, 3, 5]], 0.0))
@@ -191,7 +192,7 @@ def _sigma(found: GradesOfPeriod, axis: TimeAxis) -> GradeChart | None:
 
 
 def _differences(met: MeasuredInnovations, axis: TimeAxis) -> GradeChart:
-    """Raw minus smoothed, with bounds; what the filter did not use is marked."""
+    """Chart of measured minus smoothed attitudes with bounds; unused measurements are marked."""
     return bounded_chart(
         "difference",
         "Raw minus smoothed attitude",
@@ -210,10 +211,10 @@ def bounded_chart(
     sigma_arcsec: Vector,
     axis: TimeAxis,
 ) -> GradeChart:
-    """Values (m, 3) of measurements as dots, with three sigmas to either side as a band.
+    """Chart of values (m, 3) as dots within a band of three sigmas.
 
-    The scale is that of the usual band and of the values that were used: others, which may be
-    far beyond, are marked at the edge, and after a gap the band reaches beyond it.
+    The scale fits the usual band and the used values: other values are marked at the edge, and
+    after a gap the band may leave the chart.
     """
     used = met.is_used
     joins = joined_moments(met.tai_ns, axis, PARTS, np.arange(len(used)) > 0)
@@ -256,7 +257,7 @@ def bounded_chart(
 
 
 def _bias(found: GradesOfPeriod, axis: TimeAxis) -> list[GradeChart]:
-    """The bias of the gyro with one sigma, and that sigma; none at a constant rate."""
+    """Charts of the gyro bias with its standard deviation; none at a constant rate."""
     bias = _by_grade(found, "bias_deg_per_h")
     sigma = _by_grade(found, "bias_sigma_deg_per_h")
     if not np.isfinite(bias["smoothed"]).any():
@@ -316,12 +317,12 @@ def _median(values: Vector) -> float:
 
 DEGREES = 3
 INSIDE = 0.95
-"""The share of measurements between the lower two bounds, where the covariances are right."""
+"""Expected share of measurements between the two lower bounds if covariances are right."""
 
 
 @lru_cache(maxsize=1)
 def chi_square_bounds() -> tuple[float, float, float]:
-    """The region of 95 %, and what is rejected beyond."""
+    """Limits of chi-square: both ends of the 95 % region, and the limit of rejection."""
     # Imported here: loading it takes longer than drawing the page.
     from scipy.special import chdtri
 
@@ -332,7 +333,7 @@ def chi_square_bounds() -> tuple[float, float, float]:
 
 
 def innovation_charts(met: MeasuredInnovations, axis: TimeAxis) -> list[GradeChart]:
-    """Innovations about the body axes, and their chi-square."""
+    """Charts of innovations about the body axes, and of their chi-square."""
     known = met.taken(np.isfinite(met.nis))
     if not len(known):
         return []

@@ -1,4 +1,4 @@
-"""`acquire smooth`: filter and smooth recorded attitudes, and record both grades."""
+"""Command `acquire smooth`: filter and smooth recorded attitudes, and record the results."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -9,7 +9,7 @@ from service.cli.arguments import period_of, progress_bar, settings_of_existing
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `smooth` and its options."""
     parser = arguments.add_command(commands, "smooth", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")

@@ -1,13 +1,13 @@
-"""The grades of a UTC day: filtered, smoothed, and packed as compressed bytes for the record.
+"""Filtering and smoothing of the attitudes of one UTC day.
 
-A day depends on the record from six hours before it to two hours after it, and on nothing
-else: not on the period that is asked for, nor on what was computed of the days before.  So it
-can be computed again, alone, and gives the same bytes; a late batch concerns one day or two.
+The result depends on the record from six hours before the day to two hours after it, and on nothing
+else: not on the requested period, nor on results for earlier days.  So a day can be computed again,
+alone, with the same bytes; a late batch affects one day or two.
 
-An innovation is the rotation from the filter's prediction to a measured attitude.  A difference
-is that from the smoothed attitude to the measurement: the smoother has used it, so their errors
-are correlated, and the covariance of the difference is R - P; of a measurement that was not used
-it is R + P.  Both are what a page of grades shows and what noise is estimated from.
+An innovation is the rotation from the filter's prediction to a measured attitude.  A difference is
+the rotation from the smoothed attitude to the measured one.  If the smoother used the measurement,
+their errors are correlated, and the covariance of the difference is R - P; otherwise it is R + P.
+Both are shown on the attitude page and used to estimate noise.
 """
 
 from dataclasses import dataclass
@@ -43,9 +43,9 @@ def innovations_of(
     start_ns: int,
     end_ns: int,
 ) -> MeasuredInnovations:
-    """The innovations of the measured attitudes of a stretch from `start_ns` to before `end_ns`.
+    """Innovations of measured attitudes from `start_ns` up to `end_ns`, with smoothed differences.
 
-    `attitudes` are those that the filter was given; single directions are left out.
+    `attitudes` are the filter's input; measurements of single directions are left out.
     """
     met = result.innovations
     chosen = np.flatnonzero(
@@ -74,23 +74,24 @@ def innovations_of(
 
 
 METHOD = 5
-"""Counted up with every change of what is computed: then days are computed anew."""
+"""Version of the algorithm; a change makes stored days be computed again."""
 WARM_UP_S = 6 * 3600.0
-"""For the bias to settle (two hours), after a tracker that is wrong at the beginning was found
-out (an hour, and two in which everything is rejected)."""
+"""Seconds of data before a day: two hours for the bias to settle, after up to three in which a
+tracker with wrong stars at the beginning is detected and its measurements are rejected.
+"""
 LOOK_AHEAD_S = 2 * 3600.0
-"""The data after a day for the smoother, and for doubts at its end to be settled."""
+"""Seconds of data after a day, for the smoother and to resolve doubts at the day's end."""
 STEP_NS = 10**9
-"""The time between samples: the first sample in each second of TAI is kept."""
+"""Interval between stored samples in nanoseconds; the first epoch in each TAI second is kept."""
 MOST_SAMPLES = 4_000_000
-"""The most samples of a day with its surroundings: 30 Hz, all in memory at 1 kB each."""
+"""Greatest number of gyro samples of a day and its margins: 30 Hz, 1 kB of memory each."""
 OUTCOMES = {each.name.lower(): int(each) for each in Outcome}
-"""The outcomes of a measurement; see `filtering.result.Outcome`."""
+"""Outcomes of a measurement in the filter, by name; see `filtering.result.Outcome`."""
 
 
 @dataclass(frozen=True, eq=False)
 class GradedStretch:
-    """A stretch of a day in both grades, which have the same times, and its measurements."""
+    """Unbroken interval of a day with filtered and smoothed samples, and innovations."""
 
     model: Model
     samples: dict[Grade, GradedSamples]
@@ -99,12 +100,12 @@ class GradedStretch:
 
 @dataclass(frozen=True, eq=False)
 class GradedDay:
-    """The stretches of a day, and what became of what was recorded.
+    """Filtered and smoothed attitudes of a day, with counts of the measurements and gyro samples.
 
     `measurements` counts by the names of `filtering.result.Outcome`, and `unusable` and `alone`
-    ones; `gyro` counts samples, gaps, those beyond the
-    largest rate, and zeros while the body turned.  `nis_per_degree` is
-    the mean of z^T S^-1 z of the accepted measurements by their degrees of freedom: about 1.
+    ones; `gyro` counts samples, gaps, samples beyond the largest rate, and zeros while the body
+    turned.  `nis_per_degree` is the mean of z^T S^-1 z of the accepted measurements per degree of
+    freedom: about 1.
     """
 
     stretches: list[GradedStretch]
@@ -114,20 +115,20 @@ class GradedDay:
 
     @property
     def samples(self) -> int:
-        """The samples of one grade."""
+        """Number of samples of one grade."""
         return sum(len(each.samples["smoothed"]) for each in self.stretches)
 
 
 def window_of(day: int) -> tuple[Utc, Utc]:
-    """The time whose record a day depends on, its end excluded."""
+    """Period of the record that the attitudes of a UTC day depend on; the end is excluded."""
     start, end = day_bounds(day)
     return shifted(start, -WARM_UP_S), shifted(end, LOOK_AHEAD_S)
 
 
 def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
-    """The grades of a day, of what was recorded in its window; see `window_of`.
+    """Filter and smooth the record of a day's window; see `window_of`.
 
-    Raises `BadInput` for more gyro samples than there is memory for.
+    Raises `BadInput` for more gyro samples than fit into memory.
     """
     if len(recorded.gyro_ns) > MOST_SAMPLES:
         expected = f"a day and what is about it may have at most {MOST_SAMPLES:,} samples"
@@ -172,7 +173,7 @@ def grade_day(recorded: Recorded, mission: Mission, day: int) -> GradedDay:
 def _graded(
     stretch: Stretch, result: FilterResult, smoothed: AttitudeHistory, start: int, end: int
 ) -> GradedStretch | None:
-    """The part of a stretch that lies in the day, or None."""
+    """Part of a filtered and smoothed interval within the day; None if there is none."""
     kept = _kept(result.history, start, end)
     if not kept.any():
         return None
@@ -188,7 +189,7 @@ def _graded(
 
 
 def _kept(history: AttitudeHistory, start: int, end: int) -> Mask:
-    """The first epoch of each second of the day, from the first measured attitude on."""
+    """Mask of the first epoch in each second of the day, from the first measured attitude on."""
     times = history.tai_ns
     inside = (times >= start) & (times < end) & (history.status != Status.NONE)
     second = times // STEP_NS
@@ -197,7 +198,7 @@ def _kept(history: AttitudeHistory, start: int, end: int) -> Mask:
 
 
 def samples_of(history: AttitudeHistory, kept: Mask, is_constant: bool) -> GradedSamples:
-    """The epochs of a history where a mask (n,) is true, as samples of a grade."""
+    """Convert the selected epochs (mask (n,)) of an attitude history to stored samples."""
     quaternion = history.quaternion[kept]
     quaternion = np.where(quaternion[:, 3:] < 0.0, -quaternion, quaternion)
     covariance = history.model_covariance[kept]

@@ -1,4 +1,4 @@
-"""Filtered and smoothed attitudes of recorded days: computed, recorded and read."""
+"""Service that computes, records and reads filtered and smoothed attitudes of days."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -22,11 +22,11 @@ from service.times import Utc, utc_now
 
 @dataclass
 class SmoothProgress:
-    """How far a period is smoothed.
+    """Progress of smoothing the days of a period.
 
-    `total` counts its days with batches; `days` are the present revisions of those that have
-    attitudes, `new` the ids of the revisions that were recorded now.  `empty` counts days
-    without an attitude to start from, and `archived` those left as they are.
+    `total` counts the days with batches; `days` are the current revisions of days with attitudes,
+    `new` the ids of revisions recorded now.  `empty` counts days without an attitude to start from,
+    and `archived` days that are skipped because their batches are archived.
     """
 
     total: int
@@ -37,12 +37,12 @@ class SmoothProgress:
 
     @property
     def done(self) -> int:
-        """Days that are finished."""
+        """Number of finished days."""
         return len(self.days) + self.empty + self.archived
 
 
 class DefinitiveDays:
-    """Computes and reads filtered and smoothed attitudes."""
+    """Computes, records and reads filtered and smoothed attitudes of days."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -59,11 +59,11 @@ class DefinitiveDays:
     ) -> SmoothProgress:
         """Filter and smooth every UTC day of a period that has batches.
 
-        A day is recorded as a new revision where anything has changed that it is computed from;
-        else the revision stays that there is, as it does where batches that the day is computed
-        from are archived: those that are left would make a poorer one.
+        A day is recorded as a new revision if anything that it depends on has changed.  Otherwise
+        the old revision stays; it stays too if batches of the day are archived, since the remaining
+        ones would give a poorer result.
 
-        Raises `NotFound` where the period has no batch.
+        Raises `NotFound` if the period has no batch.
         """
         mission = mission_named(self._context.missions, name)
         run = LIVE if run is None else checked_run_name(run)
@@ -79,11 +79,11 @@ class DefinitiveDays:
         return progress
 
     def innovations(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.Innovation]:
-        """How the measured attitudes of a period met the filter, the earliest first."""
+        """Page of innovations (measured minus predicted attitudes), earliest first."""
         return self._context.page(period.list_innovations, ResultFilter, name, asked)
 
     def of_period(self, name: str, run: str, start: Utc, end: Utc) -> period.GradesOfPeriod | None:
-        """A bounded number of samples and innovations of a period; None where none are recorded."""
+        """Thinned samples and innovations of a period; None if none are recorded."""
         self._context.mission(name)
         with self._context.reading() as connection:
             return period.grades_of_period(connection, name, run, start, end)

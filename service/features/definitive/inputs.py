@@ -1,4 +1,4 @@
-"""The input of filters and predictions: recorded attitudes, lone stars, and gyro samples."""
+"""Input of filters and predictions from the database: attitudes, single stars, gyro samples."""
 
 import hashlib
 import json
@@ -53,13 +53,13 @@ _ATTITUDES = select(
 
 
 RatesRead = dict[str, Sequence[float]]
-"""The rates (3) in deg/s that batches carried, by the batch; zeros where none."""
+"""Body rates (3) in deg/s sent with batches, by batch id; zeros if none were sent."""
 
 
 def days_with_batches(
     connection: Connection, spacecraft: str, run: str, start: Utc | None, end: Utc | None
 ) -> list[int]:
-    """The UTC days of a period (see `Utc.bucket`) that have batches, in order."""
+    """UTC days of a period with batches, in order, numbered as in `Utc.bucket`."""
     c = rollups_daily.c
     within = buckets_between(c.bucket, start, end, DAY_S)
     chosen = c.spacecraft == spacecraft, c.run == run, *within
@@ -75,9 +75,9 @@ def recorded_in(
     end: Utc,
     rates_read: RatesRead | None = None,
 ) -> Recorded:
-    """The record from `start` to before `end`: good attitudes, lone stars, gyro samples.
+    """Read good attitudes, single stars and gyro samples from `start` up to `end`.
 
-    `rates_read` holds rates that were read before, and keeps those of this period.
+    `rates_read` caches body rates that were read before, and keeps those of this period.
     """
     selected = ResultFilter(run, spacecraft, start, end)
     query = _ATTITUDES.where(*selected.conditions(), results.c.status == "good").order_by(*PLACE)
@@ -103,10 +103,10 @@ def _carried_rates(
     gyro_ns: Nanoseconds,
     rates_read: RatesRead,
 ) -> Vector | None:
-    """The rates that batches carried, see `Recorded`; zeros near gyro samples, which are better.
+    """Body rates sent with batches, see `Recorded`; zeros near gyro samples, which are better.
 
-    `gyro_ns` are the times of the samples that are not zero about all axes.  Of `rates_read`
-    those stay that are of these batches.
+    `gyro_ns` are the times of samples that are not zero about all axes.  Rates of other batches are
+    removed from the cache `rates_read`.
     """
     carried = np.zeros((len(batch_ids), 3))
     padded = np.concatenate([[-FAR_NS], gyro_ns, [FAR_NS]])
@@ -129,7 +129,7 @@ def _carried_rates(
 
 
 def inputs_digest(recorded: Recorded, mission: Mission) -> str:
-    """`sha256:` of everything that the grades of a day depend on."""
+    """Digest (`sha256:`) of all data and settings that filtered attitudes of a day depend on."""
     settings = {
         name: None if each is None else each.model_dump(mode="json")
         for name, each in (("gyro", mission.gyro), ("motion", mission.motion))
@@ -154,23 +154,23 @@ WITHOUT_ATTITUDE = (
     str(NoAttitude.FEWER_THAN_TWO_UNIQUE_STARS),
     str(NoAttitude.DEGENERATE_GEOMETRY),
 )
-"""Why a batch has no attitude although stars of it are identified."""
+"""Reasons for which a batch with identified stars has no attitude."""
 FAR_NS = 2**62
-"""Nanoseconds of TAI beyond any time of a record."""
+"""Nanoseconds of TAI later than any recorded time."""
 _READ_AT_ONCE = 100
-"""Inputs may be long: few of them are in memory at a time."""
+"""Number of batch inputs read at once, small because inputs may be long."""
 
 Stars = Mapping[tuple[str, int], str]
-"""The catalog star of each unique star, by tracker and place."""
+"""Catalog star of every uniquely identified star, by tracker and place in the batch."""
 
 
 def lone_stars(
     connection: Connection, sky: SkyModel, selected: ResultFilter
 ) -> DirectionMeasurements:
-    """The unique stars of the batches without an attitude, in order of time.
+    """Uniquely identified stars of batches without an attitude, as directions in order of time.
 
-    The batch is calibrated with the settings that its result was made with; the inertial
-    directions are apparent ones, as attitudes are solved from.
+    A batch is corrected with the settings of its result; inertial directions are apparent ones, as
+    used to compute attitudes.
     """
     rows_of: dict[str, dict[str, int]] = {}
     found: list[tuple[int, Vector, Vector, Vector]] = []
@@ -233,7 +233,7 @@ def _directions(
     stars: Stars,
     rows: Mapping[str, int],
 ) -> tuple[Vector, Vector, Vector]:
-    """Body and apparent inertial directions (n, 3) of the unique stars, and their sigmas (n,)."""
+    """Body and apparent inertial directions (n, 3) of uniquely identified stars, sigmas (n,)."""
     try:
         corrected = correct(batch, mission)
     except BadInput:

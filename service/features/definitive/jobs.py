@@ -1,4 +1,4 @@
-"""Jobs that make the definitive attitude of recorded days, on request or on schedule."""
+"""Background jobs that filter and smooth recorded days, on request or on schedule."""
 
 import logging
 import threading
@@ -22,19 +22,19 @@ log = logging.getLogger(__name__)
 
 MOST_WAITING = 8
 MOST_KEPT = 50
-"""Jobs that are remembered, the newest; what they made is recorded."""
+"""Number of jobs kept in memory, the newest; their results are recorded."""
 SCHEDULE = "schedule"
-"""The author of the jobs that no person asked for."""
+"""Author of jobs that the schedule started."""
 SETTLED_S = LOOK_AHEAD_S + 600.0
-"""The delay after the end of a day, when the data that the day depends on are present."""
+"""Seconds after the end of a day until all data that its attitudes depend on are present."""
 LATE_DAYS = 3
-"""Days before the last one that are looked at again, for batches that came late."""
+"""Number of earlier days that a scheduled job computes again, for late batches."""
 LOOK_EVERY_S = 600.0
 
 
 @dataclass(frozen=True)
 class _Wanted:
-    """The days of a job."""
+    """Days that a job computes."""
 
     spacecraft: str
     run: str
@@ -43,9 +43,9 @@ class _Wanted:
 
 
 class DefinitiveJobs:
-    """Jobs that filter and smooth recorded days, one after the other, beside other work.
+    """Background jobs that filter and smooth recorded days, one at a time.
 
-    A job is forgotten at the end of the process; the days that it has made stay.
+    Jobs are forgotten when the process ends; the recorded days stay.
     """
 
     def __init__(
@@ -70,9 +70,9 @@ class DefinitiveJobs:
         end: Utc | None = None,
         who: str,
     ) -> DefinitiveJob:
-        """Queue a job for the UTC days of a period that have batches; without one, all days.
+        """Queue a job for the UTC days of a period that have batches; all days without a period.
 
-        Raises `Busy` where too many wait or kernels are still compiled, `Stopping` while the
+        Raises `Busy` if too many jobs wait or kernels are still compiled, `Stopping` while the
         service closes.
         """
         mission_named(self._context.missions, spacecraft)
@@ -107,21 +107,21 @@ class DefinitiveJobs:
         return job
 
     def all(self, spacecraft: str) -> list[DefinitiveJob]:
-        """The jobs of a spacecraft, the newest first."""
+        """Jobs of a spacecraft, newest first."""
         self._context.mission(spacecraft)
         with self._lock:
             found = [each for each in self._jobs.values() if each.spacecraft == spacecraft]
         return found[::-1]
 
     def get(self, spacecraft: str, id: str) -> DefinitiveJob:
-        """One job; raises `NotFound`."""
+        """The job with an id; raises `NotFound`."""
         for job in self.all(spacecraft):
             if job.id == id:
                 return job
         raise NotFound(f"{spacecraft} has no job {id[:40]!r} since the start of the service")
 
     def start_schedule(self) -> None:
-        """Start to make the definitive attitude of each day where the mission asks for it."""
+        """Start the thread that queues a job every day for missions with daily smoothing."""
         if self._schedule is None and any(map(self._is_daily, self._context.missions)):
             self._schedule = threading.Thread(
                 target=self._keep_schedule, name="definitive-schedule", daemon=True
@@ -129,7 +129,7 @@ class DefinitiveJobs:
             self._schedule.start()
 
     def close(self) -> None:
-        """End the job that is computed, and those that wait."""
+        """Stop the job that is being computed, and drop the queued ones."""
         with self._lock:
             self._stopped.set()
         if self._schedule is not None:
@@ -137,7 +137,7 @@ class DefinitiveJobs:
         self._worker.shutdown(cancel_futures=True)
 
     def begin_due(self, now: Utc) -> list[DefinitiveJob]:
-        """Queue a job for each mission whose last day is complete and not made yet."""
+        """Queue a job for every daily mission whose last day is complete and not computed yet."""
         today = shifted(now, -SETTLED_S).bucket(DAY_S)
         begun = []
         for name in sorted(filter(self._is_daily, self._context.missions)):

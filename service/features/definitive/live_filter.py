@@ -1,4 +1,4 @@
-"""The filtered attitude of live data, kept up beside the posts while these are recorded."""
+"""Background thread that keeps the filtered attitude of live data up to date."""
 
 import logging
 import threading
@@ -24,7 +24,7 @@ from service.times import DAY_S, recorded_utc, utc_now
 log = logging.getLogger(__name__)
 
 REST = 20.0
-"""The thread's rest as a multiple of its last look: it works 5 % of the time at most."""
+"""Pause of the thread after each pass, in multiples of its duration: at most 5 % load."""
 
 _TIMES = select(batches.c.time).join_from(results, batches, results.c.batch_id == batches.c.id)
 _LAST_FORGOTTEN = select(func.max(audit.c.id)).where(audit.c.action == "forget_run")
@@ -32,20 +32,20 @@ _LAST_FORGOTTEN = select(func.max(audit.c.id)).where(audit.c.action == "forget_r
 
 @dataclass
 class _Kept:
-    """The filter of a spacecraft, and what it was up to."""
+    """Live filter of a spacecraft, with the state of the record that it has processed."""
 
     filter: CarriedFilter = field(default_factory=CarriedFilter)
     rates_read: RatesRead = field(default_factory=dict)
     version: tuple[int, str | None] | None = None
     forgotten: str | None = None
-    """The last entry of the audit list about recorded batches or blocks that were removed."""
+    """Last audit entry about the removal of recorded batches or gyro blocks."""
     attitude: LiveAttitude | None = None
 
 
 class LiveFilter:
-    """The filters of the missions that ask for them; started by the server alone.
+    """Live filters of all missions that configure one; only the server starts them.
 
-    What a filter gives depends on the record alone, so that a service that was killed and
+    The result of a filter depends on the record alone, so that a service that was killed and
     started again gives the same.
     """
 
@@ -58,22 +58,22 @@ class LiveFilter:
         self._thread: threading.Thread | None = None
 
     def start(self) -> None:
-        """Keep the filters up from now on, if any mission asks for it."""
+        """Start the thread that updates the filters, if any mission has a live filter."""
         if self._names() and self._thread is None:
             self._thread = threading.Thread(target=self._keep_up, name="live-filter", daemon=True)
             self._thread.start()
 
     def stop(self) -> None:
-        """End the thread."""
+        """Stop the thread that updates the filters."""
         self._stopped.set()
         if self._thread is not None:
             self._thread.join()
 
     def latest(self, name: str) -> LiveAttitude:
-        """The filtered attitude of a spacecraft at the last epoch.
+        """Filtered attitude of a spacecraft at its last epoch.
 
-        Raises `NotFound` for a mission without a live filter, and where no filter could start,
-        the thread has not looked at the record yet, or the attitude is lost.
+        Raises `NotFound` for a mission without a live filter, and if no filter could start, the
+        thread has not read the record yet, or the attitude is lost.
         """
         mission = mission_named(self._context.missions, name)
         if mission.live_filter is None:
@@ -113,7 +113,7 @@ class LiveFilter:
             due[name] = now + max(every_s, REST * (now - begun))
 
     def refresh(self, name: str) -> None:
-        """Filter what is new of a spacecraft."""
+        """Filter the new data of a spacecraft."""
         mission = self._context.missions[name]
         with self._lock:
             kept = self._kept.setdefault(name, _Kept())
@@ -122,7 +122,7 @@ class LiveFilter:
                 version = last_event(connection), block
                 forgotten = connection.scalar(_LAST_FORGOTTEN)
                 if kept.forgotten != forgotten:
-                    # The filter holds what was computed from facts that are gone.
+                    # The filter holds results from batches or blocks that were removed.
                     kept.filter, kept.rates_read, kept.version = CarriedFilter(), {}, None
                     kept.forgotten = forgotten
                 if kept.version == version:

@@ -1,4 +1,4 @@
-"""The page of the definitive attitude of a spacecraft."""
+"""Console page for the definitive attitude of a spacecraft."""
 
 from dataclasses import dataclass
 
@@ -16,26 +16,26 @@ from service.web.console.pages.spacecraft import RANGES_S, SpacecraftQuery, show
 from service.web.requests.access import Policy
 
 JOBS = 8
-"""The latest that the page lists."""
+"""Number of latest jobs listed on the page."""
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """The drawings of a period."""
+    """Charts and strips of a period, ready to be drawn."""
 
     found: GradesOfPeriod
     charts: list[GradeChart]
     innovations: list[GradeChart]
     strips: list[Strip]
     ticks: list[tuple[float, str]]
-    """The ticks of the time axis: percent from the left, and their text."""
+    """Tick marks of the time axis: percent from the left, and text."""
 
 
 @console_page(
     "/spacecraft/{name}/grades", "Definitive attitude", Policy("read", "path"), section="/"
 )
 def grades_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Filtered and smoothed attitudes of one spacecraft, and what they were made of."""
+    """Console page with filtered and smoothed attitudes of a spacecraft, and their measurements."""
     definitive, mission = context.app.part(Definitive), context.app.context.mission(name)
     shown = shown_period(context, name, query)
     drawn = None

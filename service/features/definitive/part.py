@@ -1,4 +1,4 @@
-"""The definitive attitude of an open app: days that are recorded, jobs, and the live filter."""
+"""Service of an open app for definitive attitudes: recorded days, jobs, live filters."""
 
 from service.app.factory import App
 from service.features.definitive.days import DefinitiveDays
@@ -7,7 +7,7 @@ from service.features.definitive.live_filter import LiveFilter
 
 
 class Definitive:
-    """Filters and smooths recorded attitudes, and keeps the filters of live data up."""
+    """Filters and smooths recorded attitudes, and runs the filters of live data."""
 
     def __init__(self, app: App) -> None:
         self.days = DefinitiveDays(app.context)
@@ -15,11 +15,11 @@ class Definitive:
         self.live_filter = LiveFilter(app.context, app.kernels)
 
     def close(self) -> None:
-        """End the jobs and the threads."""
+        """Stop all jobs and threads."""
         self.live_filter.stop()
         self.jobs.close()
 
 
 def open_part(app: App) -> Definitive:
-    """The definitive attitude of an open app."""
+    """Create the service for definitive attitudes of an open app."""
     return Definitive(app)

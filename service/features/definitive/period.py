@@ -1,4 +1,4 @@
-"""The grades of a period: samples and innovations for charts, in pages, and the alarm quantity."""
+"""Filtered and smoothed attitudes of a period: thinned for charts, in pages, and for limits."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -47,21 +47,21 @@ from service.trends.limits import SampledDay
 from service.trends.quantities import REJECTED
 
 PARTS = 600
-"""The parts of a period, of each of which one sample is kept: as many as a chart shows."""
+"""Number of equal parts of a period, with one sample each: the resolution of a chart."""
 MOST_DAYS = 40
 _SEVERITY = {Status.NONE: 3, Status.LOST: 3, Status.DOUBTFUL: 2, Status.STARTING: 1}
 
 
 @dataclass(frozen=True, eq=False)
 class GradesOfPeriod:
-    """What was recorded of a period.
+    """Filtered and smoothed attitudes of a period, thinned to the resolution of a chart.
 
-    Of each of `PARTS` equal parts of it `samples` have one, that with the worst status in
-    it; both grades have the same times.  `is_gyro` (n,) says which model they have.
-    `innovations` have of each part one measurement that was accepted, and one, with the largest
-    chi-square, that was not.  `is_whole` says whether every block was read.
-    `stretches` are the model, first and last moment (TAI nanoseconds) of every block of up to
-    an hour; `days` the latest of `total_days`.
+    `samples` have one sample in each of `PARTS` equal parts of the period, the one with the worst
+    status; both grades have the same times.  `is_gyro` (n,) is true for samples filtered with a
+    gyro.  `innovations` have in each part one accepted measurement, and the unused one with the
+    largest chi-square.  `is_whole` is true if every block was read.  `stretches` are the model,
+    first and last moment (TAI nanoseconds) of every block of up to an hour; `days` the latest of
+    `total_days`.
     """
 
     samples: dict[Grade, GradedSamples]
@@ -76,7 +76,7 @@ class GradesOfPeriod:
 def grades_of_period(
     connection: Connection, spacecraft: str, run: str, start: Utc, end: Utc
 ) -> GradesOfPeriod | None:
-    """The grades of a period, None where none are recorded."""
+    """Read the filtered and smoothed attitudes of a period; None if none are recorded."""
     selected = ResultFilter(run, spacecraft, start, end)
     blocks = blocks_of(connection, selected, "smoothed")
     if not blocks:
@@ -127,7 +127,7 @@ def _severity(status: Integers) -> Integers:
 
 
 def _of_each_part(time_ns: Integers, rank: npt.ArrayLike, start: Utc, end: Utc) -> Integers:
-    """The places, one in each part of the period, with the greatest rank in it; the first such."""
+    """Index of the row with the highest rank in each part of a period, the first of equals."""
     within = np.flatnonzero((time_ns >= start.tai_ns) & (time_ns < end.tai_ns))
     length_ns = max(end.tai_ns - start.tai_ns, 1)
     part = ((time_ns[within] - start.tai_ns) / length_ns * PARTS).astype(np.int64)
@@ -145,7 +145,7 @@ def _repeated_models(read: Sequence[Block], time_ns: Integers) -> npt.NDArray[np
 def _innovations(
     connection: Connection, read: Sequence[Block], selected: ResultFilter, start: Utc, end: Utc
 ) -> MeasuredInnovations | None:
-    """The innovations to show; None where none were recorded, as of an older revision."""
+    """Thinned innovations of a period; None if none were recorded, as in older revisions."""
     if not read:
         return None
     parts = []
@@ -168,7 +168,7 @@ def _innovations(
 def list_innovations(
     connection: Connection, selected: ResultFilter, *, limit: int, cursor: str | None
 ) -> Page[Innovation]:
-    """How the measured attitudes of a period met the filter, the earliest first."""
+    """One page of innovations of measured attitudes in a period, earliest first."""
     query = BLOCKS.where(*block_conditions(selected, INNOVATIONS)).order_by(*PLACE).limit(1)
     day, position, row = (-1, -1, 0) if cursor is None else _read_cursor(cursor)
     beyond = query if cursor is None else query.where(tuple_(*PLACE) >= tuple_(day, position))
@@ -216,9 +216,9 @@ def _read_cursor(cursor: str) -> tuple[int, int, int]:
 def evaluate_day(
     connection: Connection, mission: Mission, key: DayKey, row: GradedDayRow, features_off: str
 ) -> None:
-    """Have limits of the share evaluated for a day that was recorded now.
+    """Evaluate limits on the share of rejected measurements for a newly recorded day.
 
-    Days before the latest one raise nothing, and neither do runs without alarms.
+    Earlier days than the latest raise no alarms, and neither do runs without alarms.
     """
     modules = feature_modules("shares", features_off)
     if not modules or not runs_with_alarms(connection, {key.run}):

@@ -1,6 +1,6 @@
-"""Days of grades in the records: a new revision where the facts have changed, none otherwise.
+"""Database records of filtered and smoothed days: a new revision if the input has changed.
 
-Also their attitudes page by page, over a period, and the filtered one of live data.
+Also API records of innovations, jobs and the live attitude.
 """
 
 import hashlib
@@ -61,24 +61,25 @@ SHOWN = ("id", "spacecraft", "run", "revision", "created", "samples", "inputs", 
 
 
 class Innovation(Record, frozen=True, kw_only=True):
-    """How a measured attitude met the filter, and how it differs from the smoothed attitude."""
+    """Difference of a measured attitude from the filter's prediction and the smoothed attitude."""
 
     time: Moment
     outcome: Annotated[
         str, DescribedAs(Literal["accepted", "rejected", "started", "undecided", "unused"])
     ]
-    """`accepted` and `started` measurements are used; `started`: with it the filter began.
-    `undecided`: it agrees with two attitudes that contradict each other."""
+    """`accepted` and `started` measurements were used; `started`: the filter started from it.
+    `undecided`: the measurement agrees with two attitudes that contradict each other.
+    """
     innovation_arcsec: Components | None
-    """From prediction to measurement, about the body axes; null: nothing was predicted."""
+    """Rotation vector from prediction to measurement, about the body axes; null: no prediction."""
     innovation_sigma_arcsec: Components | None
-    """One sigma of prediction and measurement together."""
+    """One sigma of prediction and measurement together, about each body axis."""
     chi_square: float | None
     """Chi-square of the innovation, with three degrees of freedom: 3 on average."""
     difference_arcsec: Components
-    """From the smoothed attitude to the measured one, about the body axes."""
+    """Rotation vector from the smoothed attitude to the measured one, about the body axes."""
     difference_sigma_arcsec: Components
-    """One sigma; the smoothed attitude is partly made of the measured one."""
+    """One sigma of the difference; the smoothed attitude depends on the measured one."""
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
     revision: Annotated[int, Field(ge=1), doc("Revision of the day.")]
 
@@ -87,7 +88,7 @@ InnovationPage = page_record("InnovationPage", Innovation, "A page of innovation
 
 
 class DefinitiveJob(Record, frozen=True, kw_only=True):
-    """The making of a definitive attitude: filtered and smoothed attitudes of recorded days."""
+    """A job that computes the definitive attitude: filtered and smoothed attitudes of days."""
 
     id: Id
     spacecraft: str
@@ -112,7 +113,7 @@ DefinitiveJobList = list_record(
 
 
 class LiveAttitude(Record, frozen=True, kw_only=True):
-    """The filtered attitude at the last epoch of live data; use it only where `status` is good."""
+    """The filtered attitude at the last epoch of live data; use only with `status` good."""
 
     spacecraft: str
     time: Annotated[Moment, doc("Time of the last gyro sample or, without a gyro, measurement.")]
@@ -125,26 +126,26 @@ class LiveAttitude(Record, frozen=True, kw_only=True):
     bias_sigma_deg_per_h: Components
     """One sigma of the bias or, at a constant rate, of the rate."""
     status: StatusName
-    """`suspect`: measurements contradict it, or have not confirmed it yet."""
+    """Status of the filtered attitude; `suspect`: contradicted or not confirmed yet."""
     model: Annotated[str, DescribedAs(Literal["gyro", "constant_rate"])]
 
 
 @dataclass(frozen=True)
 class DayKey:
-    """A spacecraft, a run and a UTC day, counted as `Utc.bucket`."""
+    """Spacecraft, run and UTC day (as in `Utc.bucket`) that identify a filtered day."""
 
     spacecraft: str
     run: str
     day: int
 
     def conditions(self) -> list[Any]:
-        """The key as SQL over `graded_days`."""
+        """SQL conditions on `graded_days` for one day of a spacecraft and run."""
         c = graded_days.c
         return [c.spacecraft == self.spacecraft, c.run == self.run, c.day == self.day]
 
 
 class GradedDayRow(Struct, frozen=True, kw_only=True):
-    """A day of filtered and smoothed attitudes."""
+    """Database record of a day of filtered and smoothed attitudes."""
 
     id: Id
     spacecraft: str
@@ -159,14 +160,14 @@ class GradedDayRow(Struct, frozen=True, kw_only=True):
 
 
 def current_day(connection: Connection, key: DayKey) -> GradedDayRow | None:
-    """The current revision of a day, or None."""
+    """Current revision of a filtered day; None without any."""
     query = select(graded_days).where(*key.conditions(), graded_days.c.current)
     row = connection.execute(query).mappings().first()
     return None if row is None else shown(row)
 
 
 def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) -> list[Row]:
-    """The row of a day, and after it those of its blocks; without the revision."""
+    """Database rows of a filtered day: the day without revision, followed by its blocks."""
     blocks = list(_blocks(id, graded))
     digest = hashlib.sha256()
     for block in blocks:
@@ -196,9 +197,9 @@ def rows_of(key: DayKey, graded: GradedDay, inputs: str, id: str, created: Utc) 
 
 
 def record_day(connection: Connection, key: DayKey, rows: list[Row]) -> GradedDayRow:
-    """Record a revision of a day in the place of the one before.
+    """Record a new revision of a filtered day in place of the current one.
 
-    A day that was recorded meanwhile from the same facts stays as it is.
+    A day that another process recorded from the same input stays unchanged.
     """
     day, *blocks = rows
     c = graded_days.c
@@ -220,7 +221,7 @@ def record_day(connection: Connection, key: DayKey, rows: list[Row]) -> GradedDa
 
 
 def shown(row: Any) -> GradedDayRow:
-    """A row as it is answered."""
+    """Convert a database row of a filtered day to an API record."""
     start, _ = day_bounds(row["day"])
     return GradedDayRow(
         **{name: row[name] for name in SHOWN},
@@ -272,7 +273,7 @@ def _stretch(start: Utc, stretch: GradedStretch) -> GradedStretchInfo:
 
 
 def live_attitude(name: str, day_start: Utc, carried: Carried | None) -> LiveAttitude | None:
-    """The answer about the last epoch; None where there is no attitude, or it is lost."""
+    """API record of the live attitude at its last epoch; None if there is none or it is lost."""
     if carried is None or (word := STATUS.get(Status(int(carried.sample.status[0])))) is None:
         return None
     sample = carried.sample

@@ -1,4 +1,4 @@
-"""Routes of the definitive attitude: the live one, innovations, and the jobs that make it."""
+"""API routes of the definitive attitude: the live one, innovations, and jobs."""
 
 from typing import Annotated, Self
 from urllib.parse import quote
@@ -34,7 +34,7 @@ ROUTERS = (router,)
     Returns("The attitude.", records.LiveAttitude),
 )
 def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
-    """The filtered attitude at the last epoch of live data, where the mission keeps it up.
+    """The filtered attitude at the last epoch of live data, for missions with a live filter.
 
     404 if the mission has no live filter, or if there is no attitude yet, or it is lost.
     """
@@ -49,7 +49,7 @@ def get_live_attitude(name: SpacecraftPath, app: AppDep) -> Response:
 def list_innovations(
     request: Request, name: SpacecraftPath, query: FromQuery[params.PeriodPageQuery], app: AppDep
 ) -> Response:
-    """How each measured attitude met the filter, and how far it is from the smoothed one.
+    """Differences of measured attitudes from the filter's prediction and the smoothed attitude.
 
     They are of the days that `acquire smooth` recorded, the latest revision of each.
     """
@@ -57,7 +57,7 @@ def list_innovations(
 
 
 class DefinitiveIn(Wire):
-    """Which days get a definitive attitude."""
+    """Request body for definitive attitudes: run, period and author."""
 
     run: RunName = "live"
     start: params.Start = None
@@ -79,7 +79,7 @@ class DefinitiveIn(Wire):
 def make_definitive_attitude(
     name: SpacecraftPath, body: JsonBody, app: AppDep, caller: CallerDep
 ) -> Response:
-    """Filter and smooth recorded days beside other work, and record both grades.
+    """Queue a job that filters and smooths recorded days, and records both results.
 
     A day whose record has not changed stays as it is; one with later batches gets a new revision.
     """
@@ -97,7 +97,7 @@ def make_definitive_attitude(
     Returns("The jobs.", records.DefinitiveJobList),
 )
 def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
-    """The jobs of a spacecraft since the start of the service, the newest first."""
+    """The definitive-attitude jobs of a spacecraft since the start of the service, newest first."""
     return json_response(records.DefinitiveJobList(items=app.part(Definitive).jobs.all(name)))
 
 
@@ -109,5 +109,5 @@ def list_definitive_attitudes(name: SpacecraftPath, app: AppDep) -> Response:
 def get_definitive_attitude(
     name: SpacecraftPath, id: Annotated[str, Path(description="The `id` of a job.")], app: AppDep
 ) -> Response:
-    """How far a job is."""
+    """State and progress of a definitive-attitude job."""
     return json_response(app.part(Definitive).jobs.get(name, id))

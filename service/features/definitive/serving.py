@@ -1,4 +1,4 @@
-"""Live filters and daily jobs, where missions ask for them, while the service serves."""
+"""Start of live filters and daily jobs, for missions that configure them."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,12 +10,12 @@ from service.web.requests.metrics import Metrics
 
 
 def check(settings: Settings) -> None:
-    """Live filters and jobs have no settings: missions ask for them."""
+    """Do nothing: live filters and jobs have no settings, missions configure them."""
 
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Start the threads; closing the app ends them."""
+    """Start the threads of live filters and daily jobs; closing the app stops them."""
     definitive = app.part(Definitive)
     definitive.live_filter.start()
     definitive.jobs.start_schedule()

@@ -1,4 +1,4 @@
-"""The input of the filter: recorded measurements and gyro samples, in unbroken stretches."""
+"""Division of recorded measurements and gyro samples into unbroken intervals for the filter."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -25,15 +25,15 @@ from service.missions.motion import GyroSettings, MotionSettings
 from service.vectors import ARCSEC_PER_RADIAN, Vector, full_matrices
 
 LONGEST_GAP_S = 600.0
-"""A longer gap ends a stretch; what an attitude is worth is gone by then."""
+"""Longest gap in seconds within an interval; a propagated attitude is useless by then."""
 _LONGEST_GAP_NS = int(LONGEST_GAP_S) * 10**9
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """The filter's input of an unbroken stretch.
+    """Filter input of an unbroken interval.
 
-    At a constant rate `gyro` is None, or the rates that the batches of a spinning body carried.
+    At a constant rate `gyro` is None, or the rates sent with the batches of a spinning body.
     """
 
     model: GyroModel | ConstantRateModel
@@ -43,7 +43,7 @@ class Stretch:
 
     @property
     def begin_ns(self) -> int:
-        """The first moment."""
+        """Time of the first gyro sample or measurement."""
         times = [] if self.gyro is None else [self.gyro.tai_ns]
         times += [self.attitudes.tai_ns, self.directions.tai_ns]
         return min(int(each[0]) for each in times if len(each))
@@ -51,11 +51,11 @@ class Stretch:
 
 @dataclass(frozen=True, eq=False)
 class Cut:
-    """The stretches of a window in order of time, and what is in none of them.
+    """Filter input of a window, divided into intervals in order of time, and the unused rest.
 
     `beyond_largest` counts gyro samples beyond the mission's largest rate, `not_given` samples of
-    zeros while the body turned, `alone` the measurements that are too few to confirm an attitude
-    at a constant rate.
+    zeros while the body turned, `alone` measurements that are too few to confirm an attitude at a
+    constant rate.
     """
 
     stretches: list[Stretch]
@@ -66,17 +66,17 @@ class Cut:
 
 Mask = npt.NDArray[np.bool_]
 LEAST_RATIO = 1e-10
-"""The least ratio of smallest to largest variance: a covariance below it is as good as singular."""
+"""Least ratio of smallest to largest variance; below it a covariance counts as singular."""
 
 
 @dataclass(frozen=True, eq=False)
 class Recorded:
-    """Gyro samples and measurements of a window, each in order of time.
+    """Recorded gyro samples and measurements of a window, in order of time.
 
-    `gyro_ns` (n,) and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.  Of m
-    attitudes those are left out whose covariance says nothing, and counted in `unusable`.
-    `carried_rad_s` (m, 3) are the rates about the body axes that the batches of the attitudes
-    carried, zeros where none; None where none carried any.
+    `gyro_ns` (n,) and `rates_rad_s` (n, 3) are as recorded, about the gyro's axes.  Attitudes (m)
+    with a useless covariance are left out, and counted in `unusable`.  `carried_rad_s` (m, 3) are
+    the rates about the body axes sent with the batches of the attitudes, zeros if not sent; None if
+    none were sent.
     """
 
     gyro_ns: Nanoseconds
@@ -88,14 +88,14 @@ class Recorded:
 
 
 RATE_SIGMAS = 3.0
-"""A body that turns faster than so many of the mission's sigmas is not found by its attitudes."""
+"""Rate, in the mission's sigmas, above which attitudes alone do not show the rotation."""
 
 
 def rates_of_use(model: ConstantRateModel, tai_ns: Nanoseconds, carried_rad_s: Vector) -> bool:
-    """True if the attitudes of a body at times (m,) do not tell how it turns at rates (m, 3).
+    """True if attitudes at times (m,) are too sparse to determine rotation at rates (m, 3).
 
-    The filter does not expect it to turn so fast.  Where it makes more than a quarter turn between
-    two of them, they leave open how many turns and which way round.
+    The filter does not expect such a fast rotation; and with more than a quarter turn between two
+    attitudes, the number and the sense of the turns stay open.
     """
     fastest = np.linalg.norm(carried_rad_s, axis=1)
     turn = np.maximum(fastest[1:], fastest[:-1]) * np.diff(tai_ns) * NS
@@ -106,7 +106,7 @@ def rates_of_use(model: ConstantRateModel, tai_ns: Nanoseconds, carried_rad_s: V
 def arrays_of(
     attitudes: AttitudeMeasurements, directions: DirectionMeasurements
 ) -> Sequence[npt.NDArray[Any]]:
-    """All arrays of measurements, as digests take them in."""
+    """All arrays of the measurements, in the order in which digests take them."""
     return (
         attitudes.tai_ns,
         attitudes.quaternion,
@@ -121,7 +121,7 @@ def arrays_of(
 def usable_attitudes(
     tai_ns: Nanoseconds, quaternion: Vector, covariance_arcsec2: Vector
 ) -> tuple[AttitudeMeasurements, Mask]:
-    """The attitudes with a sound covariance, and marks (m,) of those among all.
+    """Attitudes with a valid covariance, and their mask (m,).
 
     `covariance_arcsec2` (m, 6) is the upper triangle: 11, 12, 13, 22, 23, 33.
     """
@@ -137,14 +137,14 @@ def usable_attitudes(
 
 
 def attitudes_where(attitudes: AttitudeMeasurements, places: Any) -> AttitudeMeasurements:
-    """Some of the attitudes."""
+    """Attitude measurements selected by indices or a mask."""
     return AttitudeMeasurements(
         attitudes.tai_ns[places], attitudes.quaternion[places], attitudes.covariance_rad2[places]
     )
 
 
 def directions_where(directions: DirectionMeasurements, places: Any) -> DirectionMeasurements:
-    """Some of the directions."""
+    """Direction measurements selected by indices or a mask."""
     return DirectionMeasurements(
         directions.tai_ns[places],
         directions.body[places],
@@ -154,11 +154,11 @@ def directions_where(directions: DirectionMeasurements, places: Any) -> Directio
 
 
 def cut(recorded: Recorded, mission: Mission) -> Cut:
-    """The stretches of a window.
+    """Divide the record of a window into unbroken intervals.
 
-    Where a gyro runs without a gap of `LONGEST_GAP_S`, a stretch has its samples, and the
-    measurements from its first sample to its last.  Measurements outside have stretches at a
-    constant rate, which the same gap ends.
+    An interval with a gyro has samples without a gap of `LONGEST_GAP_S`, and the measurements from
+    its first sample to its last.  Measurements outside form intervals at a constant rate, which the
+    same gap ends.
     """
     stretches: list[Stretch] = []
     attitude_ns, direction_ns = recorded.attitudes.tai_ns, recorded.directions.tai_ns
@@ -212,7 +212,7 @@ def cut(recorded: Recorded, mission: Mission) -> Cut:
 
 
 def _unbroken(times_ns: Nanoseconds) -> Iterator[slice]:
-    """The parts of rising times between long gaps."""
+    """Slices of ascending times between long gaps."""
     if not len(times_ns):
         return
     breaks = (np.flatnonzero(np.diff(times_ns) > _LONGEST_GAP_NS) + 1).tolist()
@@ -231,7 +231,7 @@ def _without_gyro(
     left_d: Mask,
     edges: list[int],
 ) -> Iterator[tuple[Mask, Mask]]:
-    """Masks of the measurements that are left, for each stretch without a gyro."""
+    """Masks of remaining attitudes and directions, for each interval without a gyro."""
     times = np.union1d(attitude_ns[left_a], direction_ns[left_d])
     # Between two of the same stretch lies no stretch with a gyro.
     place = np.searchsorted(np.asarray(edges, dtype=np.int64), times)
@@ -246,9 +246,10 @@ def _without_gyro(
 
 
 def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
-    """Marks (n,) of gyro samples that are zero about all axes, in a row, while the body turned.
+    """Mask (n,) of gyro samples in a run of zeros about all axes while the body turned.
 
-    Such samples stand for none.  A gyro of coarse steps also reads zero, of a body nearly at rest.
+    Such samples stand for missing data.  A gyro with coarse resolution also reads zero when the
+    body is nearly at rest.
     """
     zero: Mask = np.asarray(~recorded.rates_rad_s.any(axis=1))
     attitude_ns = recorded.attitudes.tai_ns
@@ -272,7 +273,7 @@ def zeros_while_turning(settings: GyroSettings, recorded: Recorded) -> Mask:
 
 
 def constant_rate(settings: MotionSettings | None) -> ConstantRateModel:
-    """The model of a body without a gyro."""
+    """Constant-rate model with the mission's settings, for a body without a gyro."""
     settings = settings or MotionSettings()
     return ConstantRateModel(settings.rate_walk_rad_s1_5, settings.rate_sigma_rad_s)
 
@@ -283,11 +284,11 @@ def at_carried_rates(
     attitude_ns: Nanoseconds,
     carried_rad_s: Vector,
 ) -> tuple[ConstantRateModel, GyroSamples | None]:
-    """The model and the rates of a stretch whose batches carried rates of a body that spins.
+    """Constant-rate model and body rates of an interval whose batches were sent with rates.
 
-    `times_ns` (n,) are those of all measurements, `carried_rad_s` (m, 3) the rates of the
-    attitudes, zeros where none.  Where they are of no use, or all measurements are of one time,
-    the model comes back without rates.
+    `times_ns` (n,) are the times of all measurements, `carried_rad_s` (m, 3) the rates sent with
+    the attitudes, zeros if none.  If the rates are of no use, or all times are equal, the model is
+    returned without rates.
     """
     known = carried_rad_s.any(axis=1)
     if len(times_ns) < 2 or not rates_of_use(model, attitude_ns, carried_rad_s):
@@ -307,12 +308,12 @@ def at_carried_rates(
 
 
 WALK_STEP = 1.1
-"""The ratio of an angle walk to the next larger one."""
+"""Ratio of two successive values to which an angle walk is rounded."""
 
 
 def _rounded_up(walk: float) -> float:
-    """The next power of `WALK_STEP`: one more batch changes it rarely.
+    """Round up to the next power of `WALK_STEP`, so that one more batch rarely changes the value.
 
-    With another model the live filter begins its stretch anew.
+    With another model the live filter has to filter its interval again.
     """
     return WALK_STEP ** math.ceil(math.log(walk, WALK_STEP)) if walk > 0.0 else 0.0

@@ -1,4 +1,4 @@
-"""Telemetry from a message bus: follows a stream of NATS JetStream."""
+"""Telemetry from a message bus: submits messages of a NATS JetStream stream."""
 
 from service.feature import Feature
 

@@ -1,4 +1,4 @@
-"""`acquire follow`: telemetry from a stream of NATS JetStream."""
+"""Command `acquire follow`: submit telemetry from a NATS JetStream stream."""
 
 import sys
 from argparse import Namespace
@@ -15,7 +15,7 @@ DEFAULT_CONCURRENCY = 16
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `follow` and its options."""
     parser = arguments.add_command(commands, "follow", run, first="--url --answers --until-empty")
     parser.add_argument("source", metavar="nats://HOST/STREAM", help="or tls://HOST/STREAM")
     parser.add_argument(

@@ -1,4 +1,4 @@
-"""Follows a stream: a durable consumer of NATS JetStream whose messages are submitted.
+"""Follower of a message stream: submits the messages of a durable NATS JetStream consumer.
 
     stream ──► consumer ──► follower ──► service ──► committed ──► acknowledged
                                └──► refused: subject of refusals, and terminated
@@ -37,58 +37,58 @@ from service.features.follow.source import Source
 from service.gyro.blocks import is_gyro_line
 
 ACK_WAIT_S = 30.0
-"""A message without a sign from its follower for so long is delivered to another one."""
+"""Seconds without a sign of life after which NATS delivers a message to another follower."""
 BEAT_S = 10.0
 FETCH_S = 1.0
 PAUSE_S = 1
 BEGIN_AGAIN_S = 5.0
 TRIES = 5
-"""Attempts of this follower at which the service fails, before it refuses the message."""
+"""Failed attempts of the service to process a message before the follower refuses it."""
 UNKEPT_S = 60.0
 """Seconds before a follower asks again whether a stream keeps a subject."""
 MESSAGE_TOO_LARGE = 10_054
-"""The code of NATS for a message above the largest one that a stream takes."""
+"""NATS error code for a message larger than a stream accepts."""
 STATE_EVERY_S = 5.0
 SEQUENCE, DELIVERED = "Acquire-Sequence", "Acquire-Delivered"
-"""Headers of refusals and answers: the message's place in its stream, and its deliveries."""
+"""Headers of refusals and answers: the message's number in its stream, and its deliveries."""
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
 class Answer:
-    """The answer to a message that is recorded."""
+    """Answer of the service to a recorded message."""
 
     body: bytes
     is_repeated: bool
-    """True if it had been recorded before."""
+    """True if the message was already recorded before."""
 
 
 Submit = Callable[[bytes], Awaitable[Answer]]
-"""Hands a message over, and waits until it is recorded.
+"""Function that submits a message, and waits until it is recorded.
 
-Raises `NotNow`, `Refused`, or another exception that is about no single message.
+Raises `NotNow`, `Refused`, or another exception that concerns no single message.
 """
 
 
 class NotNow(Exception):
-    """The service takes no message now; the same one may be recorded later."""
+    """Raised if the service accepts no message now; a later attempt may succeed."""
 
 
 class Refused(Exception):
-    """The service refuses a message."""
+    """Raised if the service refuses a message."""
 
     def __init__(self, problem: Mapping[str, Any], has_failed: bool) -> None:
-        """`has_failed`: the fault is the service's; another attempt may succeed."""
+        """Keep the problem; `has_failed`: the service is at fault, another attempt may succeed."""
         super().__init__(problem["detail"])
         self.problem, self.has_failed = problem, has_failed
 
 
 class Metrics:
-    """Counters of a follower for Prometheus, and for its summary."""
+    """Counters of a follower, for Prometheus and for its summary."""
 
     def __init__(self, registry: CollectorRegistry | None = None) -> None:
-        """The counters are in a registry of their own unless one is given."""
+        """Create the counters in `registry`, or in a new one."""
         self.registry = CollectorRegistry() if registry is None else registry
         self._messages = Counter(
             "starid_follow_messages",
@@ -110,23 +110,23 @@ class Metrics:
         self.lag = 0
 
     def count(self, outcome: str) -> None:
-        """Count a message that is done."""
+        """Count a finished message by its outcome."""
         self.counts[outcome] += 1
         self._messages.labels(outcome).inc()
 
     def count_redelivered(self) -> None:
-        """Count a message that another follower had before."""
+        """Count a message that was delivered before."""
         self.counts["redelivered"] += 1
         self._redelivered.inc()
 
     def set_lag(self, pending: int) -> None:
-        """Note how many messages the consumer has still to deliver."""
+        """Record the number of messages that the consumer has still to deliver."""
         self.lag = pending
         self._lag.set(pending)
 
 
 class Follower:
-    """Takes messages until it is stopped; what it has not finished then goes to another one."""
+    """Submits messages of a stream until stopped; unfinished ones go to another follower."""
 
     def __init__(
         self,
@@ -135,25 +135,25 @@ class Follower:
         metrics: Metrics,
         progress: Callable[[Metrics], object] = lambda metrics: None,
     ) -> None:
-        """`progress` is called every few seconds."""
+        """Keep the collaborators; `progress` is called every few seconds."""
         self._source, self._submit = source, submit
         self._metrics, self._progress = metrics, progress
         self._stopped = asyncio.Event()
         self._is_service_busy = False
         self._failures: Counts[int] = Counts()
-        """How often the service failed at a message, by its place in the stream."""
+        """Number of failed attempts by message, identified by its place in the stream."""
         self._unkept_until_s: dict[str, float] = {}
-        """Subjects that no stream keeps, and when to ask again."""
+        """Subjects that no stream keeps, and the time of the next check."""
 
     def stop(self) -> None:
-        """Take no more messages, and end after those at work."""
+        """Take no more messages, and end after those in progress."""
         self._stopped.set()
 
     async def run(self, until_empty: bool = False) -> None:
         """Follow the stream; with `until_empty`, until nothing is left to deliver.
 
-        Raises `BadConfiguration` where NATS has no such stream or refuses the connection, and what
-        `submit` raises that is about no single message.
+        Raises `BadConfiguration` if NATS has no such stream or refuses the connection, and
+        exceptions of `submit` that concern no single message.
         """
         connection = await self._connected()
         if connection is None:
@@ -193,7 +193,7 @@ class Follower:
             await connection.close()
 
     async def keep_running(self) -> None:
-        """Follow until it is stopped; after a failure begin again a few seconds later."""
+        """Follow the stream until stopped; start again a few seconds after a failure."""
         while not self._stopped.is_set():
             try:
                 await self.run()
@@ -205,7 +205,7 @@ class Follower:
                 await asyncio.wait_for(self._stopped.wait(), BEGIN_AGAIN_S)
 
     async def _connected(self) -> Client | None:
-        """A connection; None if the follower was stopped before NATS answered."""
+        """Connection to NATS; None if the follower was stopped before NATS answered."""
         source = self._source
 
         async def note(error: Exception) -> None:
@@ -243,10 +243,10 @@ class Follower:
             raise BadConfiguration(f"{source.shown}: NATS cannot be reached: {error}") from None
 
     async def _require_consumer(self, stream: JetStreamContext) -> None:
-        """Make the durable consumer where there is none.
+        """Create the durable consumer if the stream does not have it.
 
-        Raises `BadConfiguration` where JetStream does not answer, where there is no such stream,
-        and where the consumer would deliver the follower's own answers or refusals to it.
+        Raises `BadConfiguration` if JetStream does not answer, if there is no such stream, and if
+        the consumer would deliver the follower's own answers or refusals to it.
         """
         source = self._source
         try:
@@ -266,7 +266,7 @@ class Follower:
             raise BadConfiguration(f"{source.shown}: JetStream cannot be used: {error}") from None
 
     def _refuse_own_output(self, kept: Iterable[str], consumer: ConsumerConfig) -> None:
-        """Raise `BadConfiguration` where the consumer would deliver answers or refusals."""
+        """Raise `BadConfiguration` if the consumer would deliver answers or refusals."""
         source, one = self._source, consumer.filter_subject
         delivered = [one] if one else consumer.filter_subjects or [">"]
         for subject in (source.refusals, source.answers):
@@ -277,7 +277,7 @@ class Follower:
                 )
 
     async def _is_empty(self, stream: JetStreamContext) -> bool:
-        """True if every message is settled; makes a consumer that was deleted again."""
+        """True if every message of the stream is settled; creates a deleted consumer again."""
         try:
             info = await stream.consumer_info(self._source.stream, self._source.consumer)
         except NotFoundError:
@@ -299,7 +299,7 @@ class Follower:
             await asyncio.sleep(STATE_EVERY_S)
 
     def _forget_failures(self, info: ConsumerInfo) -> None:
-        """Forget the failures at messages that another follower has settled."""
+        """Drop failure counts of messages that another follower has settled."""
         floor = info.ack_floor.stream_seq if info.ack_floor else 0
         for place in [place for place in self._failures if place <= floor]:
             del self._failures[place]
@@ -313,13 +313,13 @@ class Follower:
         try:
             await self._settle(stream, message)
         except NatsError as error:
-            # It is delivered again, and then found to be recorded.
+            # NATS delivers the message again, which is then found to be recorded.
             log.warning("message %d is not settled: %s", message.metadata.sequence.stream, error)
         finally:
             beat.cancel()
 
     async def _keep(self, message: Msg) -> None:
-        """Let no other follower have the message while the service is at work on it."""
+        """Keep NATS from delivering a message again while the service processes it."""
         while True:
             await asyncio.sleep(BEAT_S)
             with suppress(NatsError):
@@ -349,7 +349,7 @@ class Follower:
                 self._metrics.count("refused")
                 return
             except Exception:
-                # Of the token, for example, not of the message: that waits for a follower that may.
+                # The problem is the token's, for example, not the message's: leave it to others.
                 await message.nak()
                 raise
             else:
@@ -365,7 +365,7 @@ class Follower:
     async def _publish(
         self, stream: JetStreamContext, subject: str, message: Msg, body: bytes
     ) -> None:
-        """Publish about a message; a stream that keeps the subject takes it once.
+        """Publish an answer or refusal; a stream that keeps the subject stores it once.
 
         A message that is too large for NATS is logged and not published.
         """
@@ -403,7 +403,7 @@ class Follower:
 
 
 class _TlsClient(Client):
-    """A connection that sends no credentials to a server without TLS, also when it is lost."""
+    """NATS connection that sends no credentials to a server without TLS, also on reconnection."""
 
     def _connect_command(self) -> bytes:
         if not self._server_info.get("tls_required"):
@@ -412,13 +412,13 @@ class _TlsClient(Client):
 
 
 def _size_of(headers: Mapping[str, str]) -> int:
-    """The bytes of headers as NATS counts them."""
+    """Size of NATS headers in bytes, counted as NATS does."""
     lines = (f"{name}: {value}\r\n".encode() for name, value in headers.items())
     return len(b"NATS/1.0\r\n\r\n") + sum(len(line) for line in lines)
 
 
 def _covers(patterns: Iterable[str], subject: str) -> bool:
-    """True if one of the patterns, with `*` for a token and `>` for the rest, has the subject."""
+    """True if a NATS subject matches a pattern, with `*` for a token and `>` for the rest."""
     return any(_matches(pattern.split("."), subject.split(".")) for pattern in patterns)
 
 
@@ -431,7 +431,7 @@ def _matches(pattern: list[str], tokens: list[str]) -> bool:
 
 
 def gyro_block_in(message: bytes) -> tuple[str, bytes] | None:
-    """The spacecraft of a gyro block, and the body of a request for it; None for a batch."""
+    """Spacecraft and request body of a gyro block; None if the message is a batch."""
     if not is_gyro_line(message):
         return None
     block = json.loads(message)

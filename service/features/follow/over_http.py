@@ -1,4 +1,4 @@
-"""Submits the messages of a stream to a service over HTTP."""
+"""Submission of stream messages to a service over HTTP."""
 
 from acquire_client import AsyncClient
 from acquire_client import errors as answers
@@ -9,30 +9,30 @@ from service.errors import BadConfiguration
 from service.features.follow.follower import Answer, NotNow, Refused, gyro_block_in
 
 RECORDED = (200, 201)
-"""The statuses of a message that was recorded before, and of one that is recorded now."""
+"""HTTP statuses of a message recorded before, and of one recorded now."""
 MISDIRECTED = 421
-"""The status where the service does not know itself by the name in its address."""
+"""HTTP status of a service that does not accept the host name in the request."""
 PATH_TOO_LONG = (414, 431)
-"""The statuses where the name of a spacecraft makes the request line too long."""
+"""HTTP statuses of a request line that a long spacecraft name makes too long."""
 FAILED = 500
 
 
 class OverHttp:
-    """Submits through a client.
+    """Submits messages through the HTTP client.
 
-    Raises what the client does where the service wants a token, or another name of its host.
+    Raises the client's exceptions if the service requires a token, or another host name.
     """
 
     def __init__(self, client: AsyncClient) -> None:
         self._client = client
 
     async def require_scope(self) -> None:
-        """Raise `BadConfiguration` where the token may not submit."""
+        """Raise `BadConfiguration` if the token lacks the scope to submit."""
         if "submit" not in (await self._client.session()).scopes:
             raise BadConfiguration("ACQUIRE_TOKEN: the token lacks the scope `submit`")
 
     async def __call__(self, message: bytes) -> Answer:
-        """The answer of the service once it has committed."""
+        """Submit a message; returns the answer of the service once committed."""
         path, body = path_of("batches"), message
         if (block := gyro_block_in(message)) is not None:
             spacecraft, body = block
@@ -61,7 +61,7 @@ class OverHttp:
 
 
 def _is_about_message(problem: answers.Problem) -> bool:
-    """False if a proxy answered, for example: the same message may be recorded later.
+    """True if the service refused the message itself; False if a proxy, for example, answered.
 
     The client gives an answer that is no problem document the detail `HTTP 404: ...`.
     """

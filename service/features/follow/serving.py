@@ -1,7 +1,7 @@
-"""The follower of a NATS stream that runs within the service (`ACQUIRE_FOLLOW`).
+"""Follower of a NATS stream that runs within the service (`ACQUIRE_FOLLOW`).
 
-It submits as the routes do, without a token and without HTTP.  Several services that share a
-database share the messages of the consumer, too.
+Messages are submitted like requests, without a token and without HTTP.  Several services that share
+a database share the messages of the consumer, too.
 """
 
 import asyncio
@@ -30,10 +30,10 @@ log = logging.getLogger(__name__)
 
 
 def source_of(settings: Settings) -> Source | None:
-    """The stream that the settings name; None without one.
+    """Stream, consumer and subjects from the settings; None without a stream.
 
-    Raises `BadConfiguration` for an address that is none and for a file that is not there,
-    `NotAvailable` without the package.
+    Raises `BadConfiguration` for an invalid address and for a missing file, `NotAvailable` without
+    the package.
     """
     if settings.follow is None:
         return None
@@ -62,13 +62,13 @@ def source_of(settings: Settings) -> Source | None:
 
 
 def check(settings: Settings) -> None:
-    """Raise for settings that name no stream that can be followed; see `source_of`."""
+    """Raise for settings of a stream that cannot be followed; see `source_of`."""
     source_of(settings)
 
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Follow the stream that the settings name, in a task of its own."""
+    """Follow the stream named in the settings, in a background task."""
     source = source_of(app.settings)
     if source is None:
         yield
@@ -86,7 +86,7 @@ async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
 
 
 def _submit_to(app: App, metrics: Metrics) -> "Submit":
-    """Submit as the routes do, for a follower."""
+    """Submit function for a follower that runs within the service."""
     from service.features.follow.follower import Answer, NotNow, Refused, gyro_block_in
 
     async def recorded(message: bytes) -> Answer:

@@ -1,4 +1,4 @@
-"""Source of a follower: a stream of NATS, its consumer, and the subjects to publish to."""
+"""Configuration of a follower: NATS stream, consumer, and subjects to publish to."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,33 +10,33 @@ EXPECTED = "must be nats://HOST/STREAM or tls://HOST/STREAM"
 
 @dataclass(frozen=True)
 class Source:
-    """The stream, consumer and subjects that a follower uses."""
+    """NATS stream, consumer and subjects that a follower uses."""
 
     servers: str
     stream: str
     consumer: str
     refusals: str
-    """The subject that refused messages go to, with the problem."""
+    """Subject for refused messages, published with the problem."""
     answers: str | None = None
-    """The subject that answers are published to; None: to none."""
+    """Subject for answers; None: answers are not published."""
     credentials: Path | None = None
     authority: Path | None = None
-    """CA certificate (PEM) that the NATS server's certificate is checked with.
+    """CA certificate (PEM) to verify the NATS server.
 
-    None: those of the system.
+    None: the certificates of the system.
     """
     concurrency: int = 16
-    """Messages that are at work together."""
+    """Greatest number of messages processed at the same time."""
 
     @property
     def shown(self) -> str:
-        """The address of NATS for messages, without a password."""
+        """Address of the NATS server without a password, for messages."""
         scheme, _, place = self.servers.partition("://")
         return f"{scheme}://{place.rpartition('@')[2]}"
 
 
 def server_and_stream(text: str) -> tuple[str, str]:
-    """The two parts of nats://HOST/STREAM; raises ValueError."""
+    """Split nats://HOST/STREAM into server and stream; raises ValueError."""
     try:
         parts = urlsplit(text)
         _ = parts.port
@@ -50,5 +50,5 @@ def server_and_stream(text: str) -> tuple[str, str]:
 
 
 def refusals_of(stream: str) -> str:
-    """The subject that refused messages of a stream go to where no other is named."""
+    """Default subject for refused messages of a stream."""
     return f"acquire.refused.{stream}"

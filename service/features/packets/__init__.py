@@ -1,4 +1,4 @@
-"""CCSDS space packets as batches and gyro blocks."""
+"""Input format for CCSDS space packets, converted to batches and gyro blocks."""
 
 from service.feature import Feature
 

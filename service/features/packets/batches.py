@@ -1,4 +1,4 @@
-"""Packets to batches: stars with what earlier packets carried, and measured attitudes."""
+"""Conversion of packet values to batches of stars and of measured attitudes."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,39 +15,39 @@ from service.observations.field_faults import checked_by
 from service.observations.schema import NORM_TOLERANCE, BatchIn, checked_from_model
 
 CARRIED_WITHIN_S = 10.0
-"""Rates, velocity and position of another packet serve stars that are so near in time."""
+"""Greatest age in seconds of rates, velocity and position from another packet than the stars'."""
 
 STATE_FIELDS = {
     "rates": "body_rates_deg_per_s",
     "velocity": "velocity_km_per_s",
     "position": "position_km",
 }
-"""The tables of a spacecraft's state in `[packets]`, and the fields of a batch that they fill."""
+"""Tables of `[packets]` for the spacecraft's state, and the batch fields that they fill."""
 SCALES = {"rad_per_s": 180.0 / math.pi, "m_per_s": 1e-3, "m": 1e-3}
-"""The factors to degrees per second and kilometres, of units that need one."""
+"""Factors from a unit to degrees per second or kilometres; 1 for units not listed."""
 
 Values = Mapping[str, Any]
 
 
 @dataclass
 class StarBatch:
-    """A batch in the making, with the packet that it began with."""
+    """An unfinished batch of stars, with its first packet."""
 
     packet: SpacePacket
     moment: clock.Moment
     body: dict[str, Any]
     columns: list[TrackerColumns] = field(default_factory=list)
     slots: list[list[int]] = field(default_factory=list)
-    """By tracker, the slot of each of its stars."""
+    """Packet slots of each tracker's stars."""
 
     def has_stars(self) -> bool:
-        """True if a slot of any tracker held a star."""
+        """True if any tracker has a star in the batch."""
         return any(self.slots)
 
 
 @dataclass(frozen=True, slots=True)
 class PacketAttitude:
-    """An a priori attitude: scalar last, inertial to body, and its time."""
+    """A priori attitude read from a packet: scalar-last quaternion, inertial to body, and time."""
 
     moment: clock.Moment
     quaternion: tuple[float, float, float, float]
@@ -56,7 +56,7 @@ class PacketAttitude:
 def quaternion_in(
     values: Mapping[str, Any], names: Sequence[str], table: PacketPrior | PacketMeasurement
 ) -> tuple[float, float, float, float] | None:
-    """The quaternion of a packet; None where it is zero or not finite: there is no attitude.
+    """Quaternion read from a packet; None (no attitude) if it is zero or not finite.
 
     Raises `PacketFault` for a norm other than 1.
     """
@@ -77,13 +77,13 @@ def quaternion_in(
 
 
 def counted_change(counts: int, turn: int) -> int:
-    """The change nearest to zero of a counter that starts again after `turn` counts."""
+    """Change of a counter that wraps after `turn` counts, taken as the one nearest to zero."""
     half = turn // 2
     return (counts + half) % turn - half
 
 
 class GyroRates:
-    """Body rates from the counts of a gyro."""
+    """Conversion of a gyro's counts in packets to body rates."""
 
     def __init__(self, gyro: PacketGyro, names: Sequence[str]) -> None:
         self._gyro = gyro
@@ -92,7 +92,7 @@ class GyroRates:
         self._last: tuple[int, tuple[int, ...]] | None = None
 
     def add(self, values: Mapping[str, Any], moment: clock.Moment) -> list[float] | None:
-        """The rates in deg/s at a packet; None where an angle has no packet just before."""
+        """Body rates in deg/s at a packet; None for an angle without a recent packet before."""
         gyro = self._gyro
         if gyro.kind == "rate":
             counts = clock.finite_all(values, self._names)
@@ -111,7 +111,7 @@ class GyroRates:
 
 
 class Held:
-    """Values of the latest packet that had them, with their time."""
+    """Latest packet values of a quantity, with their time."""
 
     def __init__(self, within_s: float) -> None:
         self._within_ns = round(within_s * clock.NS)
@@ -119,18 +119,18 @@ class Held:
         self._values: list[float] | None = None
 
     def hold(self, moment: clock.Moment, values: list[float] | None) -> None:
-        """Take values in place of those before; None: there are none any more."""
+        """Replace the held values; None if the packet has none."""
         self._moment, self._values = moment, values
 
     def near(self, moment: clock.Moment) -> list[float] | None:
-        """The values, if their time is near enough to a moment."""
+        """Held values, if their time is near enough to `moment`; otherwise None."""
         if self._moment is None or abs(self._moment.tai_ns - moment.tai_ns) > self._within_ns:
             return None
         return self._values
 
 
 class BatchMaker:
-    """Makes batches of one spacecraft from the values of packets, in order."""
+    """Converts packet values of one spacecraft, in order, to batches of stars."""
 
     def __init__(self, spacecraft: str, mapped: PacketMap) -> None:
         self._spacecraft = spacecraft
@@ -145,7 +145,7 @@ class BatchMaker:
         """Packets whose a priori quaternion was zero or not finite."""
 
     def attitude(self, values: Values) -> PacketAttitude | None:
-        """The a priori attitude in a packet; raises `PacketFault`."""
+        """A priori attitude in a packet, None without one; raises `PacketFault`."""
         names, prior = self._mapped.quaternion, self._prior
         if not names or prior is None or names[0] not in values:
             return None
@@ -156,7 +156,7 @@ class BatchMaker:
         return PacketAttitude(clock.moment_of(prior.time or self._table.time, values), quaternion)
 
     def add(self, packet: SpacePacket, values: Values) -> Iterator[StarBatch]:
-        """Take a packet; gives the batch that is complete with it.  Raises `PacketFault`."""
+        """Add a packet; yields the batch that the packet completes.  Raises `PacketFault`."""
         attitude = self.attitude(values)
         if attitude is not None:
             self._attitude.hold(attitude.moment, list(attitude.quaternion))
@@ -188,7 +188,7 @@ class BatchMaker:
             yield pending
 
     def end(self) -> Iterator[StarBatch]:
-        """The batch that waits for further trackers."""
+        """Yield the unfinished batch, which waited for further trackers."""
         pending, self._pending = self._pending, None
         if pending is not None:
             yield pending
@@ -244,7 +244,7 @@ class BatchMaker:
     def _stars(
         self, columns: TrackerColumns, values: Values
     ) -> tuple[list[int], list[dict[str, Any]]]:
-        """The slots that hold a star, and the stars."""
+        """Indices of the slots that hold a star, and the stars."""
         used = columns.slots
         if columns.count is not None:
             used = clock.whole(values, columns.count)
@@ -283,11 +283,11 @@ class BatchMaker:
         return slots, stars
 
     def json_of(self, batch: StarBatch) -> bytes:
-        """A batch as canonical JSON; raises `PacketFault` naming the parameter of a fault."""
+        """Canonical JSON of a batch; raises `PacketFault` naming the packet parameter at fault."""
         return _json_of(batch.body, lambda fault: self._parameter_of(batch, fault))
 
     def _parameter_of(self, batch: StarBatch, fault: Fault) -> str:
-        """The parameter from which a field of a batch was made."""
+        """Packet parameters from which a field of a batch was made, for error messages."""
         head, *rest = fault.field.split(".")
         mapped = self._mapped
         whole_fields = {
@@ -314,7 +314,7 @@ class BatchMaker:
 
 
 def _json_of(body: dict[str, Any] | None, parameters_of: Callable[[Fault], str]) -> bytes:
-    """A body as canonical JSON, with the checks of every batch."""
+    """Canonical JSON of a request body, after the checks of every batch."""
     try:
         model = checked_by(BatchIn.model_validate, body)
     except BadBatch as error:
@@ -325,7 +325,7 @@ def _json_of(body: dict[str, Any] | None, parameters_of: Callable[[Fault], str])
 
 
 def _shift(stars: list[dict[str, Any]], later_s: float) -> None:
-    """Times of stars from a packet that is later than the batch's first."""
+    """Shift the time offsets of stars from a packet later than the batch's first one."""
     if later_s:
         for star in stars:
             star["time_offset_s"] = star.get("time_offset_s", 0.0) + later_s
@@ -333,7 +333,7 @@ def _shift(stars: list[dict[str, Any]], later_s: float) -> None:
 
 @dataclass(frozen=True)
 class MeasuredBatch:
-    """A measured attitude of a packet; `body` is None where the packet says that there is none."""
+    """Batch of a measured attitude in a packet; `body` is None if the packet flags it invalid."""
 
     packet: SpacePacket
     columns: MeasurementColumns
@@ -341,20 +341,20 @@ class MeasuredBatch:
 
 
 class MeasurementMaker:
-    """Makes batches of measured attitudes of one spacecraft from the values of packets."""
+    """Converts packet values of one spacecraft to batches of measured attitudes."""
 
     def __init__(self, spacecraft: str, mapped: PacketMap) -> None:
         self._spacecraft = spacecraft
         self._mapped = mapped
 
     def add(self, packet: SpacePacket, values: Mapping[str, Any]) -> Iterator[MeasuredBatch]:
-        """The measured attitudes of a packet; raises `PacketFault`."""
+        """Yield the measured attitudes in a packet; raises `PacketFault`."""
         for columns in self._mapped.measurements:
             if columns.quaternion[0] in values:
                 yield MeasuredBatch(packet, columns, self._body(columns, packet, values))
 
     def json_of(self, batch: MeasuredBatch) -> bytes:
-        """A batch as canonical JSON; raises `PacketFault` naming the parameters of a fault."""
+        """Canonical JSON of a batch; raises `PacketFault` naming the packet parameters at fault."""
         return _json_of(batch.body, lambda fault: self._parameters_of(batch.columns, fault))
 
     def _parameters_of(self, columns: MeasurementColumns, fault: Fault) -> str:

@@ -1,4 +1,4 @@
-"""Values of packets as numbers, and CCSDS day segmented and unsegmented times (301.0-B-4)."""
+"""Conversion of packet values to numbers, and of CCSDS times (CDS and CUC, 301.0-B-4) to UTC."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -17,24 +17,24 @@ MS_NS, US_NS = 1_000_000, 1_000
 DAY_NS = DAY_S * NS
 GPS_LESS_TAI_S = -19
 _TAI_ZERO = datetime(2000, 1, 1, 12)
-"""The zero of `Utc.tai_ns`, on the clock of TAI."""
+"""Date and time of TAI at which `Utc.tai_ns` is zero."""
 
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """A time as text in UTC, and in nanoseconds as `Utc.tai_ns` counts them."""
+    """A time as UTC text, and in nanoseconds as `Utc.tai_ns`."""
 
     text: str
     tai_ns: int
 
 
 def moment_of(time: PacketTime, values: Mapping[str, Any]) -> Moment:
-    """The time in a packet's values; raises `PacketFault` naming the parameter."""
+    """Read the time of a packet from its values; raises `PacketFault` naming the parameter."""
     return _of_days(time, values) if isinstance(time, CdsTime) else _of_seconds(time, values)
 
 
 def names_of(time: PacketTime) -> tuple[str, ...]:
-    """The parameters that a time is read from."""
+    """Names of the packet parameters that a time is read from."""
     if isinstance(time, CdsTime):
         return tuple(filter(None, (time.day, time.millisecond, time.microsecond)))
     return tuple(filter(None, (time.coarse, time.fine)))
@@ -42,7 +42,7 @@ def names_of(time: PacketTime) -> tuple[str, ...]:
 
 @dataclass(frozen=True, slots=True)
 class _Day:
-    """A day of UTC: its date, the moment of its beginning, and its length."""
+    """A UTC day: its date, its start in TAI nanoseconds, and its length."""
 
     text: str
     tai_ns: int
@@ -51,7 +51,7 @@ class _Day:
 
 @lru_cache(maxsize=64)
 def _day(ordinal: int) -> _Day:
-    """A day by its ordinal; raises `BadInput` and `ValueError` for one that UTC does not have."""
+    """UTC day of an ordinal date; raises `BadInput` or `ValueError` beyond supported years."""
     text = date.fromordinal(ordinal).isoformat()
     start_ns = parse_utc(f"{text}T00:00:00Z").tai_ns
     # The day after the last supported one is of no supported year.
@@ -115,7 +115,7 @@ def _seconds_of_day(moment: datetime) -> int:
 
 
 def _text(day: _Day, passed_ns: int) -> str:
-    """UTC as `Utc.text` writes it; what is beyond 24 hours is in the leap second."""
+    """Format UTC as `Utc.text` does; times beyond 24 hours are within the leap second."""
     seconds, nanoseconds = divmod(passed_ns, NS)
     if seconds >= DAY_S:
         hour, minute, second = 23, 59, seconds - DAY_S + 60
@@ -127,11 +127,11 @@ def _text(day: _Day, passed_ns: int) -> str:
 
 
 EXACT = 1 << 53
-"""Whole numbers up to this are exact as a float."""
+"""Limit up to which whole numbers are exact as a float."""
 
 
 def number(values: Mapping[str, Any], name: str) -> float:
-    """A value as a float, NaN and infinity included; raises `PacketFault` where it is no number."""
+    """Packet value as a float, NaN and infinity allowed; raises `PacketFault` if not a number."""
     value = _present(values, name)
     if not isinstance(value, int | float):
         raise PacketFault(name, "must be a number", value)
@@ -142,9 +142,9 @@ def number(values: Mapping[str, Any], name: str) -> float:
 
 
 def flag(values: Mapping[str, Any], name: str, labels: Sequence[str] | None = None) -> bool:
-    """True where a flag is not zero; of an enumerated one, its number.
+    """True if a flag is not zero; an enumerated flag is judged by its number.
 
-    With `labels`, where its label or text is among them.
+    With `labels`, true if its label or text is among them.
     """
     if labels is not None:
         return text(values, name) in labels
@@ -154,7 +154,7 @@ def flag(values: Mapping[str, Any], name: str, labels: Sequence[str] | None = No
 
 
 def finite(values: Mapping[str, Any], name: str) -> float:
-    """A value that is a number; raises `PacketFault` for NaN and infinity too."""
+    """Packet value as a finite number; raises `PacketFault` otherwise."""
     value = number(values, name)
     if not math.isfinite(value):
         raise PacketFault(name, "must be finite", value)
@@ -162,12 +162,12 @@ def finite(values: Mapping[str, Any], name: str) -> float:
 
 
 def finite_all(values: Mapping[str, Any], names: Sequence[str], scale: float = 1.0) -> list[float]:
-    """Several values, each times `scale`."""
+    """Several packet values as finite numbers, each times `scale`."""
     return [finite(values, name) * scale for name in names]
 
 
 def whole(values: Mapping[str, Any], name: str) -> int:
-    """A value that is a whole number; a float without a fraction is one."""
+    """Packet value as an integer; a float without a fraction is accepted."""
     value = _present(values, name)
     if isinstance(value, int):
         return int(value)
@@ -177,7 +177,7 @@ def whole(values: Mapping[str, Any], name: str) -> int:
 
 
 def text(values: Mapping[str, Any], name: str) -> str:
-    """A value as text: a string without its padding, or a whole number in digits."""
+    """Packet value as text: a string without padding, or a whole number in digits."""
     value = _present(values, name)
     if isinstance(value, bytes):
         try:

@@ -1,10 +1,10 @@
-"""The packets that an XTCE file describes: from the bytes of one to its parameters by name.
+"""Packet definitions in XTCE: parse the bytes of a packet to parameters by name.
 
-The XML is checked, and written anew in the form that space-packet-parser reads.
-The file comes from outside.  No document type is accepted, so that no entity is expanded, and
-nothing that the file names is opened: no schema, no include.  Arrays and aggregates become
-single parameters, NAME[0] and NAME.MEMBER, as XTCE references write them.  What the package
-would pass over without a word, such as an entry at a place of its own, is refused by line.
+The XML is checked, and rewritten in the form that space-packet-parser reads.  Files are untrusted.
+No document type is accepted, so that no entity is expanded, and no file named in it is opened: no
+schema, no include.  Arrays and aggregates become single parameters, NAME[0] and NAME.MEMBER, as
+XTCE references write them.  Elements that the package would silently ignore, such as an entry with
+its own location, are refused by line.
 """
 
 import io
@@ -26,7 +26,7 @@ MAX_EXPONENT = 64
 MAX_BITS = 8 * (65536 + 6)
 MAX_LABELLED = 65_536
 MAX_DEPTH = 16
-"""Arrays of aggregates of arrays, so deep."""
+"""Greatest nesting of arrays and aggregates."""
 
 _XTCE_WORD = "xtce"
 _MOVED = ("LocationInContainerInBits", "RepeatEntry", "IncludeCondition")
@@ -35,7 +35,7 @@ _EMPTY_NAMES = ("name", "parameterRef", "containerRef", "parameterTypeRef")
 
 
 class XtceFault(Exception):
-    """A fault in the file, with its line."""
+    """A fault in an XTCE file, with its line."""
 
     def __init__(self, element: Any, message: str, value: object = None) -> None:
         super().__init__(message)
@@ -45,9 +45,9 @@ class XtceFault(Exception):
 
 
 def normalised_xtce(text: bytes, file: str) -> bytes:
-    """The XML of a file in one namespace, without arrays.
+    """Rewrite the XML of an XTCE file in one namespace and without arrays.
 
-    Raises `BadFile` naming the file, the line and what is wrong.
+    Raises `BadFile` naming the file, the line and the fault.
     """
     try:
         return _normalised(text)
@@ -87,7 +87,7 @@ def _normalised(text: bytes) -> bytes:
 
 
 def _into_one_namespace(root: Any, etree: Any) -> None:
-    """Give every element the namespace of XTCE 1.2, whichever the file has or lacks."""
+    """Move every element to the namespace of XTCE 1.2, from any other XTCE namespace or none."""
     name = etree.QName(root)
     if name.localname != "SpaceSystem":
         raise XtceFault(root, "must have the root SpaceSystem", name.localname)
@@ -113,7 +113,7 @@ def _named(name: str) -> str:
 
 
 class _Expansion:
-    """Replaces arrays and aggregates by their members, and refuses what would be misread."""
+    """Replaces arrays and aggregates by single parameters, and refuses ambiguous XTCE elements."""
 
     def __init__(self, root: Any, etree: Any) -> None:
         self._root, self._etree = root, etree
@@ -157,7 +157,7 @@ class _Expansion:
         return str(value)
 
     def _require_bounded(self, kind: Any) -> None:
-        """Refuse sizes and powers that would take unbounded time or memory for each packet."""
+        """Refuse sizes and exponents that would cost unbounded time or memory for each packet."""
         for each in kind.iter(_named("Term")):
             if not 0 <= _whole(each, "exponent") <= MAX_EXPONENT:
                 message = f"an exponent must be from 0 to {MAX_EXPONENT}"
@@ -168,7 +168,7 @@ class _Expansion:
                 raise XtceFault(each, message, each.get("sizeInBits"))
 
     def _require_clear(self, kind: Any) -> None:
-        """Settle what the package would warn of or pass over: spellings, orders, odd booleans."""
+        """Normalise spellings, byte orders and booleans that the library would ignore."""
         for each in kind.iter(_named("FloatDataEncoding")):
             spelling = each.get("encoding")
             if spelling in _SPELLINGS:
@@ -192,7 +192,7 @@ class _Expansion:
                     raise XtceFault(kind, f"a boolean with a {word} is not supported")
 
     def _list_range(self, entry: Any) -> None:
-        """Write a label of numbers up to `maxValue` as one entry for each."""
+        """Expand an enumeration label with `maxValue` to one entry for each number."""
         last = entry.get("maxValue")
         if last is None:
             return
@@ -242,7 +242,7 @@ class _Expansion:
             entries.remove(entry)
 
     def _require_in_order(self, entry: Any) -> None:
-        """An entry must follow the one before it, once and in every packet."""
+        """Refuse an entry with its own location, a repetition or a condition."""
         for word in _MOVED:
             found = entry.find(_named(word))
             if found is None:
@@ -266,7 +266,7 @@ class _Expansion:
     def _members(
         self, name: str, type_name: str, entry: Any, sizes: Any, depth: int
     ) -> Iterator[tuple[str, str]]:
-        """The single parameters of a compound one, with their types, in order."""
+        """Single parameters of a compound parameter, with their types, in order."""
         kind = self._types.get(type_name)
         if kind is None:
             raise XtceFault(entry, f"{name} has a type that is not in the file", type_name)
@@ -335,18 +335,18 @@ def _integer(element: Any, text: str | None) -> int:
 
 
 MAX_ENTRIES = 20_000
-"""The most entries of one packet, with those of the containers in it."""
+"""Greatest number of entries in one packet, nested containers included."""
 
 _LOADING = threading.Lock()
-"""While it loads a file, space-packet-parser keeps the file's namespaces in a class."""
+"""Lock on loading XTCE files, since space-packet-parser keeps their namespaces in a class."""
 
 
 class UnknownPacket(Exception):
-    """No container of the XTCE file describes the packet."""
+    """Raised if no container of the XTCE file describes a packet."""
 
 
 class PacketFault(Exception):
-    """A packet that does not have the form that the XTCE file gives it."""
+    """Raised if a packet does not match its description in the XTCE file."""
 
     def __init__(self, parameter: str, message: str, value: object = None) -> None:
         super().__init__(message)
@@ -357,9 +357,9 @@ class PacketFault(Exception):
 
 @dataclass(frozen=True)
 class ParameterKind:
-    """The values that a parameter has; of an enumerated one the labels with their numbers.
+    """Kind of value of a parameter; for enumerations the labels with their numbers.
 
-    The number is None where the labels stand for texts.
+    The number is None if the labels stand for texts.
     """
 
     kind: Literal["number", "boolean", "enumerated", "text", "binary"]
@@ -367,10 +367,10 @@ class ParameterKind:
 
 
 class PacketDefinition:
-    """Reads packets as an XTCE file describes them; `name` is that of the file in messages."""
+    """Parses packets as described by an XTCE file; `name` identifies the file in messages."""
 
     def __init__(self, text: bytes, name: str, root_container: str) -> None:
-        """Raises `BadFile` naming the file, and `NotAvailable` without space-packet-parser."""
+        """Load XTCE text; raises `BadFile` naming the file, `NotAvailable` without the package."""
         require_extra("packets", "space_packet_parser", "packets", name)
         self.name = name
         self._containers = _loaded(normalised_xtce(text, name), name)
@@ -391,9 +391,9 @@ class PacketDefinition:
         """The kinds of the parameters that containers hold, by name."""
 
     def read(self, packet: bytes) -> Mapping[str, Any]:
-        """The calibrated values of a packet's parameters by name.
+        """Calibrated values of a packet's parameters by name.
 
-        Raises `UnknownPacket`, and `PacketFault` naming the parameter at which reading failed.
+        Raises `UnknownPacket`, and `PacketFault` naming the parameter at which parsing failed.
         """
         from space_packet_parser import SpacePacket
 
@@ -404,7 +404,7 @@ class PacketDefinition:
                 try:
                     entry.parse(values)
                 except Exception as error:
-                    # Of a file from outside the package may raise anything.
+                    # The library may raise any exception for an untrusted XTCE file.
                     raise _fault(entry, values, error) from None
             fitting = [each for each in self._heirs(container) if _fits(each, values)]
             if len(fitting) > 1:
@@ -427,7 +427,7 @@ class PacketDefinition:
 
 
 def read_definition(path: Path, root_container: str) -> PacketDefinition:
-    """The definition of a file; raises as `PacketDefinition`, and for a file that is missing."""
+    """Read packet definitions from a file; raises as `PacketDefinition`, and for a missing file."""
     try:
         with path.open("rb") as file:
             text = file.read(MAX_BYTES + 1)
@@ -446,14 +446,14 @@ def _loaded(text: bytes, name: str) -> dict[str, Any]:
     except RecursionError:
         raise BadFile(Fault(name, "a container refers to itself")) from None
     except Exception as error:
-        # The package raises whatever an unexpected element leads to.
+        # The library may raise any exception for an unexpected element.
         why = f"is not read: {type(error).__name__}: {str(error)[:300]}"
         raise BadFile(Fault(name, why)) from None
     return dict(found.containers)
 
 
 def _require_bounded(containers: dict[str, Any], file: str) -> None:
-    """Refuse containers that hold each other so often that one packet takes minutes."""
+    """Refuse containers nested so often that parsing a packet would take minutes."""
     sizes: dict[str, int] = {}
     for container in containers.values():
         if _entries(container, sizes) > MAX_ENTRIES:
@@ -496,7 +496,7 @@ def _fits(container: Any, values: Any) -> bool:
 
 
 def _fault(entry: Any, values: Any, error: Exception) -> PacketFault:
-    """The fault of the first parameter of an entry that was not read."""
+    """Fault naming the first unread parameter of an entry, with its position in the packet."""
     while hasattr(entry, "entry_list"):
         missing = [each for each in entry.entry_list if not _is_read(each, values)]
         if not missing:

@@ -1,4 +1,4 @@
-"""Space packets among the input formats."""
+"""Registration of space packets as an input format."""
 
 from service.observations.input_formats import InputFormat
 

@@ -1,4 +1,4 @@
-"""Packets to gyro blocks: the samples of packets, gathered in blocks of a fixed time."""
+"""Conversion of packets to gyro blocks, each with the samples of a fixed period."""
 
 import math
 from collections import deque
@@ -20,10 +20,10 @@ from service.missions.motion import largest_rate_deg_per_s
 from service.times import parse_utc, shifted
 
 MOST_SAMPLES = 10_000
-"""The most samples of a block, as in a request."""
+"""Greatest number of samples in a gyro block, as in a request."""
 
 LATEST = 16
-"""Packets among which one that comes again is recognised."""
+"""Number of latest packets among which a repeated one is recognised."""
 
 Values = Mapping[str, Any]
 Axes = tuple[float, float, float]
@@ -31,7 +31,7 @@ Axes = tuple[float, float, float]
 
 @dataclass
 class PacketBlock:
-    """A gyro block in the making, with the packet that it began with."""
+    """An unfinished gyro block, with its first packet."""
 
     packet: SpacePacket
     start_ns: int
@@ -47,10 +47,10 @@ class _Sample:
 
 
 class GyroBlockMaker:
-    """Makes gyro blocks of one spacecraft from the values of packets, in order.
+    """Converts packet values of one spacecraft, in order, to gyro blocks.
 
-    A block ends where the next one of `block_s` begins, and where time goes back.  Its name is
-    made of the APID and the time of its first sample.
+    A block ends at multiples of `block_s`, and if time goes back.  Its name consists of the APID
+    and the time of its first sample.
     """
 
     def __init__(self, mission: Mission, mapped: PacketMap) -> None:
@@ -66,9 +66,9 @@ class GyroBlockMaker:
         self._pending: PacketBlock | None = None
 
     def add(self, packet: SpacePacket, values: Values) -> Iterator[PacketBlock]:
-        """Take a packet; gives the blocks that are complete with it.
+        """Add a packet; yields the blocks that the packet completes.
 
-        Raises `PacketFault` for a packet of which no sample is taken.
+        Raises `PacketFault` for a packet without a usable sample.
         """
         if self._mapped.gyro_values[0][0] not in values:
             return
@@ -90,13 +90,13 @@ class GyroBlockMaker:
                 yield done
 
     def end(self) -> Iterator[PacketBlock]:
-        """The block that waits for further samples."""
+        """Yield the unfinished block, which waited for further samples."""
         pending, self._pending = self._pending, None
         if pending is not None:
             yield pending
 
     def json_of(self, block: PacketBlock, apid: int) -> bytes:
-        """A block as a line of a telemetry file."""
+        """A gyro block as a JSON line of a telemetry file."""
         return msgspec.json.encode(
             {
                 "spacecraft": self._spacecraft,
@@ -130,7 +130,7 @@ class GyroBlockMaker:
         return _Sample(tai_ns, tuple(finite(values, name) for name in names))
 
     def _rates(self, found: list[_Sample]) -> list[tuple[_Sample, Axes]]:
-        """The samples with their rates; of an angle without one before there is none."""
+        """Samples with their rates; an angle without a previous sample gives no rate."""
         rates = []
         before = self._before
         for sample in found:
@@ -148,7 +148,7 @@ class GyroBlockMaker:
         return rates
 
     def _changes(self, before: _Sample | None, sample: _Sample) -> tuple[float, ...] | None:
-        """Counts per second since the sample before."""
+        """Counts per second since the sample before; None without one in time."""
         if before is None:
             return None
         passed_s = (sample.tai_ns - before.tai_ns) / NS
@@ -162,7 +162,7 @@ class GyroBlockMaker:
     def _require_believed(self, rates: Axes) -> None:
         """Raise `PacketFault` for a rate beyond the mission's largest.
 
-        Here and not with the block, of which the other samples are kept.
+        Checked per sample rather than per block, so that the other samples are kept.
         """
         for axis, rate in enumerate(rates):
             if abs(rate) > self._largest:
@@ -176,7 +176,7 @@ class GyroBlockMaker:
     def _taken(
         self, packet: SpacePacket, moment: Moment, sample: _Sample, rate: Axes
     ) -> PacketBlock | None:
-        """Put a sample into its block; the block before, where it begins another one."""
+        """Add a sample to the unfinished block; returns the block that the sample ends, or None."""
         pending, done = self._pending, None
         if pending is not None and (
             sample.tai_ns // self._block_ns != pending.start_ns // self._block_ns

@@ -1,4 +1,4 @@
-"""A mission's table `[packets]` against an XTCE file: the parameters of every field of a batch."""
+"""Mapping of a mission's table `[packets]` to XTCE parameters for every field of a batch."""
 
 import difflib
 import math
@@ -23,14 +23,14 @@ DEG_OF_UNIT = {"deg": 1.0, "arcmin": 1.0 / 60.0, "arcsec": 1.0 / 3600.0, "rad": 
 
 @dataclass(frozen=True)
 class TrackerColumns:
-    """The parameters of one tracker's stars, a name for each slot; None: there are none."""
+    """Packet parameters of one tracker's stars, one name per slot; None: not sent."""
 
     tracker: str
     slots: int
     directions: tuple[tuple[str, ...], ...]
-    """Two columns, h and v, or three, the components of vectors."""
+    """Parameter names of two columns (h and v), or three (components of a vector)."""
     scale: float
-    """Degrees of one unit of h and v."""
+    """Factor from the unit of h and v to degrees."""
     magnitude: tuple[str, ...] | None
     time_offset_s: tuple[str, ...] | None
     sigma_arcsec: tuple[str, ...] | None
@@ -40,25 +40,25 @@ class TrackerColumns:
 
     @property
     def first(self) -> str:
-        """The parameter that tells whether a packet holds this tracker."""
+        """Parameter whose presence shows that a packet has this tracker's stars."""
         return self.directions[0][0]
 
 
 @dataclass(frozen=True)
 class MeasurementColumns:
-    """The parameters of an attitude that a tracker measured itself."""
+    """Packet parameters of an attitude measured by a tracker."""
 
     table: PacketMeasurement
     quaternion: tuple[str, ...]
     sigma: tuple[str, ...]
     covariance: tuple[str, ...]
     arcsec: float
-    """Arcseconds in one unit of `sigma`."""
+    """Factor from the unit of `sigma` to arcseconds."""
 
 
 @dataclass(frozen=True)
 class PacketMap:
-    """The parameters of a batch: a table with every array and pattern written out."""
+    """Packet parameters for all batch fields, with arrays and patterns expanded."""
 
     table: Packets
     trackers: tuple[TrackerColumns, ...]
@@ -67,14 +67,14 @@ class PacketMap:
     rates: tuple[str, ...]
     gyro: tuple[str, ...]
     gyro_values: tuple[tuple[str, ...], ...]
-    """By axis, a name for each sample of a gyro block."""
+    """Parameter names of a gyro block's samples, for each axis."""
     gyro_offsets: tuple[str, ...]
     velocity: tuple[str, ...]
     position: tuple[str, ...]
 
 
 def packet_map(table: Packets, definition: PacketDefinition) -> PacketMap:
-    """The map of a mission's table; raises `BadInput` naming each parameter that is missing.
+    """Map a mission's table to parameters; raises `BadInput` naming each missing parameter.
 
     The message names the key of the table and the XTCE file.
     """
@@ -126,11 +126,11 @@ _YES = frozenset(
         *("nominal", "locked", "tracking", "tracked"),
     )
 )
-"""Words of labels that tell by themselves whether something is there."""
+"""Words in enumeration labels that mean present or valid."""
 
 
 def _misfit(key: str, kind: ParameterKind, labels: tuple[str, ...] | None) -> str | None:
-    """Why parameters of a kind cannot stand at a key of the table; None where they can."""
+    """Reason why a kind of parameter does not fit a key of the table; None if it fits."""
     if key == "batch":
         return "is a boolean; a number or a text is needed" if kind.kind == "boolean" else None
     if not key.endswith(".valid"):
@@ -151,7 +151,7 @@ def _said(kind: ParameterKind) -> str:
 
 
 def _unclear_labels(labels: Mapping[str, float | None]) -> str | None:
-    """Why the numbers of labels do not tell which of them mean that something is there."""
+    """Reason why the numbers of labels do not show which of them mean valid; None if they do."""
     words = {label: label.strip().lower().replace(" ", "_").replace("-", "_") for label in labels}
     set_labels = [label for label, raw in labels.items() if raw != 0]
     wrong = [label for label in set_labels if labels[label] is None or words[label] in _NO]
@@ -165,9 +165,9 @@ def _unclear_labels(labels: Mapping[str, float | None]) -> str | None:
 
 
 def packet_mission(missions: Mapping[str, Mission], name: str | None) -> Mission:
-    """The mission whose packets are read: the one named, or the only one with a table.
+    """Mission whose packets are read: the named one, or the only one with a table.
 
-    Raises `BadInput` naming `spacecraft` where there is none, or several.
+    Raises `BadInput` naming `spacecraft` if there is none, or several without a name.
     """
     able = [each for each in missions.values() if each.packets is not None]
     known = ", ".join(each.name for each in able) or "none"
@@ -230,7 +230,7 @@ def _measurement(table: PacketMeasurement) -> MeasurementColumns:
 
 
 def _keys(found: PacketMap) -> Iterable[tuple[str, Iterable[str]]]:
-    """Every key of the table with its parameters."""
+    """All keys of the packet table with their parameter names."""
     table = found.table
     yield "time", names_of(table.time)
     yield "batch", (table.batch,) if table.batch else ()

@@ -1,8 +1,8 @@
-"""Files of space packets as lines of telemetry, a batch or a gyro block each, with counts.
+"""Reader of packet files: yields a line of telemetry per batch or gyro block, with counts.
 
-An upload brings packets and their XTCE file in one tar archive.
-The archive is read by its plain headers (POSIX ustar): nothing is unpacked, and no header
-decides how much is held in memory.  Extended headers are passed over.
+An upload has packets and their XTCE file in one tar archive.  The archive is read by its plain
+headers (POSIX ustar): nothing is unpacked, and no header determines how much memory is used.
+Extended headers are skipped.
 """
 
 import io
@@ -54,17 +54,17 @@ _OF_SEGMENTS = (
 
 READ_BYTES = 1 << 16
 MOST_APIDS = 100
-"""The application ids with the most packets are reported; the sums are of all."""
+"""Greatest number of application ids in a report, those with the most packets."""
 
 
 class PacketTotals(Struct, kw_only=True):
-    """The contents of the packets that were read."""
+    """Counts of packets read, and of batches and gyro blocks made from them."""
 
     packets: int = 0
     bytes: int = 0
     batches: int = 0
     without_stars: int = 0
-    """Packets of a tracker that held neither a star nor an attitude."""
+    """Packets of a tracker without a star or an attitude."""
     gyro_blocks: int = 0
     gyro_samples: int = 0
     unknown: int = 0
@@ -78,10 +78,10 @@ class PacketTotals(Struct, kw_only=True):
     joined: int = 0
     """Packets that were joined of segments."""
     incomplete: int = 0
-    """Segments of packets of which other segments are missing."""
+    """Segments of packets whose other segments are missing."""
     refused: int = 0
     unread_bytes: int = 0
-    """From the packets on at which files could not be read any further."""
+    """Bytes after a damaged packet, from which files could not be read any further."""
     empty_files: int = 0
     """Files without a packet."""
     without_attitude: int = 0
@@ -90,10 +90,10 @@ class PacketTotals(Struct, kw_only=True):
 
 
 class PacketReader:
-    """Reads packets of one spacecraft; what later packets need is kept between files."""
+    """Reads packets of one spacecraft, and keeps values that later packets need between files."""
 
     def __init__(self, mission: Mission, definition: PacketDefinition) -> None:
-        """Raises `BadInput` naming each parameter of the mission's table that XTCE lacks."""
+        """Prepare the mapping; raises `BadInput` naming each parameter missing in XTCE."""
         if mission.packets is None:
             raise BadInput(Fault("packets", f"the mission file of {mission.name} has no [packets]"))
         self._table = mission.packets
@@ -108,7 +108,7 @@ class PacketReader:
         self._totals = PacketTotals()
 
     def totals(self) -> PacketTotals:
-        """The counts so far, with those of each APID in order."""
+        """Counts of packets so far, also by APID in order."""
         totals, apids = self._totals, sorted(self._sequence.apids.items())
         totals.apids = [counts for _, counts in apids]
         totals.gaps = sum(each.gaps for each in totals.apids)
@@ -118,10 +118,10 @@ class PacketReader:
         return totals
 
     def lines(self, stream: IO[bytes], name: str) -> Iterator[Line]:
-        """The batches and gyro blocks of a file, and a fault for each packet that cannot be read.
+        """Batches and gyro blocks of a file, and a fault for each packet that cannot be read.
 
         A line has the number of its packet in the file.  A fault names the file, the packet, its
-        first byte and the parameter.  After the end of a file that is damaged nothing follows.
+        first byte and the parameter.  Nothing follows the damaged packet of a file.
         """
         before = self._totals.packets
         try:
@@ -159,7 +159,7 @@ class PacketReader:
             raise BadFile(_fault_at(number, offset, fault, "packets")) from None
 
     def _read(self, packet: SpacePacket, name: str) -> Iterator[Line]:
-        """The lines that are complete with a packet."""
+        """Lines of telemetry that a packet or segment completes."""
         totals = self._totals
         totals.packets += 1
         totals.bytes += len(packet.content)
@@ -184,9 +184,9 @@ class PacketReader:
             yield self._refused(whole, fault, name)
 
     def _lines_of_packet(self, packet: SpacePacket, name: str) -> Iterator[Line]:
-        """The lines that are complete with a whole packet.
+        """Lines of telemetry that a whole packet completes.
 
-        Raises `UnknownPacket`, and `PacketFault` for one that cannot be read.
+        Raises `UnknownPacket`, and `PacketFault` for a packet that cannot be read.
         """
         try:
             values = self._definition.read(packet.content)
@@ -200,7 +200,7 @@ class PacketReader:
             yield from self._lines_of_blocks(self._gyro, self._gyro.add(packet, values))
 
     def _whole(self, packet: SpacePacket) -> tuple[SpacePacket | None, list[SpacePacket]]:
-        """The packet, or the one whose last segment it is; and segments that cannot be joined."""
+        """The packet that a segment completes, or None, and segments that cannot be joined."""
         if self._table.sequence_flags == "groups":
             return packet, []
         return self._segments.add(packet)
@@ -262,7 +262,7 @@ class PacketReader:
 
 
 def file_lines(reader: PacketReader, files: Iterable[Path]) -> Iterator[tuple[Path, Line]]:
-    """The lines of files on disk; raises `BadFile` for one that cannot be opened."""
+    """Lines of telemetry from packet files on disk; raises `BadFile` if one cannot be opened."""
     for file in files:
         try:
             stream = file.open("rb")
@@ -290,7 +290,7 @@ _FIELD = "body"
 
 @dataclass(frozen=True)
 class Member:
-    """A file of an archive."""
+    """A file in a tar archive: name, offset and size."""
 
     name: str
     offset: int
@@ -298,7 +298,7 @@ class Member:
 
 
 def members_of(file: IO[bytes]) -> list[Member]:
-    """The files of an archive, in order; raises `BadFile` naming the byte of a bad header."""
+    """Files of a tar archive, in order; raises `BadFile` naming the byte of a bad header."""
     end = file.seek(0, io.SEEK_END)
     offset = 0
     found: list[Member] = []
@@ -324,7 +324,7 @@ def members_of(file: IO[bytes]) -> list[Member]:
 
 
 def _checked(header: bytes, offset: int) -> tuple[int, bytes]:
-    """Size and kind of a member; raises `BadFile` for what is no header of an archive."""
+    """Size and kind of a tar member from its header; raises `BadFile` for an invalid one."""
     try:
         if len(header) < BLOCK_BYTES or header[257:262] != b"ustar":
             raise ValueError
@@ -346,12 +346,12 @@ def _octal(digits: bytes) -> int:
 
 
 class PacketLines:
-    """The batches of an uploaded archive as lines; iterated once, and closed at the end."""
+    """Lines of telemetry from an uploaded packet archive; iterated once, and closed at the end."""
 
     def __init__(
         self, file: IO[bytes], missions: Mapping[str, Mission], spacecraft: str | None
     ) -> None:
-        """Raises `BadInput` for an archive, an XTCE file or a mapping that cannot be read.
+        """Open an archive; raises `BadInput` for an archive, XTCE file or mapping with faults.
 
         Without `spacecraft` the only mission with a table `[packets]` is taken.
         """
@@ -376,7 +376,7 @@ class PacketLines:
             yield from self._reader.lines(part, member.name)
 
     def counts(self) -> ReplayPackets:
-        """The counts of the packets so far, of APIDs those with the most packets."""
+        """Counts of packets so far; only the APIDs with the most packets are listed."""
         totals = self._reader.totals()
         most = sorted(totals.apids, key=lambda each: -each.packets)[:MOST_APIDS]
         kept = structs.replace(totals, apids=sorted(most, key=lambda each: each.apid))
@@ -388,7 +388,7 @@ class PacketLines:
 
 
 class _Part(io.RawIOBase):
-    """A member of an archive as a stream."""
+    """A file in a tar archive as a stream."""
 
     def __init__(self, file: IO[bytes], member: Member) -> None:
         self._file, self._next = file, member.offset
@@ -406,7 +406,7 @@ class _Part(io.RawIOBase):
 
 
 def archive_of(files: Sequence[Path]) -> Iterator[bytes]:
-    """An archive of files on disk, in pieces; raises `BadFile` for one that cannot be read."""
+    """Tar archive of files on disk, in pieces; raises `BadFile` if one cannot be read."""
     for file in files:
         try:
             with file.open("rb") as stream:

@@ -1,4 +1,4 @@
-"""Space packets in a file, one after another, and the sequence counts of each APID.
+"""Reader of consecutive space packets in a file, and counter of their sequence gaps.
 
 Source of the primary header: CCSDS 133.0-B-2, section 4.1.3.
 """
@@ -14,9 +14,9 @@ from service.features.packets.definition import PacketFault
 HEADER_BYTES = 6
 IDLE_APID = 2047
 CONTINUATION, FIRST, LAST, WHOLE = range(4)
-"""The sequence flags."""
+"""Sequence flags of a packet header: segment or whole packet."""
 MOST_BYTES = 1 << 20
-"""The most bytes of a packet that is joined of segments."""
+"""Greatest size in bytes of a packet joined from segments."""
 SYNC_MARKERS = {
     bytes.fromhex(marker): f"{kind} {marker.upper()}"
     for marker, kind in (
@@ -28,7 +28,7 @@ SYNC_MARKERS = {
         ("eb90", "the start sequence"),
     )
 }
-"""Source: CCSDS 131.0-B, section 9, and 231.0-B; transfer frames begin with them."""
+"""Sync markers at the start of transfer frames (CCSDS 131.0-B, section 9, and 231.0-B)."""
 CONTAINERS = {
     b"CCSD": "an SFDU label (CCSDS 620.0-B)",
     b"NJPL": "an SFDU label of JPL",
@@ -41,13 +41,13 @@ CONTAINERS = {
     b"\x28\xb5\x2f\xfd": "the header of zstd",
     b"PK\x03\x04": "the header of a zip archive",
 }
-"""The first bytes of files that hold packets within something else."""
+"""First bytes of container files that hold packets in another format."""
 SEQUENCE_COUNTS = 1 << 14
 
 
 @dataclass(frozen=True, slots=True)
 class SpacePacket:
-    """One packet with its header; `number` counts the packets of a file from 1."""
+    """A space packet with its header; `number` counts the packets of a file from 1."""
 
     number: int
     offset: int
@@ -56,17 +56,17 @@ class SpacePacket:
 
     @property
     def apid(self) -> int:
-        """The application process identifier."""
+        """Application process identifier (APID) of the packet."""
         return ((self.content[0] & 0x07) << 8) | self.content[1]
 
     @property
     def sequence_flags(self) -> int:
-        """Tells a segment of a packet from a whole one."""
+        """Sequence flags of the packet: segment or whole packet."""
         return self.content[2] >> 6
 
     @property
     def sequence_count(self) -> int:
-        """The 14 bits that count the packets of an APID."""
+        """14-bit sequence count of the packet within its APID."""
         return ((self.content[2] & 0x3F) << 8) | self.content[3]
 
     segments: int = 1
@@ -74,7 +74,7 @@ class SpacePacket:
 
 
 class EndOfPackets(PacketFault):
-    """Nothing more of a file can be read; `number` and `offset` are those of the packet."""
+    """Raised if the rest of a packet file is unreadable; `number` and `offset` locate it."""
 
     def __init__(
         self, number: int, offset: int, read: int, message: str, value: object = None
@@ -87,11 +87,11 @@ class EndOfPackets(PacketFault):
 
 
 def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket]:
-    """The packets of a stream, each preceded by `prefix_bytes` bytes that are skipped.
+    """Read the packets of a stream, skipping `prefix_bytes` bytes before each.
 
-    Holds one packet at a time, at most 64 KiB.  Raises `EndOfPackets` where the stream ends
-    within a packet, and where a header is none of a space packet: after a wrong length the
-    next packet is not found.
+    Holds one packet at a time, at most 64 KiB.  Raises `EndOfPackets` if the stream ends within a
+    packet, or if a header is not that of a space packet: after a wrong length the next packet is
+    not found.
     """
     offset, number = 0, 0
     while True:
@@ -137,36 +137,36 @@ def packets_in(stream: IO[bytes], prefix_bytes: int = 0) -> Iterator[SpacePacket
 
 
 class ApidCounts(Struct, kw_only=True):
-    """The packets of one APID."""
+    """Counts of the packets of one APID."""
 
     apid: int
     packets: int = 0
     described: bool = True
     """True if the XTCE file describes packets of this APID."""
     gaps: int = 0
-    """Places where the sequence count skips packets."""
+    """Number of places where the sequence count skips packets."""
     missing: int = 0
-    """Packets that are missing in these places."""
+    """Number of packets missing at these gaps of the sequence count."""
     backward: int = 0
-    """Places where the count repeats or goes back: a reset, or packets out of order."""
+    """Number of places where the count repeats or goes back: a reset, or packets out of order."""
     incomplete: int = 0
-    """Segments of packets of which other segments are missing."""
+    """Segments of packets whose other segments are missing."""
     refused: int = 0
 
 
 class SegmentJoiner:
-    """Joins the segments of packets, as CCSDS 133.0-B-2 has it in section 4.1.3.4.2.2.
+    """Joins segmented packets (CCSDS 133.0-B-2, section 4.1.3.4.2.2).
 
-    The packets of an APID follow each other; those of others may lie between.
+    The segments of an APID follow each other; packets of others may lie between.
     """
 
     def __init__(self, header_bytes: int) -> None:
-        """`header_bytes`: of the secondary header that segments after the first one repeat."""
+        """Keep `header_bytes`, the size of the secondary header that later segments repeat."""
         self._header_bytes = header_bytes
         self._open: dict[int, list[SpacePacket]] = {}
 
     def add(self, packet: SpacePacket) -> tuple[SpacePacket | None, list[SpacePacket]]:
-        """The packet that is complete now, if any, and the segments that cannot be joined."""
+        """Add a packet or segment; returns the completed packet or None, and unusable segments."""
         flags, apid = packet.sequence_flags, packet.apid
         before = self._open.pop(apid, [])
         if flags == WHOLE:
@@ -187,7 +187,7 @@ class SegmentJoiner:
         return self._joined([*before, packet]), []
 
     def end(self) -> list[SpacePacket]:
-        """The segments whose packet has no end."""
+        """Remaining segments of packets without an end."""
         left = [packet for segments in self._open.values() for packet in segments]
         self._open.clear()
         return left
@@ -207,7 +207,7 @@ class SegmentJoiner:
 
 
 class SequenceCounter:
-    """Counts the packets of each APID, and finds the gaps in their sequence counts."""
+    """Counts packets by APID, and detects gaps in their sequence counts."""
 
     def __init__(self) -> None:
         self.apids: dict[int, ApidCounts] = {}

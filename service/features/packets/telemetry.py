@@ -1,4 +1,4 @@
-"""Space packets as telemetry: in uploads as an archive with their XTCE file, and for replays."""
+"""Space packets as telemetry: uploaded archives with their XTCE file, and replays."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,14 +19,14 @@ FORMAT = "packets"
 def opened_upload(
     file: IO[bytes], missions: Mapping[str, "Mission"], spacecraft: str | None
 ) -> "PacketLines":
-    """The batches of an uploaded archive; see `PacketLines`."""
+    """Lines of telemetry from an uploaded archive; see `PacketLines`."""
     from service.features.packets.reader import PacketLines
 
     return PacketLines(file, missions, spacecraft)
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Declare the options of `acquire replay`."""
+    """Declare the packet options of `acquire replay`."""
     parser.add_argument(
         "--packets",
         nargs="+",
@@ -47,9 +47,9 @@ def add_options(parser: ArgumentParser) -> None:
 
 
 def files_of(parsed: Namespace) -> "PacketFiles | None":
-    """The files of packets that a replay is to send; None where its options name none.
+    """Packet files that a replay should send; None without packet options.
 
-    Raises `BadInput` for options that do not go together.
+    Raises `BadInput` for options that contradict each other.
     """
     if bool(parsed.packets) != (parsed.xtce is not None):
         raise BadInput(Fault("--xtce", "goes with --packets, and --packets needs it"))
@@ -60,7 +60,7 @@ def files_of(parsed: Namespace) -> "PacketFiles | None":
 
 
 class PacketFiles:
-    """Files of packets and their XTCE file, read in this process or sent as an archive."""
+    """Packet files with their XTCE file, parsed in this process or sent as an archive."""
 
     def __init__(self, parsed: Namespace) -> None:
         self.files: Sequence[Path] = parsed.packets
@@ -69,7 +69,7 @@ class PacketFiles:
         self._reader: PacketReader | None = None
 
     def items(self, run: str) -> Iterator["Item"]:
-        """Every batch and gyro block in the packets, read with the missions of the settings."""
+        """All batches and gyro blocks in the packets, parsed with the missions of the settings."""
         from service.features.packets.reader import file_lines
         from service.replay.items import item_of
 
@@ -90,7 +90,7 @@ class PacketFiles:
         return PacketReader(mission, definition)
 
     def counts(self) -> dict[str, Any] | None:
-        """The counts of the packets that were read in this process; None where none were."""
+        """Counts of the packets parsed in this process; None if none were."""
         from msgspec import to_builtins
 
         return None if self._reader is None else to_builtins(self._reader.totals())
@@ -101,7 +101,7 @@ class PacketFiles:
         return archive_of([self._parsed.xtce, *self.files])
 
     def item(self, number: int) -> "Item":
-        """A packet by its number; of several files the problem names the one."""
+        """A packet by its number; with several files the problem's message names the file."""
         from service.replay.items import Item
 
         return Item(self.files[0], number, None)

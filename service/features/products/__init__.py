@@ -1,4 +1,4 @@
-"""Products: attitudes and tables in the formats that other programs read."""
+"""Export of attitudes and tables in file formats for other programs."""
 
 from service.feature import Feature
 

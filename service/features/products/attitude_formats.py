@@ -1,4 +1,4 @@
-"""The output formats of attitudes: those of tables, and those of flight dynamics."""
+"""Output formats of attitudes: tables, and formats of flight dynamics."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -20,17 +20,17 @@ if TYPE_CHECKING:
 
 
 def attitude_formats() -> dict[str, OutputFormat]:
-    """The formats of attitudes, by name: JSON first, which the API answers by default."""
+    """Output formats of attitudes by name; JSON, the default of the API, is first."""
     return {JSON_FORMAT: JSON, **TABLE_FORMATS, **ATTITUDE_FORMATS}
 
 
 def file_suffix(name: str) -> str:
-    """The suffix of a file of a format, without the dot."""
+    """File suffix of a format, without the dot."""
     return attitude_formats()[name].suffix or name
 
 
 def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
-    """Attitudes in a format, in pieces; raises `NotAvailable` where a package is missing."""
+    """Write attitudes in a format, in pieces; raises `NotAvailable` if a package is missing."""
     written = attitude_formats()[name]
     written.require(name)
     if series.about.newest_first and not written.any_order:
@@ -47,7 +47,7 @@ def write_attitudes(name: str, series: "AttitudeSeries") -> Iterator[bytes]:
 
 
 def _message(title: str, media_type: str, writer: str, **more: Any) -> OutputFormat:
-    """A format that is oldest first, and has one attitude at least."""
+    """Output format that requires oldest-first order and at least one attitude."""
     arguments = {"most_batches": MOST_BATCHES, "any_order": False, "may_be_empty": False, **more}
     return OutputFormat(title, media_type, _writer(writer), **arguments)
 
@@ -76,4 +76,4 @@ ATTITUDE_FORMATS: dict[str, OutputFormat] = {
         package="spiceypy",
     ),
 }
-"""The formats that hold attitudes alone, by name."""
+"""Formats for attitudes only, not for other tables, by name."""

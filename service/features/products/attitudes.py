@@ -1,8 +1,8 @@
-"""Attitudes in order of time: unbroken stretches, continuous signs, rates.
+"""Series of attitudes in order of time: unbroken intervals, continuous signs, rates.
 
-Quaternions are scalar-last and transform J2000 (EME2000) into body components.  Covariances
-are of the small error rotation about the body axes, arcsec^2.  Rates are of the body relative
-to inertial, in body axes, deg/s.
+Quaternions are scalar-last and transform J2000 (EME2000) into body components.  Covariances are of
+the small error rotation about the body axes, arcsec^2.  Rates are of the body relative to inertial,
+in body axes, deg/s.
 
 Also attitudes as a table, and as JSON whose items are written as they are read.
 """
@@ -32,7 +32,7 @@ OWN, DERIVED, NONE, ESTIMATED = "own", "derived", "none", "estimated"
 
 @dataclass(frozen=True)
 class SeriesTracker:
-    """A tracker that saw the stars: its alignment, body = this @ tracker, and its noise."""
+    """A tracker of the spacecraft: its rotation from tracker to body axes, and its noise."""
 
     name: str
     body_from_tracker: tuple[tuple[float, ...], ...]
@@ -41,14 +41,11 @@ class SeriesTracker:
 
 @dataclass(frozen=True)
 class SeriesInfo:
-    """The subject of a series of attitudes: the spacecraft, the filters, and its identifiers.
+    """Metadata of a series of attitudes: spacecraft, run, period, filters and identifiers.
 
-
-    Attitudes of the grade `raw` are those of batches; `service.attitude.definitive` has the others.
-    Attitudes of the grade `raw` are those of batches; `service.attitude.definitive` has the others.
-    `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
-    `start` and `end` are UTC as text, None where the period is open.  `sclk_kernel` is the
-    spacecraft's clock; without it kernels have a clock of our own.
+    The grade `raw` has the attitudes of batches; `service.attitude.definitive` has the others.
+    `start` and `end` are UTC as text, None if the period is open.  `sclk_kernel` is the
+    spacecraft's clock; without it, C-kernels get a clock defined by this service.
     """
 
     spacecraft: str
@@ -66,10 +63,10 @@ class SeriesInfo:
     sclk_kernel: Path | None = None
     trackers: tuple[SeriesTracker, ...] = ()
     record_head: str = ""
-    """Number, SHA-256 and time of the record's last head; empty: it has none yet."""
+    """Number, SHA-256 and time of the record's last head; empty if there is none."""
 
     def __post_init__(self) -> None:
-        """Raise `BadBatch` with the name and value of what is out of its range."""
+        """Raise `BadBatch` with the name and value of each field out of range."""
         faults = [
             Fault(name, expected, shown_value(getattr(self, name)))
             for name, is_good, expected in (
@@ -96,7 +93,7 @@ class SeriesInfo:
             raise BadBatch(faults)
 
     def described(self) -> str:
-        """The subject of the series, for a message."""
+        """Description of the series, for a message."""
         words = "attitudes" if self.status == "all" else f"{self.status} attitudes"
         if self.grade != "raw":
             words = words.replace("attitudes", f"{self.grade} attitudes")
@@ -108,7 +105,7 @@ class SeriesInfo:
         return f"{words} of {self.spacecraft} in run {self.run}{period}"
 
     def provenance(self) -> dict[str, str]:
-        """The origin of the attitudes, as texts by name."""
+        """Metadata of the series as texts by name, written into files."""
         return {
             "spacecraft": self.spacecraft,
             "object_id": self.object_id or self.spacecraft,
@@ -127,12 +124,11 @@ class SeriesInfo:
 
 @dataclass(frozen=True)
 class AttitudeBlock(AttitudeRows):
-    """Attitudes of a series, with the number of their stretch, which counts from 0.
+    """Attitudes of a series with the numbers of their unbroken intervals, counted from 0.
 
-    Within a stretch the quaternions have continuous signs.  `rate_origin` says whether a
-    rate is the batch's `own`, `derived` from the attitudes before and after, `estimated` by a
-    filter, or `none`.
-    `gaps` counts the batches without a wanted attitude up to each row.
+    Within an interval the quaternions have continuous signs.  `rate_origin` is `own` for a batch's
+    rate, `derived` from the attitudes before and after, `estimated` by a filter, or `none`.  `gaps`
+    counts the batches without a wanted attitude up to each row.
     """
 
     stretch: Integers
@@ -142,24 +138,24 @@ class AttitudeBlock(AttitudeRows):
 
 @dataclass(frozen=True)
 class AttitudeSeries:
-    """Attitudes in order of time, block by block."""
+    """A series of attitudes in order of time, read block by block."""
 
     about: SeriesInfo
     blocks: Iterable[AttitudeBlock]
 
 
 def series_of(about: SeriesInfo, pages: Iterable[AttitudeRows]) -> AttitudeSeries:
-    """The series of recorded rows, which come in order of time; see `AttitudeBlock`.
+    """Build a series from recorded rows in order of time; see `AttitudeBlock`.
 
-    Between two attitudes a stretch ends where they are farther apart than the largest gap, a
-    batch between them has no attitude of the wanted status, or the body makes more than a quarter
-    turn: other programs would take it the shorter way.
+    An interval ends if two attitudes are farther apart than the largest gap, if a batch between
+    them has no attitude of the wanted status, or if the body makes more than a quarter turn: other
+    programs would interpolate along the shorter way.
     """
     return AttitudeSeries(about, _blocks(about, pages))
 
 
 def stretches(series: AttitudeSeries) -> Iterator[Iterator[AttitudeBlock]]:
-    """The unbroken stretches of a series, each in parts, which are read in their order."""
+    """Unbroken intervals of a series, each in parts that must be read in order."""
     for _, parts in groupby(_parts(series.blocks), key=lambda part: int(part.stretch[0])):
         yield parts
 
@@ -182,10 +178,10 @@ def _blocks(about: SeriesInfo, pages: Iterable[AttitudeRows]) -> Iterator[Attitu
 
 
 class _Assembler:
-    """Holds the last row given, for rates and signs, and those after it, which wait.
+    """Computes rates, signs and interval numbers of attitudes that arrive page by page.
 
-    Two rows wait: the last may still be replaced by one of the same moment, and the rate of the
-    one before depends on it.
+    Two rows wait: the last may still be replaced by one of the same moment, and the rate of the one
+    before depends on it.
     """
 
     def __init__(self, about: SeriesInfo) -> None:
@@ -196,7 +192,7 @@ class _Assembler:
         self._emitted = 0
 
     def fed(self, page: AttitudeRows) -> AttitudeBlock:
-        """The rows that are finished now that a page is known too; perhaps none."""
+        """Rows that are complete after a new page; may be empty."""
         is_wanted = _among(page.status, self._wanted)
         gaps = self._unwanted + np.cumsum(~is_wanted)
         self._unwanted = int(gaps[-1]) if len(gaps) else self._unwanted
@@ -206,7 +202,7 @@ class _Assembler:
         return self._finished(rows, waiting=2)
 
     def rest(self) -> AttitudeBlock | None:
-        """The rows that still waited, or None where there were none."""
+        """Rows that still waited at the end; None if there were none."""
         if self._held is None or len(self._held) == self._emitted:
             return None
         return self._finished(self._held, waiting=0)
@@ -218,7 +214,7 @@ class _Assembler:
         rows = _with_stretches(rows, self._about.largest_gap_s, first)
         end = max(emitted, len(rows) - waiting)
         finished = _with_rates(rows).taken(slice(emitted, end))
-        # The last one given stays, for the rate and the sign of the next.
+        # The last emitted row is kept for the rate and the sign of the next.
         self._emitted = min(end, 1)
         self._held = rows.taken(slice(end - self._emitted, None))
         return finished
@@ -235,7 +231,7 @@ class _Assembler:
 
 
 def _among(texts: Texts, wanted: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Marks of the texts that are among some; `numpy.isin` needs texts of fixed width."""
+    """Mask of texts that equal one of `wanted`; `numpy.isin` needs texts of fixed width."""
     return np.asarray(np.logical_or.reduce([texts == each for each in wanted]))
 
 
@@ -247,19 +243,19 @@ def _unfinished(rows: AttitudeRows, gaps: Integers, known: str) -> AttitudeBlock
 
 
 def follows(rows: AttitudeBlock, largest_gap_s: float) -> npt.NDArray[np.bool_]:
-    """Marks (n - 1,) of the rows that follow the one before within the gap, and none is missing."""
+    """Mask (n - 1,) of rows that follow the previous one within the gap, with no batch missing."""
     near = np.abs(np.diff(rows.time_ns)) <= round(largest_gap_s * 1e9)
     return np.asarray(near & (np.diff(rows.gaps) == 0))
 
 
 def known_rates(rows: AttitudeBlock) -> Vector:
-    """The rates (n, 3), deg/s, that batches gave or a filter estimated; NaN elsewhere."""
+    """Rates (n, 3) in deg/s from batches or a filter; NaN where unknown or derived."""
     is_known = _among(rows.rate_origin, (OWN, ESTIMATED))
     return np.where(is_known[:, None], rows.rate_deg_per_s, np.nan)
 
 
 def turns_far(rows: AttitudeBlock) -> npt.NDArray[np.bool_]:
-    """Marks (n - 1,) of the steps of more than a quarter turn, by the attitudes or by the rates."""
+    """Mask (n - 1,) of steps of more than a quarter turn, by attitudes or by rates."""
     step_s = np.abs(np.diff(rows.time_ns)) * 1e-9
     turn = np.linalg.norm(rotation_vectors(rows.quaternion[:-1], rows.quaternion[1:]), axis=1)
     rate = np.nan_to_num(np.linalg.norm(np.radians(known_rates(rows)), axis=1))
@@ -268,7 +264,7 @@ def turns_far(rows: AttitudeBlock) -> npt.NDArray[np.bool_]:
 
 
 def _with_stretches(rows: AttitudeBlock, largest_gap_s: float, first: int) -> AttitudeBlock:
-    """The rows with numbers of stretches, the first row's being `first`, and continuous signs."""
+    """Number the unbroken intervals of rows from `first`, and make quaternion signs continuous."""
     if not len(rows):
         return rows
     begins = ~follows(rows, largest_gap_s) | turns_far(rows)
@@ -285,10 +281,10 @@ def _with_stretches(rows: AttitudeBlock, largest_gap_s: float, first: int) -> At
 
 
 def _with_rates(rows: AttitudeBlock) -> AttitudeBlock:
-    """The rows with rates derived from their neighbours where batches gave none.
+    """Derive missing rates from neighbouring attitudes.
 
-    Between the steps before and after a row the rate is interpolated linearly; at the ends of
-    a stretch it is that of the one step.  A lone attitude has none.
+    The rate is interpolated linearly between the steps before and after a row; at the ends of an
+    interval it is the rate of the one step.  A lone attitude has none.
     """
     if len(rows) < 2 or not np.any(_among(rows.rate_origin, (NONE, DERIVED))):
         return rows
@@ -357,7 +353,7 @@ COLUMNS = (
     Column("batch", "text", description="Name of the batch.", width=128),
     Column("id", "text", description="Id of the result.", width=26),
 )
-"""The columns of raw attitudes."""
+"""Columns of the table of raw attitudes."""
 
 _OF_BATCHES = ("rate_origin", "residual_rms_arcsec", "predicted_rms_arcsec", "batch")
 _OF_ESTIMATES: dict[str, dict[str, Any]] = {
@@ -387,11 +383,11 @@ ESTIMATED_COLUMNS = (
     Column("model", "text", description="gyro or constant_rate.", width=16),
     Column("revision", "integer", description="Of the day, from 1."),
 )
-"""The columns of filtered and smoothed attitudes."""
+"""Columns of the table of filtered and smoothed attitudes."""
 
 
 def attitude_table(series: AttitudeSeries) -> Table:
-    """The table of a series, a row an attitude."""
+    """Table of a series, with one attitude per row."""
     columns = COLUMNS if series.about.grade == "raw" else ESTIMATED_COLUMNS
     about = {"product": "attitude", **series.about.provenance()}
     return Table(columns, _pages(series, [each.name for each in columns]), about)
@@ -404,7 +400,7 @@ def _pages(series: AttitudeSeries, names: Sequence[str]) -> Iterator[Page]:
 
 
 def page_of(block: AttitudeBlock) -> dict[str, list[Any]]:
-    """The values of every column by its name, as plain values; what is not known is None."""
+    """Values of all table columns by name, as plain values; None where unknown."""
     parts = {
         "q": (("1", "2", "3", "c"), block.quaternion),
         "p": (_COVARIANCE, block.covariance_arcsec2),
@@ -436,7 +432,7 @@ _ENCODER = msgspec.json.Encoder()
 
 
 def write_json(series: AttitudeSeries) -> Iterator[bytes]:
-    """Write the series: `about` and its `items`, an object an attitude."""
+    """Write a series as JSON: `about` with metadata, and `items` with an object per attitude."""
     yield b'{"about":' + _ENCODER.encode(series.about.provenance()) + b',"items":['
     is_first = True
     for block in series.blocks:
@@ -447,10 +443,10 @@ def write_json(series: AttitudeSeries) -> Iterator[bytes]:
 
 
 def _items(block: AttitudeBlock) -> Iterator[str]:
-    """The attitudes of a block, which has at least one, as objects.
+    """JSON objects of the attitudes in a block with at least one.
 
-    They are put together from texts: plain objects take twice the time, most of it to
-    collect garbage.
+    They are assembled from texts: encoding plain objects takes twice the time, mostly in garbage
+    collection.
     """
     members = {
         "time": _plain(block.time),
@@ -486,7 +482,7 @@ def _plain(values: Texts) -> list[str]:
 
 
 def _vectors(values: Vector) -> list[str]:
-    """Arrays of the three or four numbers of each row, null where they are not known."""
+    """JSON arrays of the three or four numbers of each row, null where unknown."""
     text = _ENCODER.encode(values.tolist()).decode()[1:-1].replace("],[", "]\n[")
     return text.replace("[null,null,null]", "null").split("\n")
 

@@ -1,7 +1,7 @@
-"""Attitude messages of CCSDS as KVN and XML (AEM, APM, ACM; 504.0-B-2).
+"""Attitude messages of CCSDS in KVN and XML (AEM, APM, ACM; 504.0-B-2).
 
-A message is written from pairs of keyword and value, in order; the keyword `COMMENT` may
-be repeated.  Both forms take the same pairs.
+A message is written from pairs of keyword and value, in order; the keyword `COMMENT` may be
+repeated.  Both notations take the same pairs.
 """
 
 import math
@@ -27,13 +27,13 @@ _XSI = "http://www.w3.org/2001/XMLSchema-instance"
 
 
 def xml(pairs: Pairs, indent: int = 0) -> str:
-    """Elements of XML, a pair a line."""
+    """XML elements, one line for each pair of keyword and value."""
     space = " " * indent
     return "".join(f"{space}<{key}>{escape(value)}</{key}>\n" for key, value in pairs)
 
 
 def xml_opening(kind: str, header: Pairs) -> str:
-    """The beginning of a message of a kind, such as `aem`, up to its body."""
+    """Beginning of an XML message of a kind, such as `aem`, up to its body."""
     return (
         '<?xml version="1.0" encoding="UTF-8"?>\n'
         f'<{kind} xmlns:xsi="{_XSI}" xsi:noNamespaceSchemaLocation="{_SCHEMA}" '
@@ -43,12 +43,12 @@ def xml_opening(kind: str, header: Pairs) -> str:
 
 
 def xml_closing(kind: str) -> str:
-    """The end of a message of a kind."""
+    """End of an XML message of a kind."""
     return f"  </body>\n</{kind}>\n"
 
 
 def numbers(values: Iterable[float]) -> list[str]:
-    """Numbers as text from which the same float64 is read again; raises for NaN."""
+    """Finite numbers as text that reads back as the same float64; asserts no NaN."""
     texts = [repr(value) for value in values]
     assert all(math.isfinite(value) for value in values)
     return texts
@@ -60,18 +60,18 @@ GRADE_WORDS = {
     "filtered": "Grade filtered: EKF of measured attitudes and gyro rates, from the past alone",
     "smoothed": "Grade smoothed: FILTER_SMOOTHER of measured attitudes and gyro rates",
 }
-"""How a grade is described; raw attitudes are those of batches."""
+"""Comments for filtered and smoothed attitudes in a message; raw ones need none."""
 RATE_WORDS = {
     frozenset({"own"}): "as the batches gave it",
     frozenset({"derived"}): "derived from the attitudes",
     frozenset({"own", "derived"}): "of some states as the batches gave it, else derived",
     frozenset({"estimated"}): "estimated by the filter",
 }
-"""How a rate is described, by the origins that occur."""
+"""Comments on the origin of angular velocities, by the set of origins that occur."""
 
 
 def header(about: attitudes.SeriesInfo) -> Pairs:
-    """Comments that say where the message comes from, its date and its originator."""
+    """Header of a message: comments on its origin, its date and originator."""
     comments = [f"Written by attitude-acquisition {about.version}", f"Run {about.run}"]
     comments.append(
         f"Attitudes of status {about.status}"
@@ -96,7 +96,7 @@ def header(about: attitudes.SeriesInfo) -> Pairs:
 
 
 def identity(about: attitudes.SeriesInfo) -> Pairs:
-    """The object that a message is about."""
+    """Name and identifier of the spacecraft in a message."""
     return [
         ("OBJECT_NAME", one_line(about.spacecraft)),
         ("OBJECT_ID", one_line(about.object_id or about.spacecraft)),
@@ -112,15 +112,15 @@ def identity(about: attitudes.SeriesInfo) -> Pairs:
 
 TRACKER_FRAME = "STARTRACKER_1"
 COUNTS = ("OBSERVED", "UNIQUE", "AMBIGUOUS", "UNMATCHED")
-"""Stars of all batches, in the order of `AttitudeRows.stars`."""
+"""Keywords of the star counts of all batches, in the order of `AttitudeRows.stars`."""
 _ARCSEC2_IN_DEG2 = 3600.0**2
 _DESIGNATOR = re.compile(r"\d{4}-\d{3}[A-Z]{1,3}")
 
 
 def write_acm(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
-    """Write a series, which has an attitude at least.
+    """Write a series with at least one attitude as an ACM message.
 
-    The covariances of all stretches are kept in a temporary file: they follow the last state.
+    The covariances of all intervals are kept in a temporary file: they follow the last state.
     """
     about = series.about
     methods: Counter[str] = Counter()
@@ -237,7 +237,7 @@ def _determination(about: attitudes.SeriesInfo, methods: Counter[str]) -> str:
 
 
 def _seconds(elapsed_ns: Integers) -> list[str]:
-    """Seconds with all their digits."""
+    """Seconds from nanoseconds, with all nine decimals."""
     whole, rest = np.divmod(elapsed_ns, 10**9)
     return [f"{s}.{ns:09d}" for s, ns in zip(whole.tolist(), rest.tolist(), strict=True)]
 
@@ -258,7 +258,7 @@ def _lines(seconds: list[str], values: Vector) -> str:
 
 @dataclass(frozen=True)
 class Form:
-    """How a message is written: its opening, metadata, states, ends."""
+    """Notation of a message (KVN or XML): functions and texts for its parts."""
 
     opening: Callable[[Pairs], str]
     metadata: Callable[[Pairs], str]
@@ -268,10 +268,10 @@ class Form:
 
 
 def write_aem(series: attitudes.AttitudeSeries, form: Form) -> Iterator[bytes]:
-    """Write a series.
+    """Write a series as an AEM message.
 
-    The states of a stretch are kept in a temporary file, because its metadata begins with
-    the time of its last one.
+    The states of an interval are kept in a temporary file, because its metadata, written first,
+    contains the time of the last one.
     """
     yield form.opening(header(series.about)).encode()
     for stretch in attitudes.stretches(series):
@@ -292,7 +292,7 @@ def _spooled(
 
 
 def _metadata(about: attitudes.SeriesInfo, parts: Iterable[attitudes.AttitudeBlock]) -> Pairs:
-    """The metadata of a stretch; reads all of it."""
+    """Metadata of an unbroken interval; reads all of it."""
     start = stop = ""
     origins: set[str] = set()
     for part in parts:
@@ -315,7 +315,7 @@ def _metadata(about: attitudes.SeriesInfo, parts: Iterable[attitudes.AttitudeBlo
 
 
 def _values(part: attitudes.AttitudeBlock) -> list[tuple[str, ...]]:
-    """The numbers of each state as texts: the quaternion and, where known, the rate in deg/s."""
+    """Numbers of each state as texts: the quaternion and, where known, the rate in deg/s."""
     values = part.quaternion
     if not np.isnan(part.rate_deg_per_s).any():
         values = np.concatenate([values, part.rate_deg_per_s], axis=1)
@@ -339,7 +339,7 @@ _STATES = {
     4: _STATE.format("quaternionEphemeris", _QUATERNION),
     7: _STATE.format("quaternionAngVel", _QUATERNION + _ANGVEL),
 }
-"""By the number of values of a state."""
+"""Templates of an XML state by its number of values."""
 
 
 def _xml_states(part: attitudes.AttitudeBlock) -> str:
@@ -373,7 +373,7 @@ _FRAMES = [("REF_FRAME_A", REF_FRAME_A), ("REF_FRAME_B", REF_FRAME_B)]
 
 
 def write_apm(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
-    """Write the last attitude of a series, which has one at least; reads all of it."""
+    """Write the last attitude of a non-empty series as an APM message; reads the whole series."""
     for block in series.blocks:
         last = block.taken(slice(-1, None))
     parts = [

@@ -1,4 +1,4 @@
-"""Attitudes as a C-kernel of type 3, zipped with the kernels that it takes to use it.
+"""Attitudes as a C-kernel of type 3, zipped with the kernels needed to use it.
 
 SPICE's quaternion is scalar-first and the conjugate of ours: (qc, -q1, -q2, -q3).  Its
 angular velocity is in the axes of the reference frame, J2000: A^T w.  An interpolation
@@ -23,12 +23,12 @@ from service.table_files.spool import folder, pieces
 from service.vectors import Vector, attitude_matrices
 
 CHILD_S = 600.0
-"""The longest that the child may take."""
+"""Time limit of the child process in seconds."""
 _CHILD = Path(__file__).with_name("ck_child.py")
 
 
 def write_ck(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
-    """Write a zip file with the C-kernel, clock, frame, leap seconds and their list."""
+    """Write a zip file with the C-kernel, its clock, frame, leap-second and meta-kernels."""
     about = series.about
     name = body_name(about).lower()
     with folder() as temporary:
@@ -54,7 +54,7 @@ def write_ck(series: attitudes.AttitudeSeries) -> Iterator[bytes]:
 
 
 def _clock(about: attitudes.SeriesInfo) -> str:
-    """The kernel of the spacecraft's clock: its own, or the one that we define."""
+    """Clock kernel (SCLK) of the spacecraft: its own, or the one defined here."""
     if about.sclk_kernel is None:
         return clock_kernel(about)
     try:
@@ -64,7 +64,7 @@ def _clock(about: attitudes.SeriesInfo) -> str:
 
 
 def _keep_records(series: attitudes.AttitudeSeries, place: Path) -> None:
-    """Write for the child what the kernel is made of: the records, and where stretches begin."""
+    """Write the input files of the child process: attitude records, and the starts of intervals."""
     count = 0
     begins: list[tuple[int, int]] = []
     with (place / "records").open("wb") as file:
@@ -78,7 +78,7 @@ def _keep_records(series: attitudes.AttitudeSeries, place: Path) -> None:
 
 
 def _records(part: attitudes.AttitudeBlock) -> Vector:
-    """Rows of encoded clock (of ours), SPICE's quaternion, and angular velocity in J2000, rad/s."""
+    """Rows of encoded clock, SPICE's quaternion, and angular velocity in J2000 in rad/s."""
     ticks = clock_ticks(part.time_ns)[:, None]
     vector, scalar = part.quaternion[:, :3], part.quaternion[:, 3:]
     rate = np.radians(np.nan_to_num(part.rate_deg_per_s))
@@ -99,32 +99,32 @@ def _run_child(place: Path, file: str, instrument: int, its_clock: list[str]) ->
 # 1972-01-01T00:00:00 TAI, an encoded tick being a microsecond.
 
 _CLOCK_ZERO_S = -883_656_000
-"""TAI seconds from 2000-01-01T12:00:00 to the zero of the clock."""
+"""Zero of the clock in TAI seconds since 2000-01-01T12:00:00."""
 _TT_LESS_TAI_S = 32.184
 
 
 def clock_ticks(tai_ns: Integers) -> Vector:
-    """Encoded clock of moments given as `Utc.tai_ns`; exact for whole microseconds."""
+    """Encoded clock ticks of times as `Utc.tai_ns`; exact for whole microseconds."""
     return (tai_ns - _CLOCK_ZERO_S * 10**9) / 1e3
 
 
 def body_name(about: attitudes.SeriesInfo) -> str:
-    """The name of the spacecraft in kernels: capitals, digits and underscores."""
+    """Name of the spacecraft in kernels: capitals, digits and underscores."""
     return re.sub("[^A-Z0-9]", "_", about.spacecraft.upper())[:20]
 
 
 def frame_name(about: attitudes.SeriesInfo) -> str:
-    """The name of the frame of its body."""
+    """Name of the spacecraft's body frame in kernels."""
     return f"{body_name(about)}_BODY"
 
 
 def instrument_id(about: attitudes.SeriesInfo) -> int:
-    """The id of the structure that the C-kernel orients, and of its frame."""
+    """SPICE id of the structure whose orientation the C-kernel gives, and of its frame."""
     return about.naif_id * 1000
 
 
 def clock_kernel(about: attitudes.SeriesInfo) -> str:
-    """SCLK: the clock of the spacecraft."""
+    """Text of the spacecraft's clock kernel (SCLK)."""
     id = -about.naif_id
     zero = f"{_CLOCK_ZERO_S + _TT_LESS_TAI_S:.3f}"
     return text_kernel(
@@ -144,7 +144,7 @@ def clock_kernel(about: attitudes.SeriesInfo) -> str:
 
 
 def frame_kernel(about: attitudes.SeriesInfo) -> str:
-    """FK: the frame of the body, whose orientation the C-kernel gives."""
+    """Text of the frame kernel (FK) of the body axes, whose orientation the C-kernel gives."""
     id, name = instrument_id(about), frame_name(about)
     return text_kernel(
         "FK",
@@ -162,6 +162,6 @@ def frame_kernel(about: attitudes.SeriesInfo) -> str:
 
 
 def list_of_kernels(names: list[str]) -> str:
-    """Meta-kernel: loads all of them from the folder of the process."""
+    """Text of the meta-kernel that loads all kernels from the current folder."""
     quoted = [f"  '{name}'" for name in names]
     return text_kernel("MK", "Load this from their folder.", "KERNELS_TO_LOAD = (", *quoted, ")")

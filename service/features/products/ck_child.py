@@ -1,4 +1,4 @@
-"""Writes a C-kernel of type 3 from records; run as a program of its own.
+"""Program that writes a C-kernel of type 3 from records, run as a child process.
 
     python ck_child.py FOLDER FILE INSTRUMENT [LSK SCLK]
 
@@ -15,17 +15,18 @@ from collections.abc import Iterator
 import numpy as np
 
 IN_SEGMENT = 50_000
-"""Records of a segment at most.  A longer stretch goes on in the next with its last record
-again, so that no interval is lost between both."""
+"""Greatest number of records in a segment.  A longer interval continues in the next segment with
+its last record repeated, so that the step between both is not lost.
+"""
 
 CLOCK_ZERO_S = -883_656_000
-"""TAI seconds from 2000-01-01T12:00:00 to the zero of our clock, as in `kernels`."""
+"""Zero of the service's own clock in TAI seconds since 2000-01-01T12:00:00, as in `kernels`."""
 
 Piece = tuple[int, int, bool]
 
 
 def pieces(begins: "np.ndarray[tuple[int, int], np.dtype[np.int64]]", count: int) -> list[Piece]:
-    """Stretches as first row, end, and whether it has rates; long ones in overlapping pieces."""
+    """Intervals as first row, end, and presence of rates; long ones in overlapping pieces."""
     ends = [*begins[1:, 0].tolist(), count]
     found = []
     for (first, rated), end in zip(begins.tolist(), ends, strict=True):
@@ -37,7 +38,7 @@ def pieces(begins: "np.ndarray[tuple[int, int], np.dtype[np.int64]]", count: int
 
 
 def segments(parts: list[Piece]) -> Iterator[list[Piece]]:
-    """Pieces drawn together into segments, of which each has rates or has none."""
+    """Group pieces into segments, each entirely with or entirely without rates."""
     group: list[Piece] = []
     for part in parts:
         size = part[1] - (group[0][0] if group else part[0])
@@ -49,7 +50,7 @@ def segments(parts: list[Piece]) -> Iterator[list[Piece]]:
 
 
 def main() -> None:
-    """Write the kernel."""
+    """Write the C-kernel from the files in the folder given as argument."""
     import spiceypy
 
     place, file, instrument, *its_clock = sys.argv[1:]

@@ -1,4 +1,4 @@
-"""`acquire export`: files for other programs; and `acquire score`."""
+"""Commands `acquire export`, which writes files for other programs, and `acquire score`."""
 
 from argparse import ArgumentParser, Namespace
 from dataclasses import asdict
@@ -17,11 +17,11 @@ TABLES = {
     "gyro": "Write the recorded gyro samples of a spacecraft, one row per sample.",
     "stars": "Write the stars of a spacecraft's batches with their outcomes, one row per star.",
 }
-"""The summary of the command of each table; see `Products.table`."""
+"""Help texts of the commands that export tables; see `Products.table`."""
 
 
 def add(commands: Any) -> None:
-    """Declare the commands."""
+    """Declare the commands `export` and `score`."""
     group = arguments.add_group(
         commands,
         "export",
@@ -157,7 +157,7 @@ def _print_attitude_at(parsed: Namespace) -> int:
 
 
 def _add_table(commands: Any, kind: str, summary: str) -> None:
-    """Declare `acquire export KIND`; see `Products.table`."""
+    """Declare `acquire export KIND` for a table; see `Products.table`."""
     parser = arguments.add_command(
         commands,
         kind,

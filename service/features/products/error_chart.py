@@ -1,4 +1,4 @@
-"""The errors of attitudes over time as SVG."""
+"""SVG chart of attitude errors over time."""
 
 from xml.sax.saxutils import escape
 
@@ -10,14 +10,14 @@ from service.vectors import Vector
 WIDTH, ROW, HEAD, FOOT = 960, 190, 44, 30
 TIME_LEFT, TIME_RIGHT, BARS_LEFT, BARS_RIGHT = 76, 640, 690, 940
 TOP, BOTTOM = 26, 166
-"""Within a row."""
+"""Top and bottom of the drawing area within a row of the chart."""
 MOST_POINTS = 3_000
-"""The most points along an axis: a longer series is shown by evenly spread attitudes."""
+"""Greatest number of points along an axis: a longer series is thinned evenly."""
 POINT, SIGMA, BAR = "#1f5f99", "#b3541e", "#7ba7cf"
 
 
 def errors_picture(errors: Errors, title: str) -> str:
-    """The errors as SVG; needs one attitude at least."""
+    """Draw attitude errors as SVG; needs at least one attitude."""
     counts = histogram(errors)
     limit = counts["edges_arcsec"][-1]
     height = HEAD + ROW * len(AXES) + FOOT

@@ -1,4 +1,4 @@
-"""The attitude at a moment: the nearest one, or one interpolated within a stretch."""
+"""Attitude at a given time: the nearest one, or one interpolated within an interval."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,14 +18,14 @@ AtMethod = Literal["nearest", "interpolated"]
 
 @dataclass(frozen=True)
 class AttitudeAt:
-    """The attitude at a moment, with its error.
+    """Attitude at a given time, with its error.
 
     `covariance_arcsec2` (3, 3) is that of the measured attitudes and of the motion, about the body
-    axes.  `motion_arcsec` is the error that the motion adds: of the nearest attitude the angle
-    that the body turns until the moment; between two attitudes, an eighth of the step times the
-    change of the rate or, if more, of what the rates miss the second attitude by; over more than
-    a quarter turn the bound of `interpolation`.  None where no rate is known.  `ids`
-    names the results it is made of.
+    axes.  `motion_arcsec` is the error due to the motion: for the nearest attitude the angle that
+    the body turns until the time; between two attitudes, an eighth of the step times the change of
+    the rate or, if larger, of the angle by which the rates miss the second attitude; over more than
+    a quarter turn the bound of `interpolation`.  None if no rate is known.  `ids` names the results
+    used.
     """
 
     time: str
@@ -34,7 +34,7 @@ class AttitudeAt:
     covariance_arcsec2: list[list[float]]
     motion_arcsec: float | None
     offset_s: float
-    """From the moment to the nearest attitude that was used."""
+    """Seconds from the requested time to the nearest attitude that was used."""
     ids: list[str]
 
 
@@ -44,11 +44,10 @@ def attitude_at(
     moment: Utc,
     method: AtMethod,
 ) -> AttitudeAt:
-    """The attitude at a moment, from the rows around it in order of time.
+    """Attitude at a given time, from rows around it in order of time.
 
-    Raises `NotFound` where none is within the largest gap and, where it is to be interpolated,
-    if the moment lies within no stretch, or the turn between the attitudes beside it cannot be
-    told.
+    Raises `NotFound` if no attitude is within the largest gap and, for interpolation, if the time
+    lies within no interval, or the turn between the neighbouring attitudes is ambiguous.
     """
     blocks = list(attitudes.series_of(about, pages).blocks)
     if not blocks:
@@ -97,7 +96,7 @@ def _nearest(
 
 
 def _interpolated(rows: attitudes.AttitudeBlock, after: int, moment: Utc) -> AttitudeAt | None:
-    """The attitude between two rows; None where the turn between them cannot be told."""
+    """Attitude interpolated between two rows; None if the turn between them is ambiguous."""
     pair = [after - 1, after]
     first_ns, second_ns = rows.time_ns[pair].tolist()
     share = np.array([(moment.tai_ns - first_ns) / (second_ns - first_ns)])

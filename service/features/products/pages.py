@@ -1,4 +1,4 @@
-"""The page of files: attitudes of a period by grade, with what each is, and tables."""
+"""Console page of export files: attitudes of a period by grade, and tables."""
 
 from dataclasses import dataclass
 from itertools import islice
@@ -26,13 +26,13 @@ GRADES: dict[ProductGrade, str] = {
     "raw": "One attitude for each batch, from its stars alone, independent of its neighbours.",
 }
 MOST_COUNTED = 5_000
-"""Attitudes of a period whose stretches are counted: reading them takes about 0.1 s."""
+"""Greatest number of attitudes read to count intervals; takes about 0.1 s."""
 FEW_PER_STRETCH = 10
-"""A file whose stretches have fewer attitudes than that is hardly of use for interpolation."""
+"""Least mean number of attitudes per interval for a file that is useful for interpolation."""
 
 
 class FilesQuery(spacecraft.SpacecraftQuery):
-    """The period, and the largest gap within a stretch; empty: that of the mission or cadence."""
+    """Query of the files page: period and largest gap; empty: from the mission or the cadence."""
 
     gap_s: Annotated[float | None, Field(gt=0, le=MAX_LARGEST_GAP_S)] = None
 
@@ -44,11 +44,11 @@ class FilesQuery(spacecraft.SpacecraftQuery):
 
 @dataclass(frozen=True)
 class GradeOfFile:
-    """One grade of a period: how many attitudes, in how many stretches, and its largest gap.
+    """Summary of one grade of attitudes in a period: number, intervals, largest gap.
 
-    `missing` says why there is none, where something is known to be missing.
+    `missing` is the reason for having none, if known.
 
-    `is_cut` says that only the first `MOST_COUNTED` of them were counted.
+    `is_cut` is true if only the first `MOST_COUNTED` attitudes were counted.
     """
 
     grade: ProductGrade
@@ -61,13 +61,13 @@ class GradeOfFile:
 
     @property
     def is_shattered(self) -> bool:
-        """True if a file falls into more stretches than a tenth of its attitudes."""
+        """True if a file has more intervals than a tenth of its attitudes."""
         return self.stretches * FEW_PER_STRETCH > self.attitudes and self.stretches > 1
 
 
 @console_page("/spacecraft/{name}/files", "Files", Policy("read", "path"), section="/")
 def files_page(name: str, query: FromQuery[FilesQuery], context: ContextDep) -> Response:
-    """Attitudes of a period as files of every grade and format, and its tables."""
+    """Console page with export files of a period: attitudes by grade and format, and tables."""
     context.app.context.mission(name)
     shown = spacecraft.shown_period(context, name, query)
 

@@ -1,4 +1,4 @@
-"""Links to files of the grades that the page of the definitive attitude shows."""
+"""Links to attitude files, on the page of the definitive attitude."""
 
 from collections.abc import Iterator
 
@@ -12,7 +12,7 @@ from service.web.console.pages.spacecraft import ShownPeriod
 def files_of_grades(
     context: PageContext, name: str, run: str, shown: ShownPeriod
 ) -> Iterator[Panel]:
-    """Links to files of each grade of which the period has a good attitude."""
+    """Panel with links to attitude files of each grade that has a good attitude in the period."""
     products = context.app.part(Products)
     series = {
         grade: products.attitudes(name, run=run, start=shown.start, end=shown.end, grade=grade)

@@ -1,4 +1,4 @@
-"""Attitudes of a spacecraft as a series, for any format, and its batches as tables."""
+"""Service that reads attitudes and tables of a spacecraft for export."""
 
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -32,25 +32,25 @@ from service.times import Utc, shifted, utc_now
 Pages = Iterator[AttitudeRows]
 Order = Literal["oldest", "newest"]
 AROUND = 200
-"""Batches on either side of a moment among which its attitude is looked for."""
+"""Number of batches on either side of a time that are read to find its attitude."""
 CADENCES = 2.5
-"""Usual times between batches that a stretch may be without one."""
+"""Default largest gap within an interval, in usual times between batches."""
 LEAST_OF_CADENCE = 4
-"""Batches from which on a period has a cadence."""
+"""Least number of batches from which the usual time between them is estimated."""
 TableKind = Literal["batches", "stars", "gyro"]
 TABLE_KINDS: tuple[TableKind, ...] = get_args(TableKind)
 _TABLES = {"batches": batch_table, "stars": star_table}
 
 
 class Products:
-    """Reads what leaves the service as files."""
+    """Reads attitudes and tables for export."""
 
     def __init__(self, missions: Mapping[str, Mission], store: Store) -> None:
         self._missions = missions
         self._store = store
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file and no connection is open."""
 
     def attitudes(
         self,
@@ -67,13 +67,13 @@ class Products:
         naif_id: int | None = None,
         most_batches: int | None = None,
     ) -> attitude_series.AttitudeSeries:
-        """The attitudes of a spacecraft's current results in a run; see `series_of`.
+        """Series of a spacecraft's current attitudes in a run; see `series_of`.
 
-        Of the grades `filtered` and `smoothed` they are those of the latest revision of each day.
-        They are read as the series is.  The largest gap and the identifiers are the mission's
-        where they are None.  A mission that names no gap has one that follows the cadence of the
-        period's batches, so that batches at a steady cadence make one stretch.
-        Raises `BadBatch` where a period has more than `most_batches`.
+        The grades `filtered` and `smoothed` are read from the latest revision of each day.  Rows
+        are read while the series is iterated.  The largest gap and the identifiers are the
+        mission's if they are None.  For a mission that sets no gap, the gap follows the cadence of
+        the period's batches, so that batches at a steady cadence form one interval.  Raises
+        `BadBatch` for a period with more than `most_batches`.
         """
         mission = mission_named(self._missions, name)
         own = mission.products
@@ -118,7 +118,7 @@ class Products:
         return "" if newest is None else newest.text
 
     def _gap_of_cadence(self, about: attitude_series.SeriesInfo, selected: ResultFilter) -> float:
-        """The largest gap of a period: its first batches tell the usual time between them."""
+        """Largest gap of a period, estimated from the usual time between its first batches."""
         first = next(self._pages(about, selected, page=AROUND), None)
         if first is None or len(first) < LEAST_OF_CADENCE:
             return about.largest_gap_s
@@ -128,7 +128,7 @@ class Products:
     def _pages(
         self, about: attitude_series.SeriesInfo, selected: ResultFilter, **wanted: Any
     ) -> Pages:
-        """The recorded attitudes of a period in a grade, page by page."""
+        """Read recorded attitudes of a period in a grade, page by page."""
         if about.grade == "raw":
             return attitude_pages(self._store.reading, self._store.archive, selected, **wanted)
         return graded_pages(self._store.reading, selected, about.grade, **wanted)
@@ -144,7 +144,7 @@ class Products:
         grade: attitude_series.ProductGrade = "raw",
         largest_gap_s: float | None = None,
     ) -> AttitudeAt:
-        """The attitude of a spacecraft at a moment; see `moment.attitude_at`."""
+        """Attitude of a spacecraft at a given time; see `moment.attitude_at`."""
         if largest_gap_s is None:
             largest_gap_s = mission_named(self._missions, name).products.largest_gap_s
         about = self.attitudes(
@@ -172,10 +172,10 @@ class Products:
         end: Utc | None = None,
         most_batches: int | None = None,
     ) -> Table:
-        """A spacecraft's batches, their stars or its gyro samples, oldest first.
+        """Table of a spacecraft's batches, their stars or its gyro samples, oldest first.
 
-        They are read as the table is; see `result_tables` and `samples_table`.  Raises `BadBatch`
-        where a period has more than `most_batches`, or so many gyro samples.
+        Rows are read while the table is iterated; see `result_tables` and `samples_table`.  Raises
+        `BadBatch` for a period with more than `most_batches` batches or gyro samples.
         """
         mission_named(self._missions, name)
         about = {
@@ -220,10 +220,10 @@ class Products:
 
 @contextmanager
 def open_products(settings: Settings) -> Iterator[Products]:
-    """The products of a database, for a command; see `factory.open_app`.
+    """Open a database for export by a command; see `factory.open_app`.
 
-    Without a sky and what computes it takes 80 MB less memory than the whole app.
-    Raises `BadConfiguration` for missions or a database that cannot be used.
+    Without the sky and the solver it needs 80 MB less memory than the whole app.  Raises
+    `BadConfiguration` for missions or a database that cannot be used.
     """
     missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
     store = Store(settings.database, archive_folder=settings.archive_folder)
@@ -237,5 +237,5 @@ def open_products(settings: Settings) -> Iterator[Products]:
 
 
 def open_part(app: App) -> Products:
-    """The products of an open app."""
+    """Create the export service of an open app."""
     return Products(app.context.known, app.store)

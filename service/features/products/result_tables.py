@@ -1,4 +1,4 @@
-"""Current results as tables, in order of time: a row per batch, per star, or per attitude."""
+"""Current results as tables in order of time: one row per batch, star, or attitude."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -25,7 +25,7 @@ from service.trends.quantities import QUANTITIES
 from service.vectors import Vector
 
 PAGE = 5_000
-"""Rows that are read together."""
+"""Number of rows read at once."""
 
 _QUALITY = ("residual_rms_arcsec", "predicted_rms_arcsec")
 _QUERY: Select[Any] = (
@@ -56,11 +56,11 @@ def attitude_pages(
     newest_first: bool = False,
     page: int = PAGE,
 ) -> Iterator[AttitudeRows]:
-    """Every current result that is selected, with its attitude, page by page.
+    """Selected current results with their attitudes, page by page.
 
-    Those of the archive are read with the recorded ones.
+    Archived results are merged with those in the database.
 
-    Between two pages no connection is held, so that a slow reader keeps none from others.
+    No connection is held between two pages, so that a slow reader does not block others.
     """
     query = _QUERY.where(*selected.conditions())
     listing = Listing(archive, query, selected, newest_first, needs=("input", "solution"))
@@ -105,7 +105,7 @@ def _texts(values: Sequence[Any]) -> Any:
 
 
 BATCHES, BATCHES_OF_STARS = 5_000, 500
-"""Results that are read together."""
+"""Numbers of results read at once, for tables of batches and of stars."""
 
 _NAMES = (
     Column("time", "utc", description="UTC. Time of the batch.", width=30),
@@ -145,7 +145,7 @@ STAR_COLUMNS = (
 def batch_table(
     reading: Reading, archive: Archive, selected: ResultFilter, about: Mapping[str, str]
 ) -> Table:
-    """The batches that are selected with their quantities; read as the table is."""
+    """Table of selected batches with their quantities; rows are read during iteration."""
     read = [
         _PLACES[each.name] if each.name in _PLACES else results.c[each.name]
         for each in BATCH_COLUMNS
@@ -162,7 +162,7 @@ def batch_table(
 def star_table(
     reading: Reading, archive: Archive, selected: ResultFilter, about: Mapping[str, str]
 ) -> Table:
-    """The stars of the batches that are selected with their outcomes; read as the table is."""
+    """Table of stars in selected batches with their outcomes; rows are read during iteration."""
     return Table(STAR_COLUMNS, _stars(reading, archive, selected), {"product": "stars", **about})
 
 

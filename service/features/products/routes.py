@@ -1,4 +1,4 @@
-"""Attitudes and tables of a period as files, and the attitude at a moment."""
+"""API routes for exported attitudes and tables of a period, and the attitude at a given time."""
 
 from dataclasses import asdict
 from typing import Annotated, Literal
@@ -68,7 +68,7 @@ ProductsDep = Annotated[Products, Depends(_products)]
 
 
 class AttitudeQuery(params.PeriodQuery):
-    """Attitudes of a period, in a format."""
+    """Query for attitudes of a period in an output format."""
 
     format: Annotated[
         str,
@@ -101,7 +101,7 @@ class AttitudeQuery(params.PeriodQuery):
 
 
 class AttitudeAtQuery(params.RunQuery):
-    """A moment, and how its attitude is found."""
+    """Query for the attitude at a given time, nearest or interpolated."""
 
     time: Annotated[params.Time, Field(description="The moment.")]
     method: Annotated[
@@ -117,7 +117,7 @@ class AttitudeAtQuery(params.RunQuery):
 
 
 class TableQuery(params.PeriodQuery):
-    """A table of a period, in a format."""
+    """Query for a table of a period in an output format."""
 
     format: Annotated[
         str, OneOf(lambda: tuple(TABLE_FORMATS)), Field(description="The format of the file.")
@@ -163,10 +163,10 @@ def get_attitude(
 def get_attitude_at(
     name: SpacecraftPath, query: FromQuery[AttitudeAtQuery], products: ProductsDep
 ) -> Response:
-    """The attitude at a moment with its error: interpolated within a stretch, or the nearest.
+    """The attitude at a given time with its error: interpolated within an interval, or the nearest.
 
-    404 if no attitude lies within the largest gap, or if the moment to interpolate at lies
-    within no stretch.
+    404 if no attitude lies within the largest gap, or if the time to interpolate at lies within no
+    interval.
     """
     asked = query.asked()
     found = products.attitude_at(name, asked.pop("time"), asked.pop("method"), **asked)

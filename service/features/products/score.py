@@ -1,4 +1,4 @@
-"""`acquire score`: recorded attitudes held against the truth of a file."""
+"""Command `acquire score`: compare recorded attitudes with true ones from a file."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -13,7 +13,7 @@ _BAR = 48
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `score` and its options."""
     parser = arguments.add_command(
         commands,
         "score",
@@ -91,7 +91,7 @@ def _table(found: dict[str, Any]) -> str:
 
 
 def _bars(histogram: dict[str, Any]) -> list[str]:
-    """The histogram of each axis as rows of characters, four bins a row."""
+    """Histogram of errors about each axis as rows of characters, four bins per row."""
     edges = histogram["edges_arcsec"]
     lines = []
     for axis in ("x", "y", "z"):

@@ -1,6 +1,6 @@
-"""Attitudes held against the truth of a file: errors per axis, and whether sigmas are right.
+"""Comparison of attitudes with true ones: errors per axis, and a check of the covariances.
 
-An error is the small rotation from the true attitude to the one found, in arcseconds about the
+An error is the small rotation from the true attitude to the estimated one, in arcseconds about the
 body axes: `vectors.attitude_error_arcsec`.
 """
 
@@ -22,10 +22,10 @@ BINS = 40
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors (n, 3) of attitudes at moments (n,), with their predicted variances (n, 3).
+    """Attitude errors (n, 3) at times (n,), with their predicted variances (n, 3).
 
-    `normalized` (n,) is e^T P^-1 e, chi-square with three degrees of freedom where the
-    covariances are right.  `outside` counts attitudes for whose time the truth has none.
+    `normalized` (n,) is e^T P^-1 e, chi-square with three degrees of freedom if the covariances are
+    right.  `outside` counts attitudes at times without a true one.
     """
 
     time_ns: Integers
@@ -36,12 +36,12 @@ class Errors:
 
     @property
     def total_arcsec(self) -> Vector:
-        """The angles (n,) between the attitudes and the truth."""
+        """Angles (n,) between estimated and true attitudes, in arcsec."""
         return np.asarray(np.linalg.norm(self.error_arcsec, axis=1))
 
 
 def errors_of(blocks: Iterable[AttitudeBlock], truth: KnownAttitudes) -> Errors:
-    """The errors of attitudes against a file's; between its records the truth is interpolated."""
+    """Errors of attitudes against the true ones of a file, interpolated between its records."""
     parts: list[tuple[Integers, Vector, Vector, Vector]] = []
     outside = 0
     for block in blocks:
@@ -64,7 +64,7 @@ def errors_of(blocks: Iterable[AttitudeBlock], truth: KnownAttitudes) -> Errors:
 
 
 def statistics(errors: Errors) -> dict[str, Any]:
-    """The statistics of errors, in arcseconds, as plain values; needs one error at least."""
+    """Statistics of attitude errors in arcseconds, as plain values; needs at least one error."""
     total = errors.total_arcsec
     return {
         "attitudes": len(total),
@@ -88,9 +88,10 @@ def statistics(errors: Errors) -> dict[str, Any]:
 
 
 def histogram(errors: Errors) -> dict[str, Any]:
-    """Counts of the errors by axis in equal bins: from -limit to limit, beyond it at both ends.
+    """Histogram of attitude errors by axis, in equal bins up to a limit; larger ones in the end
+    bins.
 
-    The limit holds 99 of 100 errors, so that a few wild ones leave the others apart.
+    The limit holds 99 of 100 errors, so that outliers do not compress the rest.
     """
     limit = float(np.percentile(np.abs(errors.error_arcsec), _SHARES[-1])) or 1.0
     edges = np.linspace(-limit, limit, BINS + 1)

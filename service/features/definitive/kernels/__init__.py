@@ -1,4 +1,4 @@
-"""The filter and the smoother, compiled, with what they take and give; no database."""
+"""Compiled attitude filter and smoother, with their input and output types; no database."""
 
 from service.features.definitive.kernels.smoother import compile_kernels
 

@@ -1,4 +1,4 @@
-"""The filter of attitude and gyro bias: gyro samples and measurements to a history.
+"""Kalman filter of attitude and gyro bias, from gyro samples and attitude measurements.
 
 A multiplicative extended Kalman filter (Lefferts, Markley & Shuster, 1982).
 """
@@ -43,9 +43,9 @@ from service.vectors import Vector, read_only
 
 NS = 1e-9
 LEAST_REDUNDANCY = 0.25
-"""What an accepted measurement adds at least, so that in a gap of the gyro a start ends, too."""
+"""Least redundancy counted for an accepted measurement, so that a start ends even in a gyro gap."""
 ESTABLISHED = 10.0
-"""Redundancy of an attitude that is held on to for `reset_after_s`, whatever contradicts it."""
+"""Redundancy from which contradicting measurements need `reset_after_s` to replace an attitude."""
 
 
 def filter_attitude(
@@ -56,15 +56,15 @@ def filter_attitude(
     state: FilterState | None = None,
     settings: FilterSettings | None = None,
 ) -> FilterResult:
-    """Filter a stretch from `state`, or from the first measured attitude where there is none.
+    """Filter measurements from `state` on, or from the first measured attitude if None.
 
-    Epochs are all times of gyro samples and, up to the last sample, of measurements.  A
-    `GyroModel` needs `gyro`; the epochs of a `ConstantRateModel` are the measurements, and
-    `gyro` has a rate for each of their times, or is None.  Filtering in parts, each from the
-    state at the end of the one before, gives the same bytes as in one.
+    Epochs are all times of gyro samples and, up to the last sample, of measurements.  A `GyroModel`
+    needs `gyro`; for a `ConstantRateModel` the epochs are the times of measurements, and `gyro` has
+    a rate for each of them, or is None.  Filtering in parts, each from the final state of the part
+    before, gives the same bytes as at once.
 
-    Raises `BadInput` for a rate beyond the gyro's limit, samples that are not later than
-    the state, measurements before it, and a stretch without any epoch.
+    Raises `BadInput` for a rate beyond the gyro's limit, samples not later than the state,
+    measurements before it, and input without any epoch.
     """
     attitudes, directions = attitudes or no_attitudes(), directions or no_directions()
     least_redundancy = LEAST_REDUNDANCY
@@ -127,7 +127,7 @@ def _order(
     state: FilterState | None,
     gyro: GyroSamples,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """Kind and row of the measurements within the gyro's samples, in order of time."""
+    """Kind and row of measurements within the period of gyro samples, in order of time."""
     for name, measurements in (("attitudes", attitudes), ("directions", directions)):
         if state is not None and len(measurements.tai_ns) and measurements.tai_ns[0] < state.tai_ns:
             expected = f"must be no earlier than the state, {state.tai_ns}"
@@ -148,7 +148,7 @@ def _measured(
     kind: npt.NDArray[np.int64],
     row: npt.NDArray[np.int64],
 ) -> tuple[Measured, npt.NDArray[np.int64]]:
-    """The measurements as the kernels take them, and their times."""
+    """Measurements as arrays for the compiled kernels, and their times."""
     m = len(kind)
     found = Measured(
         kind, np.zeros((m, 4)), np.zeros((m, 3, 3)), np.zeros((m, 3)), np.zeros((m, 3))
@@ -170,7 +170,7 @@ def _timeline(
     model: GyroModel,
     state: FilterState | None,
 ) -> Timeline:
-    """The epochs and the steps to them."""
+    """Epochs of the filter, with the time step and rate that lead to each."""
     tai_ns = np.unique(np.concatenate([gyro.tai_ns, measured_ns]))
     begin_ns = int(gyro.tai_ns[0]) if state is None else state.tai_ns
     before = gyro.rate_rad_s[:1] if state is None else state.rate_rad_s[None]
@@ -197,7 +197,7 @@ def noise_of(
     settings: FilterSettings | None = None,
     least_redundancy: float = LEAST_REDUNDANCY,
 ) -> Noise:
-    """The model and the settings as the kernels take them."""
+    """Model and filter settings as plain numbers for the compiled kernels."""
     settings = settings or FilterSettings()
     gate_2, gate_3 = _gates(settings.gate_tail)
     start_gate_3 = _gates(max(settings.gate_tail, settings.start_gate_tail))[1]
@@ -223,7 +223,7 @@ def noise_of(
 
 @lru_cache(maxsize=64)
 def _gates(tail: float) -> tuple[float, float]:
-    """What chi-square of two and of three degrees of freedom passes with this probability."""
+    """Values that chi-square with 2 and 3 degrees of freedom exceeds with probability `tail`."""
     low, high = 0.0, 2000.0
     # Halved until no number lies between: scipy's inverse takes a tenth of a start to load.
     while low < (middle := 0.5 * (low + high)) < high:
@@ -234,7 +234,7 @@ def _gates(tail: float) -> tuple[float, float]:
 
 
 def _track(state: FilterState | None, noise: Noise) -> Track:
-    """The state to work on; a copy of what is given."""
+    """Working copy of a filter state, or an empty one."""
     counts, redundancy, doubt_rad = np.zeros(5, dtype=np.int64), np.zeros(1), np.zeros(1)
     if state is None:
         covariance = np.diag([0.0, 0.0, 0.0, *[noise.first_bias] * 3])
@@ -279,7 +279,7 @@ def _state(track: Track, tai_ns: int, rate_rad_s: Vector) -> FilterState:
 
 
 def _room(n: int, m: int) -> tuple[Epochs, WrittenInnovations]:
-    """What the kernel writes of n epochs and m measurements."""
+    """Empty output arrays of the kernel for n epochs and m measurements."""
     epochs = Epochs(
         quaternion=np.empty((n, 4)),
         bias=np.empty((n, 3)),

@@ -1,4 +1,4 @@
-"""The filter's recursion over epochs and measurements, compiled."""
+"""Compiled recursion of the attitude filter over epochs and measurements."""
 
 import math
 from typing import Any, NamedTuple
@@ -24,20 +24,21 @@ UNUSED, ACCEPTED = int(Outcome.UNUSED), int(Outcome.ACCEPTED)
 REJECTED, STARTED = int(Outcome.REJECTED), int(Outcome.STARTED)
 UNDECIDED = int(Outcome.UNDECIDED)
 IN_A_ROW, AGREED, SINCE_NS, HERE, AFTER_GAP = 0, 1, 2, 3, 4
-"""Rows of `Track.counts`; HERE counts those accepted at the present epoch, and AFTER_GAP is 1 from
-a gap of the gyro until the next accepted measurement."""
+"""Indices of `Track.counts`; HERE counts measurements accepted at the present epoch, and AFTER_GAP
+is 1 from a gap of the gyro until the next accepted measurement.
+"""
 UPDATED, UNCHECKED = 1, 2
-"""Values of `Epochs.updated`."""
+"""Values of `Epochs.updated`: a confirmed and an unconfirmed update of an epoch."""
 PREDICTED = 0.25
-"""A measurement of this redundancy number or more was predicted, so that it can be checked."""
+"""Redundancy number from which a measurement was predicted well enough to be checked."""
 WIDER = 4.0
-"""How much the variance of the bias grows with each start that the next measurement rejects."""
+"""Factor on the variance of the gyro bias after each start that the next measurement rejects."""
 
 
 class Track(NamedTuple):
-    """The state while it is worked on: see `FilterState`.
+    """Working state of the filter, changed in place; see `FilterState`.
 
-    `status` (1,), `counts` (5,) by the rows above, `redundancy` (1,), `doubt_rad` (1,).
+    `status` (1,), `counts` (5,) by the indices above, `redundancy` (1,), `doubt_rad` (1,).
     """
 
     quaternion: Any
@@ -52,13 +53,13 @@ class Track(NamedTuple):
 
 
 class Epochs(NamedTuple):
-    """What is written of n epochs, after their measurements.
+    """Output arrays of the filter for n epochs, each after its measurements.
 
-    `quaternion` (n, 4), `bias` (n, 3), `rate` (n, 3) less the bias, `covariance`
-    (n, 6, 6), `doubt_rad` (n,), `status` (n,), and `shift` (n, 3), which
-    `propagation.predict` was given.  `started` (n,): the state was replaced there;
-    `updated` (n,): UPDATED where it was, or a measurement was accepted, UNCHECKED where that
-    followed a gap of the gyro and has to be confirmed as a start has, 0 elsewhere.
+    `quaternion` (n, 4), `bias` (n, 3), `rate` (n, 3) less the bias, `covariance` (n, 6, 6),
+    `doubt_rad` (n,), `status` (n,), and `shift` (n, 3), the argument of `propagation.predict`.
+    `started` (n,) is true where the state was replaced; `updated` (n,) is UPDATED there and where a
+    measurement was accepted, UNCHECKED if that followed a gap of the gyro and has to be confirmed
+    like a start, and 0 elsewhere.
     """
 
     quaternion: Any
@@ -74,7 +75,7 @@ class Epochs(NamedTuple):
 
 @njit_no_refcount
 def run_filter(track, timeline, measured, noise, epochs, innovations, work):  # type: ignore[no-untyped-def]
-    """Filter all epochs of a timeline; `track` is at their end afterwards."""
+    """Filter all epochs of a timeline; `track` is advanced in place to the last one."""
     for k in range(len(timeline.tai_ns)):
         _propagate(track, k, timeline, noise, epochs.shift[k], work)
         track.counts[HERE], after_gap = 0, track.counts[AFTER_GAP]
@@ -90,7 +91,7 @@ def run_filter(track, timeline, measured, noise, epochs, innovations, work):  # 
 
 @njit_no_refcount
 def _propagate(track, k, timeline, noise, shift, work):  # type: ignore[no-untyped-def]
-    """Bring the state to epoch k; `shift` (3,) gets the variance that was added to the bias."""
+    """Propagate the state to epoch k; `shift` (3,) receives the variance added to the bias."""
     rate = timeline.rate_rad_s[k]
     if track.status[0] == NONE:
         for i in range(3):
@@ -116,7 +117,7 @@ def _propagate(track, k, timeline, noise, shift, work):  # type: ignore[no-untyp
 
 @njit_no_refcount
 def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ignore[no-untyped-def]
-    """Take one measurement in, reject it, or start with it."""
+    """Use one measurement: accept it, reject it, or start the filter from it."""
     kind, counts = measured.kind[m], track.counts
     if track.status[0] == NONE or track.status[0] == LOST:
         if kind != ATTITUDE:
@@ -134,7 +135,7 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     sound = innovation_covariance(track.covariance, h, size, r, s, work)
     nis = chi_square(z, size, work) if sound else math.inf
     innovations.nis[m] = nis
-    # Before the start is confirmed, nothing speaks for the older measurement.
+    # Before the start is confirmed, the older measurement is no better than the new one.
     confirmed = track.redundancy[0] >= noise.start_redundancy
     gate = noise.gate_3 if size == 3 else noise.gate_2
     redundancy = 0.0
@@ -160,7 +161,7 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
     if confirmed and counts[HERE] == 0:
         _contradict(track, m, tai_ns, nis > gate, angle, measured, noise, work)
         again = tai_ns - counts[SINCE_NS] >= noise.reset_after_ns or (
-            # A young attitude has no more on its side than those that contradict it.
+            # A young attitude has less support than the measurements that contradict it.
             track.redundancy[0] < noise.established and counts[IN_A_ROW] > track.redundancy[0]
         )
     if again and kind == ATTITUDE:
@@ -172,10 +173,10 @@ def _measure(track, m, tai_ns, measured, noise, innovations, work):  # type: ign
 def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-def]
     """True if a measurement that agrees with the state may end a doubt.
 
-    It has to exclude the rival.  Of fewer rejected measurements than `confirmations`, it is
-    enough if the rival lies within the state's own covariance by now: more of them are no
-    chance, and a wide covariance holds the true attitude and the wrong one.  `work` has the
-    factor of the innovation's covariance in `small`, and keeps it.
+    The measurement has to exclude the rival attitude.  If fewer than `confirmations` measurements
+    were rejected, a rival within the state's covariance suffices; more rejections are no chance,
+    and a wide covariance may contain the true and the wrong attitude.  `work.small` holds the
+    factor of the innovation's covariance, and keeps it.
     """
     copy(work.small, work.psi)
     size, _ = innovate(track.rival, measured, m, work.dx, work.psi_square, work.small)
@@ -198,11 +199,12 @@ def _decides(track, measured, m, gate, noise, work):  # type: ignore[no-untyped-
 
 @njit_no_refcount
 def _contradict(track, m, tai_ns, rejected, angle, measured, noise, work):  # type: ignore[no-untyped-def]
-    """Begin or go on with a doubt; rejected measurements say what the attitude may be instead.
+    """Begin or continue a doubt about the attitude; rejected measurements update the rival
+    attitude.
 
-    The rival is the mean of the latest of them, and goes on with the gyro as the state does; of
-    a rival that is the last one alone, its own noise would exclude it before long.  A
-    measurement that agrees with both decides nothing.
+    The rival is the mean of the latest rejected measurements, and is propagated with the gyro like
+    the state; a rival of the last one alone would soon be excluded by its own noise.  A measurement
+    that agrees with both decides nothing.
     """
     counts = track.counts
     if counts[IN_A_ROW] == 0:
@@ -226,9 +228,9 @@ def _contradict(track, m, tai_ns, rejected, angle, measured, noise, work):  # ty
 
 @njit_no_refcount
 def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped-def]
-    """Replace the attitude by a measured one; the bias keeps its value, or its variance too.
+    """Replace the attitude by a measured one; the bias keeps its value, and its variance if known.
 
-    Where already the measurement after a start rejects it, the bias may be the reason.
+    If the first measurement after a start already rejects it, the bias may be the reason.
     """
     p = track.covariance
     is_at_once = track.status[0] == STARTING and track.redundancy[0] == 0.0
@@ -250,7 +252,7 @@ def _start(track, m, measured, noise, bias_is_known):  # type: ignore[no-untyped
 
 @njit_no_refcount
 def _accept(track, noise, work):  # type: ignore[no-untyped-def]
-    """Correct the state by `work.dx`, and end a doubt that enough measurements contradict."""
+    """Correct the state by `work.dx`, and end a doubt after enough agreeing measurements."""
     counts = track.counts
     turn(track.quaternion, work.dx[:3], track.quaternion)
     for i in range(3):
@@ -268,7 +270,7 @@ def _accept(track, noise, work):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _write(track, k, timeline, epochs):  # type: ignore[no-untyped-def]
-    """Write the state as epoch k; what there is not, is NaN."""
+    """Write the state to the output arrays of epoch k; NaN while there is no attitude."""
     known = track.status[0] != NONE
     for i in range(4):
         epochs.quaternion[k, i] = track.quaternion[i] if known else math.nan

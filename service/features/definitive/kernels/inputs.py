@@ -1,8 +1,7 @@
-"""What the filter is given beside gyro samples: settings, a motion without a gyro, measurements.
+"""Input types of the attitude filter: settings, constant-rate model, measurements.
 
-Times are nanoseconds of TAI as `Utc.tai_ns`.  Constructors raise `BadInput` naming the
-fields and values at fault; of samples and measurements the field, the row and the value of
-the first fault.
+Times are nanoseconds of TAI as `Utc.tai_ns`.  Constructors raise `BadInput` naming fields and
+values at fault; for samples and measurements the field, row and value of the first fault.
 """
 
 import math
@@ -21,16 +20,16 @@ LARGEST_SIGMA_RAD = 1.0
 
 @dataclass(frozen=True)
 class ConstantRateModel:
-    """Motion without a gyro: the rate in body axes is constant but for a random walk.
+    """Model of rotation without a gyro: a body rate that is constant except for a random walk.
 
-    `rate_walk_rad_s1_5` is the density of that walk in rad/s^1.5, `rate_sigma_rad_s`
-    one sigma of the rate when nothing is known of it.
+    `rate_walk_rad_s1_5` is the density of the random walk in rad/s^1.5, `rate_sigma_rad_s` one
+    sigma of the unknown initial rate.
 
-    The filter then runs with a measured rate of zero, so that **the bias is minus the
-    rate**: w_true = 0 - b.  A body that turns far from one measurement to the next looks
-    slower than it is, or still.  Of such a body the rates that came with its measurements
-    can be given as samples; the bias is then what they are off, `rate_sigma_rad_s` one sigma
-    of it, and `angle_walk_rad_s0_5` the density of their other errors in rad/s^.5.
+    The filter then runs with a measured rate of zero, so that **the bias is minus the rate**:
+    w_true = 0 - b.  A body that turns far between measurements seems to turn slower, or not at all.
+    For such a body the rates sent with its measurements can be passed as gyro samples; the bias is
+    then their error, `rate_sigma_rad_s` one sigma of it, and `angle_walk_rad_s0_5` the density of
+    their other errors in rad/s^.5.
     """
 
     rate_walk_rad_s1_5: float
@@ -38,7 +37,7 @@ class ConstantRateModel:
     angle_walk_rad_s0_5: float = 0.0
 
     def as_gyro(self) -> GyroModel:
-        """The gyro that always reads zero and whose bias is minus the rate; it has no gaps."""
+        """Equivalent gyro model without gaps: always reads zero, its bias is minus the rate."""
         return GyroModel(
             sigma_v_rad_s0_5=self.angle_walk_rad_s0_5,
             sigma_u_rad_s1_5=self.rate_walk_rad_s1_5,
@@ -49,21 +48,19 @@ class ConstantRateModel:
 
 @dataclass(frozen=True)
 class FilterSettings:
-    """When the filter rejects a measurement, and what it does when it rejects all of them.
+    """Thresholds of the filter for rejecting measurements, for starts, doubts and resets.
 
-    A measurement is rejected where chi-square passes its innovation with a
-    probability below `gate_tail`.  A start is confirmed once the redundancy numbers of the
-    measurements accepted since, each of which says how well the filter predicted one, add
-    up to `start_redundancy`: about four measurements where the bias is known, six where
-    it is not; at a constant rate each counts one.  Until then the gate of attitudes that
-    were predicted is `start_gate_tail`, and one that is rejected starts the filter anew.
-    `confirmations` accepted measurements in a row end a doubt.  After `reset_after_s` in
-    which everything was rejected the filter gives up its own attitude and starts from the
-    measurements: the default is longer than the hour for which a tracker may hold on to
-    wrong stars.  A young attitude is given up as soon as more reject it in a row than its
-    redundancy.  The first measurement accepted after a gap of the gyro multiplies the sum by
-    its own redundancy number.
-    An attitude with an axis worse than `lost_rad` is lost: the next one measured replaces it.
+    A measurement is rejected if the chi-square of its innovation has a probability below
+    `gate_tail`.  A start is confirmed once the redundancy numbers of the measurements accepted
+    since, each a measure of how well the filter predicted one, add up to `start_redundancy`: about
+    four measurements with a known bias, six otherwise; at a constant rate each counts one.  Until
+    then predicted attitudes are tested with `start_gate_tail`, and a rejected one restarts the
+    filter. `confirmations` accepted measurements in a row end a doubt.  After `reset_after_s` with
+    every measurement rejected the filter drops its attitude and starts from the measurements: the
+    default is longer than the hour for which a tracker may hold on to wrong stars.  A young
+    attitude is dropped as soon as more measurements in a row reject it than its redundancy.  The
+    first measurement accepted after a gyro gap multiplies the sum by its own redundancy number.  An
+    attitude with an axis worse than `lost_rad` is lost: the next measured one replaces it.
     """
 
     gate_tail: float = 1e-4
@@ -93,10 +90,10 @@ class FilterSettings:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeMeasurements:
-    """n measured attitudes: `quaternion` (n, 4), inertial to body.
+    """Array of n measured attitudes; `quaternion` (n, 4) is inertial to body.
 
-    `covariance_rad2` (n, 3, 3) is of the small rotation about the body axes.  Equal times
-    are allowed, as of several trackers.
+    `covariance_rad2` (n, 3, 3) is of the small rotation about the body axes.  Equal times are
+    allowed, as from several trackers.
     """
 
     tai_ns: Times
@@ -124,10 +121,10 @@ class AttitudeMeasurements:
 
 @dataclass(frozen=True, eq=False)
 class DirectionMeasurements:
-    """n directions, for moments at which no attitude is unique.
+    """Array of n measured star directions, used if a batch does not determine an attitude.
 
-    `body` (n, 3) are observed unit vectors in body axes, `inertial` (n, 3) those of
-    the catalog, `sigma_rad` (n,) one sigma in each of the two axes across.
+    `body` (n, 3) are observed unit vectors in body axes, `inertial` (n, 3) the catalog's,
+    `sigma_rad` (n,) one sigma in each of the two axes across.
     """
 
     tai_ns: Times
@@ -148,12 +145,12 @@ class DirectionMeasurements:
 
 
 def no_attitudes() -> AttitudeMeasurements:
-    """No measured attitude at all."""
+    """An empty array of measured attitudes."""
     return AttitudeMeasurements(np.zeros(0, dtype=np.int64), np.zeros((0, 4)), np.zeros((0, 3, 3)))
 
 
 def no_directions() -> DirectionMeasurements:
-    """No measured direction at all."""
+    """An empty array of measured directions."""
     empty = np.zeros((0, 3))
     return DirectionMeasurements(np.zeros(0, dtype=np.int64), empty, empty, np.zeros(0))
 

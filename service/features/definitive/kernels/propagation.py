@@ -1,4 +1,4 @@
-"""The state from one epoch to the next: transition matrix and process noise, compiled.
+"""Compiled propagation of the filter between epochs: transition matrix and process noise.
 
 The error state is (theta, delta b): the attitude error about the body axes in
 radians, and the error of the gyro's bias in rad/s.  At a rate w that is constant
@@ -18,19 +18,19 @@ from service.attitude.covariance import congruence
 from service.compiled.jit import njit_no_refcount
 
 SERIES_BELOW = 0.1
-"""Radians in a step, below which the differences of the closed form lose digits."""
+"""Rotation angle of a step, in radians, below which series replace the closed form."""
 CLEAR_CHANGE = 6.0
-"""A rate has changed where it differs by so many sigmas of the gyro's noise."""
+"""Change of a measured rate, in sigmas of gyro noise, that counts as real."""
 
 
 class Noise(NamedTuple):
-    """Variances of a gyro's model and limits of the filter, as plain numbers.
+    """Noise variances of a gyro model and thresholds of the filter, as plain numbers.
 
-    `angle` is sigma_v^2 in rad^2/s, `bias` sigma_u^2 in rad^2/s^3, `coast` the same
-    of the rate in a gap, `first_bias` in rad^2/s^2.  `gate_2` and `gate_3` are the
-    limits of chi-square with two and three degrees of freedom, `start_gate_3` that of
-    attitudes until a start is confirmed, for which every accepted measurement counts
-    `least_redundancy` or more.  Below `established` an attitude is young.
+    `angle` is sigma_v^2 in rad^2/s, `bias` sigma_u^2 in rad^2/s^3, `coast` the same for the rate in
+    a gap, `first_bias` in rad^2/s^2.  `gate_2` and `gate_3` are the limits of chi-square with two
+    and three degrees of freedom, `start_gate_3` the limit for attitudes until a start is confirmed,
+    for which every accepted measurement counts at least `least_redundancy`.  Below `established` an
+    attitude is young.
     """
 
     angle: float
@@ -52,13 +52,12 @@ class Noise(NamedTuple):
 
 
 class Timeline(NamedTuple):
-    """The n epochs: every time of a gyro sample or a measurement, in order.
+    """Epochs of the filter (n): all times of gyro samples and measurements, in order.
 
-    `tai_ns` (n,) as `Utc.tai_ns`.  Of the step that ends at an epoch: `step_s`
-    (n,), `rate_rad_s` (n, 3) as measured, `interval_s` (n,) the gyro interval that
-    the step is a part of, and `gap_s` (n,) the seconds from the beginning of a gap to that
-    of the step; -1 where there is no gap.  `first` (n + 1,) counts the measurements
-    before an epoch.
+    `tai_ns` (n,) as `Utc.tai_ns`.  For the step that ends at an epoch: `step_s` (n,), `rate_rad_s`
+    (n, 3) as measured, `interval_s` (n,) the gyro interval that contains the step, and `gap_s` (n,)
+    the seconds from the beginning of a gap to the beginning of the step; -1 without a gap.  `first`
+    (n + 1,) counts the measurements before an epoch.
     """
 
     tai_ns: Any
@@ -70,14 +69,13 @@ class Timeline(NamedTuple):
 
 
 class Workspace(NamedTuple):
-    """Matrices that every step writes to.
+    """Scratch matrices that every filter step overwrites.
 
-    `phi` (6, 6) is the transition; `psi` (3, 3) the integral of Psi over the step and
-    `psi_square` (3, 3) that of Psi Psi^T, as `transition` says; `product` (6, 6),
-    `gain` (6, 3), `projected` (3, 6) and `small` (3, 3) are intermediate, `partials`
-    (3, 3) those of a measurement by theta and `noise` (3, 3) its covariance.  `shift` (3,)
-    is a variance of the bias, `rate` (3,) the estimated rate, `theta` (3,) a rotation
-    vector and `dx` (6,) a correction of the state.
+    `phi` (6, 6) is the transition; `psi` (3, 3) the integral of Psi over the step and `psi_square`
+    (3, 3) the integral of Psi Psi^T, see `transition`; `product` (6, 6), `gain` (6, 3), `projected`
+    (3, 6) and `small` (3, 3) are intermediate, `partials` (3, 3) the derivatives of a measurement
+    by theta and `noise` (3, 3) its covariance.  `shift` (3,) is a variance of the bias, `rate` (3,)
+    the estimated rate, `theta` (3,) a rotation vector and `dx` (6,) a correction of the state.
     """
 
     phi: Any
@@ -96,7 +94,7 @@ class Workspace(NamedTuple):
 
 
 def workspace() -> Workspace:
-    """Room for one filter or smoother."""
+    """Allocate the scratch matrices of one filter or smoother."""
     return Workspace(
         phi=np.zeros((6, 6)),
         psi=np.zeros((3, 3)),
@@ -116,7 +114,7 @@ def workspace() -> Workspace:
 
 @njit_no_refcount
 def transition(rate, dt, work):  # type: ignore[no-untyped-def]
-    """The transition matrix of a step of `dt` seconds, and the two integrals that its noise needs.
+    """Transition matrix of a step of `dt` seconds, and the two integrals for its process noise.
 
     With W = [w x] of the rate in rad/s and Psi(t) the integral of exp(-W s) from 0 to t,
     phi = [[exp(-W dt), -Psi(dt)], [0, I]].
@@ -157,10 +155,10 @@ def transition(rate, dt, work):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def add_process_noise(q, rate, dt, gap_s, noise, work):  # type: ignore[no-untyped-def]
-    """Add to `q` (6, 6) the noise of a step of `dt` seconds, of which `work` has the transition.
+    """Add the process noise of a step of `dt` seconds to `q` (6, 6); `work` holds the transition.
 
-    In a gap, which began `gap_s` before the step, the rate is a random walk since then,
-    and along the turn the clock may have stepped.
+    Within a gap, which began `gap_s` before the step, the rate is a random walk, and the gyro's
+    clock may have stepped along the rotation.
     """
     for i in range(3):
         for j in range(3):
@@ -179,11 +177,11 @@ def add_process_noise(q, rate, dt, gap_s, noise, work):  # type: ignore[no-untyp
 
 @njit_no_refcount
 def bias_shift(anchor, rate, interval_s, noise, variance):  # type: ignore[no-untyped-def]
-    """The variance (3,) that a change of rate adds to the bias, where the gyro's scale is off.
+    """Variance (3,) that a change of rate adds to the bias, from scale and misalignment errors.
 
-    M w moves with the rate, and M is constant.  The variances of a turn that begins
-    in small steps have to add up to that of the whole change, so each step adds
-    the change of w^2.  `anchor` (3,) is the rate at the last clear change, and is moved.
+    M w changes with the rate, and M is constant.  The variances of a turn that begins in small
+    steps have to add up to the variance of the whole change, so each step adds the change of w^2.
+    `anchor` (3,) is the rate at the last clear change, and is updated.
     """
     for i in range(3):
         variance[i] = 0.0
@@ -201,10 +199,10 @@ def bias_shift(anchor, rate, interval_s, noise, variance):  # type: ignore[no-un
 
 @njit_no_refcount
 def predict(p, rate, dt, gap_s, shift, noise, work):  # type: ignore[no-untyped-def]
-    """The covariance `p` (6, 6) at the end of a step of `dt` seconds; `work` keeps the transition.
+    """Propagate the covariance `p` (6, 6) over a step of `dt` seconds; `work` keeps the transition.
 
-    `rate` (3,) is the estimated rate, `gap_s` the time from the beginning of a gap to that of
-    the step, -1 without a gap.  `shift` (3,) is added to the variance of the bias before.
+    `rate` (3,) is the estimated rate, `gap_s` the time from the beginning of a gap to the beginning
+    of the step, -1 without a gap.  `shift` (3,) is first added to the variance of the bias.
     """
     transition(rate, dt, work)
     for i in range(3):

@@ -1,4 +1,4 @@
-"""What the filter and the smoother give, and the state carried from one stretch to the next."""
+"""Output types of the attitude filter and smoother, and the state to continue from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
@@ -16,19 +16,18 @@ T = TypeVar("T", "AttitudeHistory", "Innovations", "Steps")
 
 @dataclass(frozen=True, eq=False)
 class FilterState:
-    """All that filtering needs of the past: filtering on from here gives the same bytes.
+    """State of the filter at an epoch; filtering on from it gives the same bytes.
 
-    `tai_ns` is the moment as `Utc.tai_ns`, `quaternion` (4,) inertial to body,
-    `bias_rad_s` (3,) that of the gyro, `covariance` (6, 6) of attitude error (rad, about
-    the body axes) and bias (rad/s), without what a doubt adds.  `rate_rad_s` (3,) is
-    the last measured rate, `anchor_rad_s` (3,) that at its last clear change.  `rival`
-    (4,) is the mean attitude that the rejected measurements say, where there is a doubt.
+    `tai_ns` is the time as `Utc.tai_ns`, `quaternion` (4,) inertial to body, `bias_rad_s` (3,) the
+    gyro's, `covariance` (6, 6) of attitude error (rad, about the body axes) and bias (rad/s),
+    without the part due to a doubt.  `rate_rad_s` (3,) is the last measured rate, `anchor_rad_s`
+    (3,) the rate at its last clear change.  `rival` (4,) is the mean of the attitudes that rejected
+    measurements indicate during a doubt.
 
-    `redundancy` is how far the measurements since the start support it (see
-    `FilterSettings`), up to where more make no difference; `rejected` counts those rejected
-    in a row, `agreed` those accepted since then, `rejected_since_ns` and `doubt_rad` say
-    when that began and how far off they were.  `after_gap` is true from a gap of the gyro until
-    the next accepted measurement.
+    `redundancy` is the support by measurements since the start (see `FilterSettings`), up to a
+    limit; `rejected` counts those rejected in a row, `agreed` those accepted since then,
+    `rejected_since_ns` and `doubt_rad` are the time and the largest angle of the rejections.
+    `after_gap` is true from a gap of the gyro until the next accepted measurement.
     """
 
     tai_ns: int
@@ -47,7 +46,7 @@ class FilterState:
     after_gap: bool = False
 
     def as_record(self) -> dict[str, Any]:
-        """The state as numbers and lists, for JSON, which keeps every bit of them."""
+        """Filter state as numbers and lists for JSON, without loss of digits."""
         return {
             each.name: value.tolist() if isinstance(value, np.ndarray) else value
             for each in fields(self)
@@ -56,7 +55,7 @@ class FilterState:
 
     @staticmethod
     def from_record(record: dict[str, Any]) -> "FilterState":
-        """The state of a record that `as_record` made."""
+        """Filter state from the record made by `as_record`."""
         values: dict[str, Any] = {
             name: read_only(np.array(value, dtype=np.float64)) if isinstance(value, list) else value
             for name, value in record.items()
@@ -66,14 +65,13 @@ class FilterState:
 
 @dataclass(frozen=True, eq=False)
 class Innovations:
-    """How m measurements met the prediction, in order of time.
+    """Innovations of m measurements in the filter, in order of time.
 
-    `kind` (m,) is `updates.ATTITUDE` or `DIRECTION`, `row` (m,) the row among those given
-    of that kind, `outcome` (m,) an `Outcome`.  `innovation_rad` (m, 3) with its
-    `covariance_rad2` (m, 3, 3) is the rotation about the body axes from prediction to
-    measurement; a direction has two components across it.  `nis` (m,) is z^T S^-1 z.
-    All three are NaN where there is none: beyond the second component, or where a
-    measurement met no prediction.
+    `kind` (m,) is `updates.ATTITUDE` or `DIRECTION`, `row` (m,) the row in the input of that kind,
+    `outcome` (m,) an `Outcome`.  `innovation_rad` (m, 3) with `covariance_rad2` (m, 3, 3) is the
+    rotation about the body axes from prediction to measurement; a direction has two components
+    across it.  `nis` (m,) is z^T S^-1 z.  Missing values are NaN: the third component of a
+    direction, and measurements without a prediction.
     """
 
     tai_ns: Integers
@@ -86,28 +84,28 @@ class Innovations:
 
     @property
     def degrees(self) -> Integers:
-        """Degrees of freedom (m,) of each `nis`."""
+        """Degrees of freedom (m,) of the chi-square of each innovation."""
         return np.where(self.kind == 0, 3, 2)
 
     @property
     def accepted(self) -> npt.NDArray[np.bool_]:
-        """Which were accepted (m,)."""
+        """Mask (m,) of accepted measurements."""
         return np.asarray(self.outcome == Outcome.ACCEPTED)
 
     def counts(self) -> dict[str, int]:
-        """How many had each outcome, by its name in small letters."""
+        """Number of measurements with each outcome, by its lower-case name."""
         return {each.name.lower(): int(np.sum(self.outcome == each)) for each in Outcome}
 
 
 @dataclass(frozen=True, eq=False)
 class AttitudeHistory:
-    """Attitudes at n epochs, filtered or smoothed.
+    """Filtered or smoothed attitudes at n epochs.
 
-    `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `rate_rad_s` (n, 3) of the body
-    in the step that ends at the epoch, `bias_rad_s` (n, 3) of the gyro, `status` (n,) a
-    `Status`.  `model_covariance` (n, 6, 6) of attitude error (rad, body axes) and bias
-    (rad/s) is what the model says; `doubt_rad` (n,) is how far the attitude may be off
-    beyond that, because measurements contradict it.  Where the status is NONE all are NaN.
+    `tai_ns` (n,), `quaternion` (n, 4) inertial to body, `rate_rad_s` (n, 3) of the body in the step
+    that ends at the epoch, `bias_rad_s` (n, 3) of the gyro, `status` (n,) a `Status`.
+    `model_covariance` (n, 6, 6) of attitude error (rad, body axes) and bias (rad/s) follows from
+    the model; `doubt_rad` (n,) is a further error of the attitude that contradicting measurements
+    indicate.  With status NONE all values are NaN.
     """
 
     tai_ns: Integers
@@ -120,7 +118,7 @@ class AttitudeHistory:
 
     @property
     def covariance(self) -> Vector:
-        """The covariance (n, 6, 6) to be relied on: a doubt is one more sigma about each axis."""
+        """Covariance (n, 6, 6) including doubts, each as one more sigma about every axis."""
         full = self.model_covariance.copy()
         axes = np.arange(3)
         full[:, axes, axes] += self.doubt_rad[:, None] ** 2
@@ -128,17 +126,17 @@ class AttitudeHistory:
 
     @property
     def good(self) -> npt.NDArray[np.bool_]:
-        """True for each sample (n,) whose attitude is GOOD."""
+        """Mask (n,) of epochs with status GOOD."""
         return np.asarray(self.status == Status.GOOD)
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """What the smoother needs of the steps to n epochs: see `propagation.Timeline`.
+    """Data of the steps to n epochs that the smoother needs; see `propagation.Timeline`.
 
-    `started` (n,) says where the state was replaced and `updated` (n,) where it was, or a
-    measurement was accepted (see `forward.Epochs`); `shift` (n, 3) was added to the variance of
-    the bias before the step.
+    `started` (n,) is true where the state was replaced, `updated` (n,) nonzero there and where a
+    measurement was accepted (see `forward.Epochs`); `shift` (n, 3) was added to the variance of the
+    bias before the step.
     """
 
     step_s: Vector
@@ -151,10 +149,10 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class FilterResult:
-    """The filtered attitudes, what became of the measurements, and the state at the end.
+    """Result of the filter: attitudes, outcomes of measurements, and the final state.
 
-    `outside` counts measurements that were not processed because they are before the
-    first gyro sample or after the last: those after it belong to the next stretch.
+    `outside` counts unprocessed measurements before the first gyro sample or after the last: the
+    latter belong to the next interval.
     """
 
     history: AttitudeHistory
@@ -165,15 +163,15 @@ class FilterResult:
 
     @property
     def starts(self) -> int:
-        """How often the attitude was replaced by a measured one, the first time included."""
+        """Number of starts of the filter from a measured attitude, the first included."""
         return int(np.sum(self.innovations.outcome == Outcome.STARTED))
 
 
 def joined(results: Sequence[FilterResult]) -> FilterResult:
-    """Consecutive results, each filtered from the state of the one before, as one.
+    """Join consecutive filter results, each filtered from the final state of the one before.
 
-    The rows of the innovations stay those of each part.  Raises `BadInput` where
-    there is none, or the epochs are not in order.
+    The row numbers of innovations stay relative to each part.  Raises `BadInput` without any
+    result, and for epochs out of order.
     """
     if not results:
         raise BadInput(Fault("results", "must be at least one"))
@@ -190,7 +188,7 @@ def joined(results: Sequence[FilterResult]) -> FilterResult:
 
 
 def _joined(parts: Sequence[T]) -> T:
-    """Records of arrays, one after the other."""
+    """Concatenate records of arrays field by field."""
     names = [each.name for each in fields(parts[0])]
     # Read-only as in each part: the smoother would be compiled once more for other arrays.
     joined = {

@@ -1,7 +1,7 @@
-"""The smoother: back over a finished stretch, so that every attitude knows what came after it.
+"""Smoother of filtered attitudes: a backward pass that adds the information of later data.
 
-The recursion of Rauch, Tung & Striebel (1965), with corrections of attitude as
-rotations.  It does not go across an epoch at which the filter started anew.
+The recursion of Rauch, Tung & Striebel (1965), with attitude corrections as rotations.  It stops at
+epochs at which the filter started anew.
 """
 
 from typing import Any, NamedTuple
@@ -40,7 +40,7 @@ _STEP_NS = 10**9
 
 
 class Filtered(NamedTuple):
-    """What the smoother needs of n filtered epochs and of the steps to them: see `Steps`."""
+    """Input arrays of the smoother for n filtered epochs and the steps to them; see `Steps`."""
 
     step_s: Any
     rate_rad_s: Any
@@ -53,7 +53,7 @@ class Filtered(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """What the smoother writes of n epochs: see `AttitudeHistory`."""
+    """Output arrays of the smoother for n epochs; see `AttitudeHistory`."""
 
     quaternion: Any
     bias: Any
@@ -63,7 +63,7 @@ class Smoothed(NamedTuple):
 
 
 class Matrices(NamedTuple):
-    """Room for the gain and the predicted covariance, one more (6, 6), and a quaternion."""
+    """Scratch arrays of the smoother: predicted covariance, gain, a spare (6, 6), a quaternion."""
 
     predicted: Any
     gain: Any
@@ -72,11 +72,11 @@ class Matrices(NamedTuple):
 
 
 def smooth(result: FilterResult, model: GyroModel | ConstantRateModel) -> AttitudeHistory:
-    """The smoothed attitudes of a stretch, of what the filter gave with the same model.
+    """Smooth the attitudes in the result of the filter, with the same motion model.
 
-    A stretch that was filtered in parts is put together by `result.joined`.  A doubt is taken
-    back where later measurements agreed with the attitude; where the filter gave its
-    attitude up, the doubt reaches back to the last measurement that was accepted.
+    Results filtered in parts are joined first by `result.joined`.  A doubt is removed if later
+    measurements agreed with the attitude; if the filter dropped the attitude, the doubt extends
+    back to the last accepted measurement.
     """
     gyro = model.as_gyro() if isinstance(model, ConstantRateModel) else model
     history, steps = result.history, result.steps
@@ -115,9 +115,10 @@ def smooth(result: FilterResult, model: GyroModel | ConstantRateModel) -> Attitu
 
 @njit_no_refcount
 def run_smoother(filtered, smoothed, noise, matrices, work):  # type: ignore[no-untyped-def]
-    """Smooth attitude, bias and covariance from the last epoch but one to the first.
+    """Smooth attitude, bias and covariance backward from the last epoch but one.
 
-    `smoothed` holds a copy of what was filtered.  Nothing is taken back across a start.
+    `smoothed` holds a copy of the filtered values on entry.  No information passes back across a
+    start.
     """
     gain = matrices.gain
     for k in range(len(filtered.status) - 2, -1, -1):
@@ -153,9 +154,9 @@ def run_smoother(filtered, smoothed, noise, matrices, work):  # type: ignore[no-
 
 @njit_no_refcount
 def _find_gain(filtered, k, bias, p, noise, matrices, work):  # type: ignore[no-untyped-def]
-    """The gain P phi^T P_predicted^-1 of epoch k, and the predicted covariance of the next.
+    """Smoother gain P phi^T P_predicted^-1 of epoch k, and the predicted covariance of the next.
 
-    False where that is not positive definite.
+    False if the predicted covariance is not positive definite.
     """
     for i in range(3):
         work.rate[i] = filtered.rate_rad_s[k + 1, i] - bias[i]
@@ -173,11 +174,11 @@ def _find_gain(filtered, k, bias, p, noise, matrices, work):  # type: ignore[no-
 
 @njit_no_refcount
 def settle(filtered, smoothed):  # type: ignore[no-untyped-def]
-    """Take back the doubts that later measurements ended, and confirm starts that they confirmed.
+    """Remove doubts that later measurements resolved, and confirm starts that they confirmed.
 
-    A doubt that lasted to the end of its stretch reaches back to the last accepted measurement.
-    What follows a gap of the gyro confirms no attitude before it; where nothing confirms the
-    measurement that ended a gap, nothing confirms the attitudes back to the one before.
+    A doubt that lasted to the end of its interval extends back to the last accepted measurement.
+    Data after a gyro gap confirm no attitude before it; if nothing confirms the measurement that
+    ended a gap, nothing confirms the attitudes back to the previous measurement.
     """
     n = len(filtered.status)
     lasting, confirmed, unchecked, doubt_rad = False, False, False, 0.0
@@ -201,7 +202,7 @@ def settle(filtered, smoothed):  # type: ignore[no-untyped-def]
 
 
 def compile_kernels() -> None:
-    """Compile filter and smoother by filtering and smoothing three seconds of rest."""
+    """Compile filter and smoother by running them on three seconds of a body at rest."""
     model = GyroModel(sigma_v_rad_s0_5=1e-6, sigma_u_rad_s1_5=1e-9)
     tai_ns = np.arange(4, dtype=np.int64) * _STEP_NS
     gyro = GyroSamples(tai_ns, np.zeros((4, 3)))

@@ -1,7 +1,7 @@
-"""Measurements of an attitude or of one direction, compiled.
+"""Compiled filter updates by a measured attitude or a single direction.
 
-The innovation is the rotation, in radians about the body axes, from the predicted
-attitude to the measured one; of a direction, its two parts across the predicted direction.
+The innovation is the rotation, in radians about the body axes, from the predicted attitude to the
+measured one; for a direction, two components across the predicted direction.
 """
 
 import math
@@ -12,15 +12,15 @@ from service.attitude.quaternions import rotation_between, to_matrix
 from service.compiled.jit import njit_no_refcount
 
 ATTITUDE, DIRECTION = 0, 1
-"""Kinds of measurements."""
+"""Kinds of measurements: an attitude with three components, a direction with two."""
 
 
 class Measured(NamedTuple):
-    """m measurements in order of time.
+    """Input arrays of m measurements in order of time.
 
-    `kind` (m,) is ATTITUDE or DIRECTION.  Of an attitude: `quaternion` (m, 4) and
-    `covariance` (m, 3, 3) in rad^2 about the body axes.  Of a direction: unit
-    vectors `body` and `inertial` (m, 3), and `covariance` holds sigma^2 in its diagonal.
+    `kind` (m,) is ATTITUDE or DIRECTION.  For an attitude: `quaternion` (m, 4) and `covariance` (m,
+    3, 3) in rad^2 about the body axes.  For a direction: unit vectors `body` and `inertial` (m, 3),
+    and `covariance` holds sigma^2 in its diagonal.
     """
 
     kind: Any
@@ -31,7 +31,7 @@ class Measured(NamedTuple):
 
 
 class Innovations(NamedTuple):
-    """What is written of m measurements, as `result.FilterResult` describes it."""
+    """Output arrays of the filter for m measurements; see `result.FilterResult`."""
 
     innovation: Any
     covariance: Any
@@ -41,10 +41,10 @@ class Innovations(NamedTuple):
 
 @njit_no_refcount
 def innovate(q, measured, m, z, h, small):  # type: ignore[no-untyped-def]
-    """The innovation `z` (3,) of a measurement, and its partials `h` (3, 3) by theta.
+    """Compute the innovation `z` (3,) of a measurement, and its derivatives `h` (3, 3) by theta.
 
-    Returns the number of components, and the angle between prediction and measurement
-    in radians.  `small` (3, 3) is written to.
+    Returns the number of components, and the angle between prediction and measurement in radians.
+    `small` (3, 3) is overwritten.
     """
     if measured.kind[m] == ATTITUDE:
         rotation_between(q, measured.quaternion[m], z)
@@ -84,10 +84,10 @@ def innovate(q, measured, m, z, h, small):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def add_curvature(p, r):  # type: ignore[no-untyped-def]
-    """Add to the covariance of a direction what the tangent plane leaves out, about |theta|^2 / 2.
+    """Add the error of the tangent plane, about |theta|^2 / 2, to the covariance of a direction.
 
-    Without it single stars of seconds of arc would make an attitude that is uncertain by
-    degrees as certain as they are, and wrong by minutes.
+    Without this term single stars accurate to arcseconds would make an attitude uncertain by
+    degrees appear equally accurate, though wrong by arcminutes.
     """
     trace = p[0, 0] + p[1, 1] + p[2, 2]
     for i in range(3):
@@ -96,9 +96,9 @@ def add_curvature(p, r):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def innovation_covariance(p, h, size, r, s, work):  # type: ignore[no-untyped-def]
-    """S = H P H^T + R into `s` (3, 3); `work` keeps its factor in `small` and H P in `projected`.
+    """Innovation covariance S = H P H^T + R into `s` (3, 3); `work` keeps its factor and H P.
 
-    False where S is not positive definite.
+    Returns False if S is not positive definite.
     """
     hp = work.projected
     for i in range(size):
@@ -114,7 +114,7 @@ def innovation_covariance(p, h, size, r, s, work):  # type: ignore[no-untyped-de
 
 @njit_no_refcount
 def chi_square(z, size, work):  # type: ignore[no-untyped-def]
-    """z^T S^-1 z, where `work.small` (3, 3) is the factor of S."""
+    """Normalised innovation squared z^T S^-1 z; `work.small` (3, 3) is the factor of S."""
     theta, total = work.theta, 0.0
     for i in range(size):
         theta[i] = z[i]
@@ -126,10 +126,10 @@ def chi_square(z, size, work):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def redundancy_of(r, size, work):  # type: ignore[no-untyped-def]
-    """How well the prediction checks a measurement: the mean over its components of R S^-1.
+    """Redundancy number of a measurement (Baarda, 1968): the mean over its components of R S^-1.
 
-    The redundancy number of geodesy (Baarda, 1968).  It is 0 where any measurement would
-    have been accepted, and 1 where the prediction was exact.  `work.small` has the factor of S.
+    The number is 0 if any measurement would have been accepted, and 1 for an exact prediction.
+    `work.small` has the factor of S.
     """
     theta, total = work.theta, 0.0
     for j in range(size):
@@ -142,10 +142,10 @@ def redundancy_of(r, size, work):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def correct(p, z, h, size, r, work):  # type: ignore[no-untyped-def]
-    """Correct `p` (6, 6) by a measurement, after `innovation_covariance`.
+    """Kalman update of the covariance `p` (6, 6) by a measurement, after `innovation_covariance`.
 
-    `work.dx` (6,) gets the correction of the state, and P is made anew in Joseph's form,
-    (I - K H) P (I - K H)^T + K R K^T, which stays positive definite.
+    `work.dx` (6,) receives the correction of the state, and P is updated in Joseph's form, (I - K
+    H) P (I - K H)^T + K R K^T, which stays positive definite.
     """
     for j in range(6):
         row = work.gain[j]
@@ -160,7 +160,7 @@ def correct(p, z, h, size, r, work):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def _joseph(p, gain, h, size, r, work):  # type: ignore[no-untyped-def]
-    """P becomes (I - K H) P (I - K H)^T + K R K^T, exactly symmetric."""
+    """Covariance update in Joseph's form, (I - K H) P (I - K H)^T + K R K^T, symmetric."""
     reduced, product = work.phi, work.product
     for i in range(6):
         for j in range(6):
