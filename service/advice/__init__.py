@@ -1,1 +1,1 @@
-"""The size of zones, checks of mission files, and intervals of estimates."""
+"""Advice on missions: zone sizes, checks of mission files, intervals of estimates."""

@@ -1,9 +1,8 @@
-"""Estimates with their 95 % intervals, of values that come in clusters.
+"""Estimates with 95 % intervals, for values that come in clusters (batches).
 
-The stars of a batch share its attitude, its time and its luck, so a thousand
-pairs of a hundred batches are not a thousand independent ones.  Every interval
-here counts batches: it is made wider by what the values of one batch have in
-common (Kish's design effect, or a sandwich covariance trial_of over batches).
+Stars of a batch share its attitude and its time, so a thousand pairs of a hundred batches are not a
+thousand independent ones.  Every interval here accounts for batches: it is widened by the
+correlation within a batch (Kish's design effect, or a sandwich covariance over batches).
 """
 
 import math
@@ -15,9 +14,9 @@ import numpy.typing as npt
 from service.vectors import Vector
 
 Z95 = 1.959963984540054
-"""The standard normal's 97.5 % point: both tails beyond it hold 5 %."""
+"""97.5 % point of the standard normal distribution, for two-sided 95 % intervals."""
 HUBER = 1.345
-"""Huber's bound in sigmas: 95 % efficient for Gaussian errors."""
+"""Bound of Huber's weight in sigmas, with 95 % efficiency for Gaussian errors."""
 ROUNDS = 50
 
 Clusters = npt.NDArray[np.int64]
@@ -25,23 +24,23 @@ Clusters = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Interval:
-    """An estimate with the bounds between which the true value lies with 95 % confidence."""
+    """An estimate with the bounds of its 95 % confidence interval."""
 
     value: float
     low: float
     high: float
 
     def scaled(self, factor: float) -> "Interval":
-        """The same of a positive multiple."""
+        """Interval of the estimate multiplied by a positive factor."""
         return Interval(self.value * factor, self.low * factor, self.high * factor)
 
     def holds(self, value: float) -> bool:
-        """True if a value lies between the bounds."""
+        """True if a value lies within the confidence interval."""
         return self.low <= value <= self.high
 
 
 def wilson(share: float, count: float) -> Interval:
-    """A share of `count` independent trials, by Wilson's score interval."""
+    """Wilson score interval of a share, from `count` independent trials."""
     z2 = Z95 * Z95 / count
     centre = (share + z2 / 2.0) / (1.0 + z2)
     half = Z95 * math.sqrt(share * (1.0 - share) / count + z2 / (4.0 * count)) / (1.0 + z2)
@@ -49,7 +48,7 @@ def wilson(share: float, count: float) -> Interval:
 
 
 def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
-    """Number of independent trials with the information of clustered marks (n,)."""
+    """Effective number of independent trials in clustered boolean values (n,)."""
     n, share = len(marks), float(marks.mean())
     if share in (0.0, 1.0):
         return float(n)
@@ -58,24 +57,24 @@ def effective_count(marks: npt.NDArray[np.bool_], cluster: Clusters) -> float:
     if clusters < 2:
         return 1.0
     variance = float(excess @ excess) * clusters / (clusters - 1) / n**2
-    # Never more than there are: that the marks of a batch shun each other is chance.
+    # At most the actual number: a negative correlation within batches is taken as chance.
     return min(float(n), share * (1.0 - share) / variance) if variance > 0 else float(n)
 
 
 def share_of(marks: npt.NDArray[np.bool_], cluster: Clusters) -> Interval:
-    """The share of marks (n,) that are true; clusters (n,) number the batches."""
+    """Share of true values among (n,), with a 95 % interval; clusters (n,) number the batches."""
     return wilson(float(marks.mean()), effective_count(marks, cluster))
 
 
 def quantile(values: Vector, cluster: Clusters, share: float) -> Interval:
-    """The value below which a share of all lies, with Woodruff's interval.
+    """Quantile of clustered values, with Woodruff's interval.
 
-    The bounds are the quantiles at the bounds of the share.  `high` is infinite
-    where the sample is too small to bound it.
+    The bounds are the quantiles at the bounds of the share.  `high` is infinite if the sample is
+    too small to bound it.
     """
     at = float(np.quantile(values, share))
     bounds = wilson(share, effective_count(values <= at, cluster))
-    # Beyond the last but one value nothing is known of the distribution.
+    # The sample shows nothing of the distribution above its largest values.
     bounded = bounds.high * len(values) <= len(values) - 1
     return Interval(
         at,
@@ -85,9 +84,9 @@ def quantile(values: Vector, cluster: Clusters, share: float) -> Interval:
 
 
 def median(values: Vector, confidence: float = 0.95) -> Interval:
-    """The median of independent values (n,), by the sign test: exact whatever they are drawn from.
+    """Median of independent values (n,) with the interval of the sign test, for any distribution.
 
-    Infinite bounds where no two of the values bound it with that confidence (95 %: below six).
+    The bounds are infinite with too few values for that confidence (95 %: below six).
     """
     from scipy.stats import binom
 
@@ -104,8 +103,8 @@ def median(values: Vector, confidence: float = 0.95) -> Interval:
 def robust_fit(design: Vector, values: Vector, cluster: Clusters) -> tuple[Vector, Vector]:
     """Coefficients (p,) of a robust linear fit and their covariance (p, p).
 
-    Huber's M-estimate of values (n,) on the design (n, p) by reweighted least
-    squares; the covariance is the sandwich trial_of over clusters (n,).
+    Huber's M-estimate of values (n,) on the design (n, p) by reweighted least squares; the
+    covariance is the sandwich estimate over clusters (n,).
     """
     beta = _least_squares(design, values)
     weight = np.ones(len(values))
@@ -135,6 +134,6 @@ def _least_squares(design: Vector, values: Vector) -> Vector:
 
 
 def intervals(beta: Vector, covariance: Vector) -> list[Interval]:
-    """Each coefficient of a fit with its bounds."""
+    """Coefficients of a fit with their 95 % intervals."""
     half = Z95 * np.sqrt(np.diag(covariance))
     return [Interval(float(b), float(b - h), float(b + h)) for b, h in zip(beta, half, strict=True)]

@@ -1,7 +1,7 @@
-"""Findings about a mission file: settings that are allowed but that its author rarely means.
+"""Checks of a mission file for settings that are valid but unlikely to be intended.
 
-A file that cannot be read at all is refused by `read_mission`.  The bounds here are wide
-about the shipped missions, which pass.
+A file that cannot be parsed is refused by `read_mission`.  The limits here are wide around the
+shipped missions, which pass.
 """
 
 import math
@@ -19,19 +19,19 @@ from service.vectors import separation_deg
 Level = Literal["wrong", "unusual"]
 
 LEAST_SIGMAS, MOST_SIGMAS = 3.0, 30.0
-"""A tolerance below the first loses true stars, above the second lets in chance ones."""
+"""Range of a tolerance in sigmas: below it true stars are lost, above it chance ones pass."""
 FEW_STARS = 3
-"""Fewer stars in the field of view seldom give an identification that can be trusted."""
+"""Number of stars in the field of view below which an identification is seldom reliable."""
 FEW_SHARE = 0.05
 MANY_STARS = 100
 MANY_PAIRS = 300_000
-"""Pairs of one zone: 5 MB, and as many pairs to look through for each batch."""
+"""Greatest number of pairs in one zone: 5 MB of memory, all searched for each batch."""
 SIGMAS_ARCSEC = 0.1, 120.0
 SAME_BORESIGHT_DEG = 0.1
 COELEVATION_DEG = 0.5
 CORNER_SHARE = 0.05
 OTHER_SIGMA = 3.0
-"""Ratio of the sigmas of a scan and its tracker, either way, above which they contradict."""
+"""Ratio of the sigmas of a scan and its tracker, either way, above which they disagree."""
 
 
 @dataclass(frozen=True)
@@ -45,16 +45,16 @@ class Finding:
 
 @dataclass(frozen=True)
 class TrackerView:
-    """How many stars of the run catalog a tracker sees over the whole sky."""
+    """Number of catalog stars in a tracker's field of view, over the whole sky."""
 
     tracker: str
     stars: zone_census.Spread
     few_share: float
-    """The share of the sky where it sees fewer than `FEW_STARS`."""
+    """Share of the sky with fewer than `FEW_STARS` stars in the field of view."""
 
 
 def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView]:
-    """The view of each tracker."""
+    """Star counts in the field of view of every tracker of a mission."""
     found = []
     for tracker in mission.trackers:
         view = run_catalog.direction, 0.0, _round_field_deg(tracker)
@@ -65,7 +65,7 @@ def tracker_views(mission: Mission, run_catalog: RunCatalog) -> list[TrackerView
 
 
 def _round_field_deg(tracker: Tracker) -> float:
-    """The radius of the round field of view with the area of the tracker's own."""
+    """Radius of the circular field of view with the same area as a tracker's."""
     if tracker.field_of_view_deg is None:
         return tracker.field_of_view_radius_deg
     half = [math.radians(0.5 * each) for each in tracker.field_of_view_deg]
@@ -76,7 +76,7 @@ def _round_field_deg(tracker: Tracker) -> float:
 
 
 def axis_findings(mission: Mission) -> list[Finding]:
-    """The findings about the zone's axis."""
+    """Findings on the length of the zone's axis vector."""
     length = math.hypot(*mission.zone.axis_body)
     if abs(length - 1.0) > 1e-3:
         text = f"has the length {length:g}; it is used as a direction, so check its components"
@@ -90,7 +90,7 @@ def findings(
     views: list[TrackerView],
     zones: list[zone_census.ZoneCensus],
 ) -> list[Finding]:
-    """Everything that is wrong or unusual, what is wrong first.
+    """All wrong or unusual settings of a mission, the wrong ones first.
 
     `faintest_mag` is the magnitude of the star catalog's faintest stars.
     """

@@ -1,4 +1,4 @@
-"""Stars and pairs of a mission's zones over the whole sky, counted without building a zone."""
+"""Numbers of stars and pairs in a mission's zones over the whole sky, without building zones."""
 
 import math
 from dataclasses import dataclass
@@ -12,17 +12,17 @@ from service.sky.catalog.run_catalog import RunCatalog
 from service.vectors import Vector, from_ra_dec, to_ra_dec, unit
 
 ROWS, COLUMNS = 18, 72
-"""The grid of axes: every 10 deg of declination, every 5 deg of right ascension."""
+"""Grid of zone axes: steps of 10 deg in declination and 5 deg in right ascension."""
 
 FIRST_STEP_DEG, LAST_STEP_DEG = 2.5, 0.02
 STAR_STARTS, PAIR_STARTS = 16, 8
-"""Numbers of axes of the grid from which the extremes of stars and of pairs are sought."""
+"""Numbers of grid axes from which the extremes of star and pair counts are searched."""
 AXES_AT_ONCE = 72
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The least, the median and the largest of counts over equal areas of the sky."""
+    """Least, median and largest count over equal areas of the sky."""
 
     least: int
     median: int
@@ -31,11 +31,11 @@ class Spread:
 
 @dataclass(frozen=True)
 class ZoneCensus:
-    """The contents of zones of one shape, for every axis of `axes_deg`.
+    """Counts of stars and pairs in zones of one shape, about every axis of the grid.
 
-    `stars` and `pairs` (ROWS, COLUMNS) are NCAP and NTOT; declination falls along the
-    rows, right ascension grows along the columns.  `of` says which shape that is.
-    `spread` is that of both over the whole sky, and `richest` the axis with the most pairs.
+    `stars` and `pairs` (ROWS, COLUMNS) are NCAP and NTOT; declination falls along the rows, right
+    ascension grows along the columns.  `of` names the shape.  `spread` has least, median and most
+    of both over the whole sky, and `richest` is the axis with the most pairs.
     """
 
     of: str
@@ -47,18 +47,17 @@ class ZoneCensus:
     richest: Vector
 
     def richest_deg(self) -> tuple[float, float]:
-        """Right ascension and declination of the axis with the most pairs."""
+        """Right ascension and declination of the zone axis with the most pairs, in degrees."""
         ra_deg, dec_deg = to_ra_dec(self.richest)
         return float(ra_deg), float(dec_deg)
 
 
 class Extremes:
-    """The fewest and the most stars or pairs of a zone whose axis may lie anywhere.
+    """Search for the fewest and the most stars or pairs in a zone about any axis.
 
-    They are sought from the poorest and the richest axes of the grid: of 24 axes about each, to
-    half the distance between rows at first, the best is taken, and the steps are halved where
-    none is better.  Counts jump from one axis to the next, so an extreme is not proven; no random
-    axis of 100,000 exceeds one.
+    The search starts from the poorest and richest axes of the grid: the best of 24 axes about each
+    is taken, at first half a row apart, and the steps are halved if none is better.  Counts jump
+    between axes, so an extreme is not proven; none of 100,000 random axes exceeds one.
     """
 
     def __init__(
@@ -69,11 +68,11 @@ class Extremes:
         self._limit_deg = limit_deg
 
     def stars(self, counts: Vector, most: bool) -> tuple[int, Vector]:
-        """The extreme of NCAP and its axis; `counts` (ROWS, COLUMNS) are those of the grid."""
+        """Extreme number of stars (NCAP) and its axis; `counts` (ROWS, COLUMNS) are the grid's."""
         return self._best(counts, STAR_STARTS, most, pairs=False)
 
     def pairs(self, counts: Vector, most: bool) -> tuple[int, Vector]:
-        """The extreme of NTOT and its axis; `counts` need only be roughly those of the grid."""
+        """Extreme number of pairs (NTOT) and its axis; rough grid `counts` suffice."""
         return self._best(counts, PAIR_STARTS, most, pairs=True)
 
     def _best(self, counts: Vector, starts: int, most: bool, pairs: bool) -> tuple[int, Vector]:
@@ -94,7 +93,7 @@ class Extremes:
         return count, axis
 
     def _counts(self, axes: Vector, step_deg: float, pairs: bool) -> Vector:
-        """The stars or pairs of zones about axes no farther than a step from the first."""
+        """Numbers of stars or pairs in zones about axes at most one step from the first."""
         least_deg, most_deg = self._bounds_deg
         wide = _inside(self._direction @ axes[0], least_deg - step_deg, most_deg + step_deg)
         near = self._direction[wide]
@@ -109,7 +108,7 @@ class Extremes:
 
 
 def _axes_about(axis: Vector, step_deg: float) -> Vector:
-    """Unit vectors (24, 3) about an axis, at a step and at half of it by turns."""
+    """Unit vectors (24, 3) around an axis, alternately at half a step and a full step."""
     first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
     turn = np.arange(24)[:, None] * math.pi / 12.0
@@ -120,21 +119,21 @@ def _axes_about(axis: Vector, step_deg: float) -> Vector:
 
 
 def _inside(cosine: Vector, least_deg: float, most_deg: float) -> npt.NDArray[np.bool_]:
-    """Marks of the cosines of angles between two bounds."""
+    """Mask of cosines whose angles lie between two bounds."""
     near = math.cos(math.radians(least_deg)) if least_deg > 0.0 else 2.0
     far = math.cos(math.radians(most_deg)) if most_deg < 180.0 else -2.0
     return (cosine <= near) & (cosine >= far)
 
 
 def axes_deg() -> tuple[Vector, Vector]:
-    """Right ascensions (COLUMNS,) and declinations (ROWS,) of the grid, in degrees."""
+    """Right ascensions (COLUMNS,) and declinations (ROWS,) of the axis grid, in degrees."""
     ra_deg = (np.arange(COLUMNS) + 0.5) * 360.0 / COLUMNS
     dec_deg = 90.0 - (np.arange(ROWS) + 0.5) * 180.0 / ROWS
     return ra_deg, dec_deg
 
 
 def zone_censuses(mission: Mission, run_catalog: RunCatalog) -> list[ZoneCensus]:
-    """A census for each shape of zone: of a cap one, of a band one for each coelevation."""
+    """Census of a mission's zones by shape: one for caps, one per coelevation for bands."""
     zone = mission.zone
     if not isinstance(zone, Band):
         shapes = {f"cap of {zone.radius_deg:g} deg": (0.0, zone.radius_deg)}
@@ -164,14 +163,14 @@ def _census(
 
 
 def star_spread(sky: Extremes, counts: Vector) -> Spread:
-    """The spread of the stars of zones, or of fields of view, by their counts over the grid."""
+    """Least, median and most stars of zones or fields of view, from counts over the grid."""
     least, _ = sky.stars(counts, most=False)
     most, _ = sky.stars(counts, most=True)
     return Spread(least, median_of(counts), most)
 
 
 def star_counts(direction: Vector, least_deg: float, most_deg: float) -> Vector:
-    """The stars (ROWS, COLUMNS) between two angles from each axis of the grid."""
+    """Numbers of stars (ROWS, COLUMNS) between two angles from each grid axis."""
     axes = axes_of_sky()
     counts = [
         _inside(axes[first : first + AXES_AT_ONCE] @ direction.T, least_deg, most_deg).sum(axis=1)
@@ -190,7 +189,7 @@ def _tree_of(direction: Vector) -> Any:
 def zone_counts(
     direction: Vector, axis: Vector, least_deg: float, most_deg: float, limit_deg: float
 ) -> tuple[int, int]:
-    """Stars between two angles from an axis, and their pairs not farther apart than a limit."""
+    """Number of stars between two angles from an axis, and of their pairs within a separation."""
     inside = direction[_inside(direction @ axis, least_deg, most_deg)]
     if len(inside) == 0:
         return 0, 0
@@ -201,12 +200,12 @@ def zone_counts(
 
 
 def share_below(counts: Vector, least: int) -> float:
-    """The share of the sky where a count is below `least`."""
+    """Share of the sky where a count over the grid is below `least`."""
     return float(_weights()[counts.ravel() < least].sum())
 
 
 def median_of(counts: Vector) -> int:
-    """The median over the sky of counts over the grid."""
+    """Median over the sky of counts over the grid, weighted by area."""
     flat = counts.ravel()
     order = np.argsort(flat)
     return int(flat[order][np.searchsorted(np.cumsum(_weights()[order]), 0.5)])
@@ -221,13 +220,13 @@ def _counts(
 
 
 def axes_of_sky() -> Vector:
-    """The axes of the grid as unit vectors (ROWS * COLUMNS, 3), row by row."""
+    """Unit vectors (ROWS * COLUMNS, 3) of the grid axes, row by row."""
     ra_deg, dec_deg = axes_deg()
     return from_ra_dec(np.tile(ra_deg, ROWS), np.repeat(dec_deg, COLUMNS))
 
 
 def _weights() -> Vector:
-    """The share of the sky of each axis: rows near a pole cover less."""
+    """Share of the sky that each grid axis represents; rows near a pole cover less."""
     _, dec_deg = axes_deg()
     weight = np.repeat(np.cos(np.radians(dec_deg)), COLUMNS)
     return np.asarray(weight / weight.sum())

@@ -1,15 +1,14 @@
-"""The size of a mission's zones: what one costs in pairs and memory, and what a priori errors need.
+"""Size of a mission's zones: cost in pairs and memory, and size for the a priori errors.
 
-A zone must hold the field of view about any attitude that the a priori one may stand for, so
-its radius (of a band: its half width) is that of the field of view and the error together.
-The most stars and pairs of such a zone are sought over the whole sky.
+A zone must contain the field of view about any attitude within the a priori error, so its radius
+(for a band: half width) is the sum of field of view and error.  The largest star and pair counts of
+such zones are searched over the whole sky.
 
-Pairs are estimated before a zone is built.  Equation 1 of Fink & Shoup (1994) is
-NTOT = k_g (NCAP² - NCAP) / 2.  Their equation 2 takes the stars to be spread evenly, and its
-k_g is a bound rather than an estimate.  Here the pairs of a zone come from what each of its
-stars has about it, in rings as far as HMAX: the number of neighbours, and to which side most of
-them lie.  Of these the share is taken that the shape of the zone leaves inside, which makes the
-k_g of that place.  No pair of a zone is looked at.
+Pairs are estimated before a zone is built.  Equation 1 of Fink & Shoup (1994) is NTOT = k_g (NCAP²
+- NCAP) / 2.  Their equation 2 assumes evenly spread stars, and its k_g is a bound rather than an
+estimate.  Here the pairs of a zone follow from the surroundings of each star, in rings up to HMAX:
+the number of neighbours, and the side on which most of them lie.  The share of neighbours inside
+the zone's shape is counted, which gives the local k_g.  No pair of a zone is looked at.
 """
 
 import math
@@ -30,22 +29,22 @@ from service.vectors import Vector, to_ra_dec
 Verdict = Literal["too_few", "fits", "too_small", "larger_than_needed"]
 
 LEAST_BATCHES = 50
-"""Fewer errors say too little of the rare large ones."""
+"""Least number of recorded a priori errors: fewer show too little of the rare large ones."""
 USUAL_PERCENT = 90.0
 GROSS = 3.0
-"""Times that percentile: an error beyond it is a failure of its source, which no zone mends."""
+"""Multiple of the 90 % point above which an a priori error is a failure of its source."""
 RESERVE = 1.2
-"""Times the largest usual error that was seen: the next one may be larger."""
+"""Factor on the largest usual error observed, since a later one may be larger."""
 TOO_LARGE = 1.5
-"""Times the size with that reserve."""
+"""Ratio of present to needed zone size above which the zone is called too large."""
 CERTAIN_SIGMAS = 4.0
-"""Sigmas of the found attitude by which an error must exceed the zone's room to count."""
+"""Sigmas of the found attitude by which an a priori error must exceed the zone to count."""
 LARGEST_DEG = {"cap": 180.0, "band": 90.0}
 
 
 @dataclass(frozen=True)
 class ZoneCost:
-    """The largest zones of one size that the sky has.
+    """Largest star and pair counts of zones of one size, over the whole sky.
 
     `stars` is the most NCAP, `pairs` the most NTOT as counted, of a zone about another axis;
     `k_g` is the paper's approximation (equation 2) and `pairs_by_k_g` what it makes of NCAP
@@ -59,16 +58,16 @@ class ZoneCost:
 
     @property
     def pairs_by_k_g(self) -> int:
-        """NTOT by equation 1 of Fink & Shoup (1994)."""
+        """Number of pairs NTOT by equation 1 of Fink & Shoup (1994)."""
         return round(self.k_g * self.stars * (self.stars - 1) / 2.0)
 
 
 @dataclass(frozen=True)
 class AprioriErrors:
-    """How far a priori attitudes were from those found.
+    """Statistics of the angles between a priori and found attitudes.
 
-    `gross` of them are errors beyond what is usual; `usual_deg` is the largest of the others.
-    `beyond` of these exceed the room of the zone by more than the found attitude's own error.
+    `gross` counts unusually large errors; `usual_deg` is the largest of the others.  `beyond` of
+    these exceed the margin of the zone by more than the found attitude's own error.
     """
 
     batches: int
@@ -81,11 +80,11 @@ class AprioriErrors:
 
 @dataclass(frozen=True)
 class ZoneSize:
-    """The size of a zone beside what was recorded.
+    """Present size of a zone compared with recorded a priori errors.
 
-    `setting` is its key in the mission file; `margin_deg` is the error that it leaves room
-    for.  `covering_deg` is the size for the usual errors with a reserve, None without enough
-    of them.
+    `setting` is its key in the mission file; `margin_deg` is the largest error that the zone
+    covers.  `covering_deg` is the size for the usual errors with a reserve, None with too few of
+    them.
     """
 
     setting: str
@@ -98,17 +97,17 @@ class ZoneSize:
 
     @property
     def sizes_deg(self) -> list[float]:
-        """The present size and the one that covers the errors, ascending."""
+        """Present zone size and the size that covers the errors, ascending, without repeats."""
         return sorted({self.size_deg, self.covering_deg or self.size_deg})
 
 
 def zone_size(
     mission: Mission, angles_deg: Sequence[float], sigmas_deg: Sequence[float]
 ) -> ZoneSize:
-    """Advice on the size of a mission's zone.
+    """Judge the size of a mission's zone from recorded a priori errors.
 
-    `angles_deg` are the recorded angles from a priori to found attitudes, `sigmas_deg` the
-    standard deviations of the found ones.
+    `angles_deg` are the recorded angles from a priori to found attitudes, `sigmas_deg` the standard
+    deviations of the found ones.
     """
     is_band = isinstance(mission.zone, Band)
     setting = "zone.half_width_deg" if is_band else "zone.radius_deg"
@@ -139,7 +138,7 @@ def zone_size(
 
 
 def zone_cost(mission: Mission, direction: Vector, size_deg: float) -> ZoneCost:
-    """The most stars and the most pairs of a zone of this size.
+    """Largest star and pair counts over the sky for zones of a given size.
 
     `direction` (n, 3) is the run catalog's.
     """
@@ -153,7 +152,8 @@ def zone_cost(mission: Mission, direction: Vector, size_deg: float) -> ZoneCost:
 
 
 def geometric_k_g(mission: Mission, size_deg: float) -> float:
-    """Equation 2 of Fink & Shoup (1994): thrice the field of view's area over the zone's.
+    """Factor k_g by equation 2 of Fink & Shoup (1994): thrice the field of view's area over the
+    zone's.
 
     The areas are those of flat circles and strips, as in the paper's tables 13 and 14; a share
     is at most 1.
@@ -172,7 +172,7 @@ def _size_deg(mission: Mission) -> float:
 
 
 def _bounds_deg(mission: Mission, size_deg: float) -> tuple[float, float]:
-    """The angles from the zone's axis between which its stars lie."""
+    """Angles from the zone's axis between which its stars lie, in degrees."""
     zone = mission.zone
     if not isinstance(zone, Band):
         return 0.0, size_deg
@@ -200,18 +200,18 @@ def _errors(
 
 
 RINGS = 4
-"""The number of rings of equal area about a star."""
+"""Number of rings of equal area about a star."""
 ANGLES, STEPS, BEARINGS = 240, 8, 48
-"""Steps across a zone, of a ring outwards and of half a turn about a star."""
+"""Numbers of steps across a zone, outward within a ring, and over half a turn about a star."""
 NEIGHBOURS_AT_ONCE = 4_000_000
 VOXEL_BITS_PER_STAR = 128
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """The number of other stars about each star of a run catalog, ring by ring as far as HMAX.
+    """Numbers of neighbours of each star in a run catalog, in rings up to HMAX.
 
-    `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of their unit vectors.
+    `count` is (n, RINGS), `total` (n, RINGS, 3) the sum of the neighbours' unit vectors.
     """
 
     direction: Vector
@@ -222,10 +222,10 @@ class Neighbours:
 
 @dataclass(frozen=True)
 class Shape:
-    """A zone's bounds, and what they leave inside of the rings about a star.
+    """Bounds of a zone, and the part of the rings about a star that lies inside.
 
-    For stars at `cosine` (k,) from the axis, ascending: `share` (k, RINGS) of a ring's area, and
-    `slope` (k, RINGS), the pull of the neighbours towards the axis that is left inside.
+    For stars at `cosine` (k,) from the axis, ascending: `share` (k, RINGS) is the share of a ring's
+    area inside, and `slope` (k, RINGS) the weight of neighbours concentrated towards the axis.
     """
 
     least_deg: float
@@ -237,7 +237,8 @@ class Shape:
 
 @dataclass(frozen=True)
 class ZoneEstimate:
-    """Zones of one shape over the sky: `pairs` (NTOT) are predicted, `stars` (NCAP) counted.
+    """Estimate for zones of one shape over the sky: `pairs` (NTOT) predicted, `stars` (NCAP)
+    counted.
 
     `pairs_counted` is the most pairs that a zone of the sky holds, `richest_deg` its axis (right
     ascension, declination); `pairs.most` and `k_g`, the share of pairs, are predicted there.
@@ -261,7 +262,7 @@ class ZoneEstimate:
 
 
 def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
-    """The neighbours of each of unit vectors (n, 3) within an angle."""
+    """Count the neighbours of unit vectors (n, 3) within an angle, by rings."""
     from scipy.spatial import cKDTree
 
     tree: Any = cKDTree(direction)
@@ -285,7 +286,7 @@ def neighbours_of(direction: Vector, limit_deg: float) -> Neighbours:
 
 
 def shape_of(least_deg: float, most_deg: float, limit_deg: float) -> Shape:
-    """The shape of zones between two angles from their axes."""
+    """Compute the shape of zones between two angles from their axes."""
     inner, outer = np.cos(np.radians((least_deg, most_deg)))
     cosine = np.linspace(outer, inner, ANGLES)
     # Parts of equal area of the disc, ring by ring, and bearings from the axis to the far side.
@@ -305,7 +306,7 @@ def shape_of(least_deg: float, most_deg: float, limit_deg: float) -> Shape:
 
 
 def predicted(neighbours: Neighbours, shape: Shape, axis: Vector) -> tuple[int, float]:
-    """The stars of a zone about an axis, counted, and its pairs, predicted."""
+    """Number of stars in a zone about an axis, counted, and of its pairs, predicted."""
     direction = neighbours.direction
     # Rounded, the axis itself may be outside of its zone.
     cosine = np.clip(direction @ axis, -1.0, 1.0)
@@ -325,7 +326,7 @@ def predicted(neighbours: Neighbours, shape: Shape, axis: Vector) -> tuple[int, 
 
 
 def zone_bytes(stars: int, pairs: float, is_band: bool) -> int:
-    """The memory of a zone, as its arrays are laid out."""
+    """Memory of a zone in bytes, from the layout of its arrays."""
     # Rows, directions twice, magnitudes twice; the buckets with rows and directions of their own.
     star_bytes = 4 + 24 + 8 + 32 + 4 + 24 + (8 if is_band else 0)
     buckets = 1 << max(4, math.ceil(math.log2(max(1, BUCKETS_PER_STAR * stars))))
@@ -339,9 +340,9 @@ def zone_bytes(stars: int, pairs: float, is_band: bool) -> int:
 def zone_estimates(
     mission: Mission, run_catalog: RunCatalog, neighbours: Neighbours
 ) -> list[ZoneEstimate]:
-    """An estimate for each shape of a mission's zones: of a cap one, of a band one a coelevation.
+    """Estimates of a mission's zones by shape: one for caps, one per coelevation for bands.
 
-    `neighbours` are those of the run catalog as far as the mission's HMAX.
+    `neighbours` are those of the run catalog up to the mission's HMAX.
     """
     zone, axes = mission.zone, zone_census.axes_of_sky()
     is_band = isinstance(zone, Band)
@@ -397,7 +398,7 @@ def _all_pairs(stars: float) -> float:
 
 
 def _bounds(mission: Mission) -> list[tuple[str, float, float]]:
-    """The shapes of a mission's zones: what each is, and the angles from the axis it lies between.
+    """Shapes of a mission's zones: description, and the two angles from the axis.
 
     Trackers at one coelevation share a band.
     """

@@ -1,1 +1,1 @@
-"""Tables as files: CSV, Parquet and FITS."""
+"""Writers of tables as files: CSV, Parquet and FITS."""

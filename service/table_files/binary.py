@@ -1,7 +1,7 @@
-"""Tables as Parquet, and as a FITS binary table (FITS standard 4.0).
+"""Writers of tables in Parquet, and as a FITS binary table (FITS standard 4.0).
 
-Beside a time as text stands `timestamp`, the same as a number that programs compute with.  It
-has no leap seconds: of one, and of the second after it, it is the same.
+Next to each time as text is a column `timestamp` with the time as a number.  It has no leap
+seconds: a leap second and the second after it have the same value.
 """
 
 from collections.abc import Iterator, Sequence
@@ -15,11 +15,11 @@ from service.table_files.table import Column, Page, Table
 from service.times import DAY_S
 
 ROWS_IN_GROUP = 1 << 14
-"""Kept in memory until they are written."""
+"""Number of rows in a Parquet row group, held in memory until written."""
 
 
 def write_parquet(table: Table) -> Iterator[bytes]:
-    """Write a table; what it is of stands in the metadata of the file."""
+    """Write a table as Parquet, with its description in the file's metadata."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -50,7 +50,7 @@ def write_parquet(table: Table) -> Iterator[bytes]:
 
 
 def _stamps(texts: Sequence[str]) -> npt.NDArray[np.datetime64]:
-    """UTC texts as POSIX times; a leap second is the second after it."""
+    """Convert UTC texts to POSIX times; a leap second becomes the second after it."""
     shown = np.array([text.rstrip("Z").replace(":60", ":59") for text in texts], "datetime64[ns]")
     shown[[text[16:19] == ":60" for text in texts]] += np.timedelta64(1, "s")
     return shown
@@ -62,7 +62,7 @@ def _described(column: Column) -> dict[str, str]:
 
 
 class _Sink:
-    """A file that is given on as it is written."""
+    """Output file whose content is handed on as it is written."""
 
     closed = False
 
@@ -71,7 +71,7 @@ class _Sink:
         self._size = 0
 
     def write(self, data: Any) -> int:
-        """Keep a piece."""
+        """Buffer a piece written by pyarrow."""
         self._pieces.append(bytes(data))
         self._size += len(self._pieces[-1])
         return len(self._pieces[-1])
@@ -83,7 +83,7 @@ class _Sink:
         return text
 
     def tell(self) -> int:
-        """How much was written in all."""
+        """Total number of bytes written."""
         return self._size
 
     def flush(self) -> None:
@@ -107,15 +107,15 @@ _DAY_NS = DAY_S * 10**9
 _J2000_MJD = 51_544
 _FORMATS = {"number": ("D", ">f8"), "integer": ("K", ">i8"), "flag": ("L", "S1")}
 _NAMES = {"time": "UTC"}
-"""Names of columns that FITS, which does not tell capitals apart, has another use for."""
+"""Renamed columns, since FITS ignores case and reserves the name for another use."""
 _UNITS = {"ppm": "10**-6", "1": "", "1/h": "h**-1"}
-"""Units that FITS does not know by their name."""
+"""FITS notation of units that FITS does not know by name."""
 _TIME = Column("TIME", unit="s", description="Terrestrial Time since MJDREFI + MJDREFF.")
 _VALID = Column("VALID", "flag", description="Whether every value of the row is known.")
 
 
 def write_fits(table: Table) -> Iterator[bytes]:
-    """Write a table, which is kept in a temporary file until its number of rows is known."""
+    """Write a table as FITS; rows are kept in a temporary file until their number is known."""
     has_time = "tai_ns" in table.names
     columns = [*([_TIME] if has_time else []), *table.columns, _VALID]
     dtype = np.dtype([(each.name, _format_of(each)[1]) for each in columns])
@@ -135,7 +135,7 @@ def write_fits(table: Table) -> Iterator[bytes]:
 
 
 def _format_of(column: Column) -> tuple[str, str]:
-    """The format of a column in FITS, and in numpy."""
+    """Format codes of a column in FITS and numpy."""
     if column.kind in ("text", "utc"):
         return f"{column.width}A", f"S{column.width}"
     return _FORMATS[column.kind]

@@ -1,4 +1,4 @@
-"""The output formats of tables; see `TABLE_FORMATS`.
+"""Output formats of tables; see `TABLE_FORMATS`.
 
 Everything that names formats derives from it: the parameters `format` of the API, their
 media types in the OpenAPI document, the links of the console, `acquire history --format`
@@ -15,7 +15,7 @@ from service.extras import require_extra
 from service.table_files.table import Table, write_csv
 
 MOST_BATCHES = 5_000_000
-"""The most batches of a period that are kept in a temporary file: up to 400 bytes each."""
+"""Greatest number of batches in a temporary file, up to 400 bytes each."""
 
 Writer = Callable[[Any], Iterator[bytes]]
 T = TypeVar("T")
@@ -23,13 +23,12 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class OutputFormat:
-    """A way to write a table or attitudes; `title` is its name for people.
+    """An output format of tables or attitudes; `title` is its displayed name.
 
-    `suffix` is that of a file, by default the name of the format.  `extra` is the extra of this
-    project that the format needs, with the `package` that tells whether it is installed.
-    A format of `any_order` takes rows in descending order of time too; one that `may_be_empty`
-    can hold none.  A format that keeps rows in a temporary file takes periods of `most_batches`
-    at most.
+    `suffix` is the file's, by default the name of the format.  `extra` is the extra of this project
+    that the format needs, with the `package` that shows if it is installed.  A format with
+    `any_order` also accepts rows in descending order of time; one with `may_be_empty` accepts no
+    rows.  A format that keeps rows in a temporary file accepts at most `most_batches`.
     """
 
     title: str
@@ -43,12 +42,12 @@ class OutputFormat:
     most_batches: int | None = None
 
     def require(self, name: str) -> None:
-        """Raise `NotAvailable` with the command that installs what the format lacks."""
+        """Raise `NotAvailable` with the command that installs the missing package."""
         require_extra(self.extra, self.package, "format", name)
 
 
 def write_table(name: str, table: Table) -> Iterator[bytes]:
-    """A table in a format, in pieces; raises `NotAvailable` where a package is missing."""
+    """Write a table in a format, in pieces; raises `NotAvailable` if a package is missing."""
     written = TABLE_FORMATS[name]
     written.require(name)
     _, pages = read_ahead(table.pages)
@@ -56,9 +55,9 @@ def write_table(name: str, table: Table) -> Iterator[bytes]:
 
 
 def read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
-    """A flag that is true if there is none, and the pages, of which the first is read at once.
+    """Read the first page at once; returns True if there is none, and all pages.
 
-    Errors of the database are raised here, and not when part of a file is sent already.
+    Database errors are raised here, rather than after part of a file was sent.
     """
     rest = iter(pages)
     first = list(islice(rest, 1))
@@ -66,12 +65,12 @@ def read_ahead(pages: Iterable[T]) -> tuple[bool, Iterator[T]]:
 
 
 def imported_later(writer: str) -> Writer:
-    """A writer such as `package.module:name`, imported when called: printing help loads none."""
+    """Writer named `package.module:name`, imported when first called to save start-up time."""
     return lambda content: resolve_name(writer)(content)
 
 
 JSON_FORMAT = "json"
-"""The name of the API's own form, which is no table."""
+"""Name of the API's JSON format, which is no table format."""
 
 TABLE_FORMATS: dict[str, OutputFormat] = {
     "csv": OutputFormat("CSV", "text/csv", write_csv),
@@ -91,4 +90,4 @@ TABLE_FORMATS: dict[str, OutputFormat] = {
         most_batches=MOST_BATCHES,
     ),
 }
-"""The output formats of tables by name."""
+"""Output formats of tables by name."""

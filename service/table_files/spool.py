@@ -1,4 +1,4 @@
-"""Temporary files for what must be known whole before its first byte is written."""
+"""Temporary files for output whose beginning depends on its end."""
 
 import shutil
 import tempfile
@@ -7,19 +7,19 @@ from contextlib import contextmanager
 from typing import IO
 
 IN_MEMORY_BYTES = 4 << 20
-"""More than this is kept on the disk."""
+"""Size in bytes above which a temporary file is kept on disk instead of in memory."""
 PIECE_BYTES = 256 << 10
 
 
 @contextmanager
 def spool() -> Iterator[IO[bytes]]:
-    """A file without a name, which is gone at the end."""
+    """Context manager of an unnamed temporary file."""
     with tempfile.SpooledTemporaryFile(IN_MEMORY_BYTES) as file:
         yield file
 
 
 def pieces(file: IO[bytes]) -> Iterator[bytes]:
-    """All that was written to a file, from its beginning."""
+    """Content of a file from its beginning, in pieces."""
     file.seek(0)
     while piece := file.read(PIECE_BYTES):
         yield piece
@@ -27,7 +27,7 @@ def pieces(file: IO[bytes]) -> Iterator[bytes]:
 
 @contextmanager
 def folder() -> Iterator[str]:
-    """A folder, which is removed at the end with all that it holds."""
+    """Context manager of a temporary folder, removed at the end with its content."""
     place = tempfile.mkdtemp(prefix="acquire-export-")
     try:
         yield place

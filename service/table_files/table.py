@@ -1,4 +1,4 @@
-"""Tables: columns with units and frames, and their values page by page."""
+"""Tables: columns with units and frames, and values page by page; CSV writer."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,15 +15,15 @@ if TYPE_CHECKING:
 
 Kind = Literal["number", "integer", "flag", "text", "utc"]
 Page = Sequence[Sequence[Any]]
-"""The values of each column, in the order of the columns; None: not known."""
+"""Values of a page, one sequence per column; None: unknown."""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its name, what it holds, its unit, and the frame that its components are in.
+    """A table column: name, kind of values, unit, and reference frame of components.
 
-    `width` is the greatest number of bytes of a text, for formats with fields of fixed width.
-    The kind `utc` is a text, too: only a text can hold a leap second.
+    `width` is the greatest number of bytes of a text, for formats with fixed field widths.  The
+    kind `utc` is a text, too: only a text can hold a leap second.
     """
 
     name: str
@@ -36,7 +36,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Table:
-    """Columns, their values page by page, and `about`: where the table comes from."""
+    """A table: columns, values page by page, and metadata on its origin (`about`)."""
 
     columns: Sequence[Column]
     pages: Iterable[Page]
@@ -44,14 +44,14 @@ class Table:
 
     @property
     def names(self) -> list[str]:
-        """The names of the columns."""
+        """Names of the columns, in order."""
         return [each.name for each in self.columns]
 
 
 def write_csv(table: Table) -> Iterator[bytes]:
-    """Write CSV as RFC 4180 has it, a line for the names of the columns first.
+    """Write a table as CSV (RFC 4180), with a first line of column names.
 
-    A text that a spreadsheet would take for a formula has an apostrophe before it.
+    Texts that a spreadsheet would read as a formula are prefixed with an apostrophe.
     """
     yield f"{','.join(_csv_texts(table.names))}\r\n".encode()
     for page in table.pages:
@@ -69,7 +69,7 @@ def write_csv(table: Table) -> Iterator[bytes]:
 
 
 def _csv_texts(values: Sequence[object]) -> list[str]:
-    """Values as fields: what is not known as nothing."""
+    """Convert values to CSV fields; unknown ones are empty."""
     texts = ["" if value is None else str(value) for value in values]
     # Most columns need no quotes: one search over all of a column is faster than one a field.
     return texts if NEEDS_QUOTES.search("".join(texts)) is None else [*map(quoted, texts)]
@@ -79,9 +79,9 @@ _ENCODER = msgspec.json.Encoder()
 
 
 def number_texts(values: Sequence[float | None], unknown: str = "null") -> list[str]:
-    """Each number as the shortest such text; `unknown` for None and NaN.
+    """Shortest text of each number that reads back unchanged; `unknown` for None and NaN.
 
-    In one piece this takes a fifth of the time of `repr`.
+    Encoding all at once takes a fifth of the time of `repr`.
     """
     if not values:
         return []
@@ -90,6 +90,6 @@ def number_texts(values: Sequence[float | None], unknown: str = "null") -> list[
 
 
 def rows_of_texts(values: "Vector") -> list[tuple[str, ...]]:
-    """The numbers of an array (n, k) as texts, a row each, k > 0."""
+    """Numbers of an array (n, k), k > 0, as texts, one tuple per row."""
     texts = iter(number_texts(values.ravel().tolist()))
     return list(zip(*[texts] * values.shape[1], strict=True))

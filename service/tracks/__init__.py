@@ -1,1 +1,1 @@
-"""Tracks of observed points that no catalog star explains, linked over the batches of a stretch."""
+"""Tracks of moving objects: observed points without a catalog star, linked over batches."""

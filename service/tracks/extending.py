@@ -1,8 +1,7 @@
-"""Two points followed from batch to batch: the kernel behind the linking.
+"""Compiled kernel that follows the motion of two points from batch to batch.
 
-The two give a great circle.  Along it a motion is an angle that grows with time, across it a
-small angle; each is a straight line in the elapsed time, fitted anew with every point that
-is taken.
+The two points give a great circle.  Along it a motion is an angle that grows with time, across it a
+small angle; both are straight lines in the elapsed time, fitted again with every point taken.
 """
 
 import math
@@ -14,19 +13,19 @@ import numpy.typing as npt
 from service.compiled.jit import njit_inlined, njit_no_refcount
 
 GATE = 16.0
-"""Chi-square with two degrees of freedom that a point of the motion exceeds once in 3,000."""
+"""Gate on chi-square with two degrees of freedom: a true point exceeds it once in 3,000."""
 MOST_MISSED = 5
-"""Batches in a row without a point, after which a motion is not followed on."""
+"""Greatest number of consecutive batches without a point, after which a track ends."""
 MOST_CHANCE = 0.2
-"""Expected number of random points within the gate beyond which the next point would be a guess."""
+"""Greatest expected number of random points in the gate; with more, a match is a guess."""
 
 
 class Sightings(NamedTuple):
-    """The points (n) of batches (b), as the kernel takes them.
+    """Input arrays of the kernel: points (n) of batches (b).
 
     The points of each batch begin at `first` (b + 1,).  `variance` (n,) is rad^2 along the worse
-    axis, `density` (n,) points per steradian.  `used` (n,) marks points of other motions.
-    `chosen` (b,) is written: the point that is taken of each batch, -1 for none.
+    axis, `density` (n,) points per steradian.  `used` (n,) marks points of other tracks.  `chosen`
+    (b,) is output: the point taken in each batch, -1 for none.
     """
 
     first: npt.NDArray[np.int64]
@@ -41,7 +40,7 @@ class Sightings(NamedTuple):
 
 @njit_no_refcount
 def _circle(direction, i, j):  # type: ignore[no-untyped-def]
-    """The axes of the circle through two points, (6,): along it at the first one, and its pole."""
+    """Axes (6,) of the great circle through two points: tangent at the first point, and pole."""
     ax, ay, az = direction[i, 0], direction[i, 1], direction[i, 2]
     bx, by, bz = direction[j, 0], direction[j, 1], direction[j, 2]
     nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
@@ -56,7 +55,7 @@ def _circle(direction, i, j):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _angles(direction, point, i, circle):  # type: ignore[no-untyped-def]
-    """The angles of a point along the circle from point `i`, and across it."""
+    """Angles of a point along the great circle from point `i`, and across it."""
     x, y, z = direction[point, 0], direction[point, 1], direction[point, 2]
     cosine = x * direction[i, 0] + y * direction[i, 1] + z * direction[i, 2]
     along = math.atan2(x * circle[0] + y * circle[1] + z * circle[2], cosine)
@@ -65,7 +64,7 @@ def _angles(direction, point, i, circle):  # type: ignore[no-untyped-def]
 
 @njit_inlined
 def _nearest(seen, at, i, circle, sums):  # type: ignore[no-untyped-def]
-    """The point of batch `at` that is nearest to the lines, within the gate; -1: none is."""
+    """Nearest point of batch `at` to the fitted motion, within the gate; -1 if there is none."""
     s0, s1, s2, along0, along1, across0, across1 = sums
     determinant = s0 * s2 - s1 * s1
     if determinant <= 0.0:
@@ -92,9 +91,9 @@ def _nearest(seen, at, i, circle, sums):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def extend(i, j, seen):  # type: ignore[no-untyped-def]
-    """The number of points that lie on the motion of points `i` and `j`, with these two.
+    """Number of points on the motion of points `i` and `j`, these two included.
 
-    Of each later batch the nearest one is taken, as `chosen` tells from the batch of `i` on.
+    In every later batch the nearest point is taken, listed in `chosen` from the batch of `i` on.
     """
     circle = _circle(seen.direction, i, j)
     s0 = s1 = s2 = along0 = along1 = across0 = across1 = 0.0
@@ -131,7 +130,7 @@ def extend(i, j, seen):  # type: ignore[no-untyped-def]
 
 @njit_no_refcount
 def count_seeds(first, reach):  # type: ignore[no-untyped-def]
-    """The number of pairs of points in batches that are at most `reach` apart."""
+    """Number of pairs of points whose batches are at most `reach` apart."""
     total = 0
     for a in range(len(first) - 1):
         for b in range(a + 1, min(a + reach, len(first) - 2) + 1):
@@ -148,7 +147,7 @@ def try_seeds(  # type: ignore[no-untyped-def]
     seen,
     seeds,  # (m, 3): points i and j, and the count, written
 ):
-    """The number of seeds whose motion has at least `least` points; they are written to `seeds`."""
+    """Number of seeds with at least `least` points on their motion; written to `seeds`."""
     found = 0
     for i in range(len(seen.batch)):
         a = seen.batch[i]

@@ -1,7 +1,7 @@
-"""The tracks of a stretch: points linked, and each track named for what it is.
+"""Search for tracks: links points, and classifies each track.
 
-Points that keep their place on a detector while the sky passes are linked first and set
-aside; the rest is linked on the sky.  Planets are told by their ephemeris.
+Points that keep their place on a detector while the sky moves are linked first and removed; the
+rest is linked on the sky.  Planets are recognised by their ephemeris.
 """
 
 import math
@@ -22,10 +22,10 @@ DAY_S = 86_400.0
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A track: its kind, its motion on the sky, and the places (n,) of its points.
+    """A track: its kind, its motion on the sky, and the indices (n,) of its points.
 
-    `planet` is a planet's name with `planet_offset_arcsec`, how far from the ephemeris it was seen;
-    None of other kinds.  `log10_expected` is of tracks as good that points anywhere would make.
+    `planet` is a planet's name and `planet_offset_arcsec` its distance from the ephemeris; None for
+    other kinds.  `log10_expected` is the expected number of equally good tracks of random points.
     """
 
     kind: TrackKind
@@ -37,9 +37,9 @@ class Track:
 
 
 def find_tracks(points: Points, batches: Batches) -> list[Track]:
-    """The tracks of a stretch, each with four points or more; those of most points first.
+    """Search for tracks of at least four points; the track with the most points is first.
 
-    Raises `BadInput` where there are too many points.
+    Raises `BadInput` for too many points.
     """
     found = [_resting(points, each, batches) for each in _on_detectors(points, len(batches.time))]
     set_aside = {k for each in found for k in each.own.tolist()}
@@ -52,7 +52,7 @@ def find_tracks(points: Points, batches: Batches) -> list[Track]:
 
 
 def _on_detectors(points: Points, batches: int) -> list[Link]:
-    """The links of points that keep their place on a tracker's detector."""
+    """Links of points that keep their place on a tracker's detector."""
     found = []
     for tracker in range(len(points.trackers)):
         own = np.flatnonzero(points.tracker == tracker)
@@ -75,7 +75,7 @@ def _on_sky(points: Points, own: Indices, *, moves: bool) -> Motion:
 
 
 def _resting(points: Points, found: Link, batches: Batches) -> Track:
-    """A track that rests on its detector: on the sky, too, where the pointing was kept."""
+    """Track of points at rest on the detector; also at rest on the sky if pointing was kept."""
     own = found.own
     motion = _on_sky(points, own, moves=True)
     on_detector = Track("fixed_on_detector", motion, own, found.log10_expected)
@@ -103,7 +103,7 @@ def _moving(points: Points, found: Link, batches: Batches) -> Track:
 
 
 def _is_good(motion: Motion) -> bool:
-    """True if the points lie on one motion at all: chi-square within four sigmas of its mean."""
+    """True if the points fit one motion: chi-square within four sigmas of its mean."""
     degrees = motion.degrees_of_freedom
     return motion.chi_square < degrees + SIGMAS * math.sqrt(2.0 * degrees)
 
@@ -111,10 +111,10 @@ def _is_good(motion: Motion) -> bool:
 def _planet(
     motion: Motion, points: Points, own: Indices, batches: Batches
 ) -> tuple[str, float] | None:
-    """The planet that moves as a track does, and its offset in arcseconds; None: no planet does.
+    """Planet that moves like a track, with its offset in arcsec; None if no planet does.
 
-    Its place at the first, the middle and the last batch must be that of the track, within the
-    ephemeris's error and the track's; and so must its rate.
+    The planet's directions at the first, middle and last batch must agree with the track, within
+    the errors of ephemeris and track, and so must its rate.
     """
     places = points.batch[own[[0, len(own) // 2, len(own) - 1]]].tolist()
     time_s = points.time_s[own[[0, len(own) // 2, len(own) - 1]]]
@@ -134,7 +134,7 @@ def _planet(
 def _offsets_rad(
     planet: Planet, places: list[int], seen: Vector, sigma_rad: Vector, batches: Batches
 ) -> Vector | None:
-    """Observed less computed (3, 3) in rad; None where one of them is beyond the errors."""
+    """Observed minus computed directions (3, 3) in rad; None if one is beyond the errors."""
     offs = []
     for place, direction, sigma in zip(places, seen, sigma_rad.tolist(), strict=True):
         position = batches.position_km[place]
@@ -150,7 +150,7 @@ def _offsets_rad(
 
 @dataclass(frozen=True)
 class TrackFigures:
-    """A track in numbers, at the middle of its time: places in degrees, the rest in arcseconds.
+    """Numbers of a track at the middle of its time: directions in degrees, errors in arcsec.
 
     `rate_ra_arcsec_per_s` is along right ascension, with the cosine of declination.
     `chi_square` over `degrees_of_freedom` is about 1 where the sigmas are right.
@@ -174,7 +174,7 @@ class TrackFigures:
 
 
 def figures(track: Track, points: Points) -> TrackFigures:
-    """The numbers of a track."""
+    """Compute the published numbers of a track: direction, rate, magnitude and their sigmas."""
     motion = track.motion
     ra, dec = (float(each) for each in to_ra_dec(motion.direction))
     east = from_ra_dec(ra + 90.0, 0.0)

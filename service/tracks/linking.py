@@ -1,11 +1,10 @@
-"""Points linked into motions: the one that most points are on first, until none is left.
+"""Linking of points to motions; the motion with the most points is taken first.
 
-The points are the unexplained ones of batches whose attitude is known, carried to inertial
-directions.
+The points are unmatched stars of batches with an attitude, as inertial directions.
 
-Whether a motion is real is decided a contrario (Desolneux, Moisan and Morel 2000): how many
-motions with so many points as near would be expected of points that lie anywhere, among
-all pairs that a motion could begin with.  It is taken if that is below `MOST_EXPECTED`.
+A motion is accepted by an a contrario test (Desolneux, Moisan and Morel 2000): the expected number
+of motions with as many points as near, if points lay anywhere, among all pairs that a motion could
+begin with, must be below `MOST_EXPECTED`.
 """
 
 import heapq
@@ -35,7 +34,7 @@ Indices = npt.NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Batches:
-    """The batches (b) with an attitude, in order of time.
+    """Batches (b) with an attitude, in order of time.
 
     `position_km` (b, 3) is geocentric, NaN where the batch gives none.  `id` are results.
     """
@@ -47,19 +46,19 @@ class Batches:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Observed points (n) that no catalog star explains, in order of their batches.
+    """Observed points (n) without a catalog star, in order of their batches.
 
-    `batch` (n,) is the place of the point's batch, `tracker` (n,) that of its tracker in
-    `trackers`, `number` (n,) its own among the tracker's stars, from 0.  `time_s` (n,) is its own
-    time after the first batch.  `direction` (n, 3) is inertial, aberration removed where
-    the batch asks for that; `covariance` (n, 3, 3), rad^2, has the noise of the point and of
-    the attitude.  `place` (n, 3) is the direction in tracker axes as measured, with
-    `sigma_rad` (n,) per tangent axis.  `magnitude_mag` (n,) is NaN where none was given.
+    `batch` (n,) is the index of the point's batch, `tracker` (n,) that of its tracker in
+    `trackers`, `number` (n,) its place among the tracker's stars, from 0.  `time_s` (n,) is the
+    point's time after the first batch.  `direction` (n, 3) is inertial, aberration removed if the
+    batch asks for that; `covariance` (n, 3, 3), rad^2, has the noise of the point and of the
+    attitude.  `place` (n, 3) is the direction in tracker axes as measured, with `sigma_rad` (n,)
+    per tangent axis.  `magnitude_mag` (n,) is NaN if unknown.
     """
 
     trackers: tuple[str, ...]
     field_sr: Vector
-    """The solid angle of each tracker's field of view, (t,)."""
+    """Solid angle of each tracker's field of view, (t,), in steradians."""
     batch: Indices
     tracker: Indices
     number: Indices
@@ -74,11 +73,11 @@ class Points:
         return len(self.batch)
 
     def taken(self, chosen: Indices) -> "Points":
-        """Some of the points, in ascending order of their places."""
+        """Points selected by ascending indices."""
         return replace(self, **{name: getattr(self, name)[chosen] for name in _NAMES})
 
     def per_steradian(self) -> Vector:
-        """The density (n,) of unexplained points about each: those of its batch and tracker."""
+        """Density (n,) of starless points in each point's batch and tracker, per steradian."""
         own = self.batch * len(self.trackers) + self.tracker
         _, inverse, count = np.unique(own, return_inverse=True, return_counts=True)
         return np.asarray(count[inverse] / self.field_sr[self.tracker])
@@ -86,7 +85,7 @@ class Points:
 
 @dataclass
 class Gathering:
-    """Takes batches in order of time; `points` and `batches` are what was taken."""
+    """Collects unmatched points of batches in order of time, for linking."""
 
     trackers: Sequence[Tracker]
     _times: list[Utc] = field(default_factory=list)
@@ -103,9 +102,9 @@ class Gathering:
         covariance_arcsec2: Matrix,
         id: str = "",
     ) -> None:
-        """Take a batch with its attitude (3, 3) and the attitude's covariance in body axes.
+        """Add a batch with its attitude (3, 3) and the attitude's covariance in body axes.
 
-        `unexplained` are the places of the points of each of its trackers, in the batch's order.
+        `unexplained` are the indices of the unmatched stars of each tracker, in the batch's order.
         """
         self._times.append(batch.time)
         unknown = np.full(3, np.nan)
@@ -123,13 +122,13 @@ class Gathering:
 
     @property
     def batches(self) -> Batches:
-        """The batches that were taken."""
+        """The batches added so far."""
         positions = np.array(self._positions).reshape(-1, 3)
         return Batches(tuple(self._times), positions, tuple(self._ids))
 
     @property
     def points(self) -> Points:
-        """Their unexplained points."""
+        """The unmatched points of all batches added so far."""
         fields_sr = 2.0 * np.pi * (1.0 - np.array([each.least_cosine for each in self.trackers]))
         names = tuple(each.name for each in self.trackers)
         if not self._parts:
@@ -154,7 +153,7 @@ def _carried(
     attitude: Matrix,
     covariance_arcsec2: Matrix,
 ) -> dict[str, npt.NDArray[np.generic]]:
-    """Directions with their covariances, and places on the detector."""
+    """Inertial directions of points with covariances, and their directions in tracker axes."""
     body = seen.direction_body[own]
     direction = body @ attitude
     if batch.aberration == "to_correct":
@@ -179,7 +178,7 @@ def _carried(
 
 LEAST_POINTS = 4
 REACH = 3
-"""Batches from the first point of a seed to its second."""
+"""Greatest number of batches from the first point of a seed to the second."""
 MOST_EXPECTED = 1e-4
 MOST_SEEDS = 3_000_000
 MOST_RATE_RAD_PER_S = 120.0 / ARCSEC_PER_RADIAN
@@ -200,7 +199,7 @@ _FIT_ROUNDS = 4
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """A motion at `time_s`: direction (3,), and rate (3,) in rad/s across it.
+    """Motion along a great circle at constant rate: direction (3,) at `time_s`, rate (3,) in rad/s.
 
     `axes` (2, 3) are orthonormal and across the direction.  `covariance` (4, 4) is of the
     direction along both, rad^2, then of the rate along both.  Without a rate it is (2, 2).
@@ -216,7 +215,7 @@ class Motion:
     degrees_of_freedom: int
 
     def at(self, time_s: Vector) -> tuple[Vector, Vector]:
-        """Directions (n, 3) at times, and the axes (n, 2, 3) there, carried along the circle."""
+        """Directions (n, 3) at given times, and the axes (n, 2, 3) transported along the circle."""
         elapsed = np.asarray(time_s) - self.time_s
         speed = float(np.sqrt(self.rate @ self.rate))
         along = self.axes[0] if speed == 0.0 else self.rate / speed
@@ -230,7 +229,7 @@ class Motion:
         return place, axes
 
     def spread(self, time_s: Vector) -> Vector:
-        """The covariance (n, 2, 2), rad^2, of the directions at times, along the axes there."""
+        """Covariance (n, 2, 2), rad^2, of the directions at given times, on transported axes."""
         elapsed = np.asarray(time_s) - self.time_s
         own = self.covariance
         if len(own) == 2:
@@ -240,15 +239,15 @@ class Motion:
 
     @property
     def rate_chi_square(self) -> float:
-        """The rate in sigmas, squared: chi-square with two degrees of freedom if there is none."""
+        """Squared rate in sigmas: chi-square with two degrees of freedom for an object at rest."""
         along = self.axes @ self.rate
         return float(along @ np.linalg.solve(self.covariance[2:, 2:], along))
 
 
 def fit_motion(time_s: Vector, direction: Vector, covariance: Vector, *, moves: bool) -> Motion:
-    """The motion through points: times (n,), directions (n, 3), covariances (n, 3, 3) in rad^2.
+    """Fit a motion to points: times (n,), directions (n, 3), covariances (n, 3, 3) in rad^2.
 
-    A motion with a rate takes two points at different times.
+    A motion with a rate needs two points at different times.
     """
     middle = 0.5 * float(np.min(time_s) + np.max(time_s))
     place, rate = unit(direction.sum(axis=0)), np.zeros(3)
@@ -273,9 +272,9 @@ def fit_motion(time_s: Vector, direction: Vector, covariance: Vector, *, moves: 
 
 
 def offsets(motion: Motion, points: "tuple[Vector, Vector, Vector]") -> tuple[Vector, Vector]:
-    """The offsets (n, 2) in rad of directions from a motion, and their variances.
+    """Offsets (n, 2) in rad of directions from a motion, and their variances.
 
-    The variances (n, 2, 2) are of the points alone; both are along the axes carried there.
+    The variances (n, 2, 2) are of the points alone; both are along the transported axes.
     """
     time_s, direction, covariance = points
     _, axes = motion.at(time_s)
@@ -284,7 +283,7 @@ def offsets(motion: Motion, points: "tuple[Vector, Vector, Vector]") -> tuple[Ve
 
 
 def _axes(place: Vector, rate: Vector) -> Matrix:
-    """Along the motion, or anywhere where there is none, and across it."""
+    """Tangent axes at a direction: along the motion (any axis at rest), and across it."""
     along = rate
     if not rate.any():
         along = np.cross(place, np.eye(3)[int(np.argmin(np.abs(place)))])
@@ -295,7 +294,7 @@ def _axes(place: Vector, rate: Vector) -> Matrix:
 def _step(
     motion: Motion, time_s: Vector, direction: Vector, covariance: Vector, *, moves: bool
 ) -> tuple[Vector, Matrix, float]:
-    """The correction, the normal matrix, and the chi-square that the correction leaves."""
+    """Correction of one least-squares step, the normal matrix, and the remaining chi-square."""
     off, variance = offsets(motion, (time_s, direction, covariance))
     elapsed = time_s - motion.time_s
     design = np.zeros((len(time_s), 2, 4 if moves else 2))
@@ -318,7 +317,7 @@ def _step(
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A motion, the places of its points among all points, and the false ones expected of it."""
+    """A motion with the indices of its points, and the expected number of chance ones like it."""
 
     motion: Motion
     own: Indices
@@ -326,10 +325,10 @@ class Link:
 
 
 def link(points: Points, batches: int, *, rests: bool = False) -> Iterator[Link]:
-    """The motions on which points lie, those of most points first; each point is on one at most.
+    """Link points to motions, the one with the most points first; a point belongs to one at most.
 
-    With `rests` only points that keep their place are linked, in whatever axes the directions
-    of the points are.  Raises `BadInput` where there are too many points to try all pairs.
+    With `rests` only points at rest are linked, in the axes of the given directions.  Raises
+    `BadInput` if there are too many points to try all pairs.
     """
     if len(points) < LEAST_POINTS:
         return
@@ -398,13 +397,13 @@ def compile_linking() -> None:
 
 
 def _end(points: Points, i: int, chosen: Indices, count: int) -> int:
-    """The batch after the last that was followed: beyond it `chosen` is of another motion."""
+    """End of the batches that a motion was followed over; later entries of `chosen` are stale."""
     taken = np.flatnonzero(chosen[points.batch[i] :] >= 0)
     return int(points.batch[i] + taken[count - 1] + 1)
 
 
 def _worse_variance(points: Points) -> Vector:
-    """The variance (n,) of each direction along its worse axis, rad^2."""
+    """Variance (n,) of each direction along its worse axis, rad^2."""
     return np.ascontiguousarray(np.linalg.eigvalsh(points.covariance)[:, 2])
 
 
@@ -416,7 +415,7 @@ def _settled(
     *,
     moves: bool,
 ) -> tuple[Motion, Indices] | None:
-    """The motion with all points on it, fitted and gathered in turn; None: it dissolves."""
+    """Alternate fitting a motion and collecting its points until stable; None: too few points."""
     motion = None
     for _ in range(_ROUNDS):
         if len(own) < LEAST_POINTS:
@@ -437,7 +436,7 @@ def _gathered(
     used: Marks,
     density: Vector,
 ) -> Indices:
-    """The points on a motion: of each batch and tracker the nearest within the gate."""
+    """Points on a motion: in each batch and tracker the nearest one within the gate."""
     off, variance = offsets(motion, (points.time_s, points.direction, points.covariance))
     place, _ = motion.at(points.time_s)
     whole = variance + motion.spread(points.time_s)
@@ -455,13 +454,13 @@ def _gathered(
 def _log10_expected(
     points: Points, motion: Motion, own: Indices, density: Vector, pairs: int
 ) -> float:
-    """How many such motions points anywhere would make: pairs, choices, and the chance of each."""
+    """Log10 of the expected number of such motions among random points."""
     time_s = points.time_s[own]
     _, variance = offsets(motion, (time_s, points.direction[own], points.covariance[own]))
     whole = variance + motion.spread(time_s)
     area = math.pi * GATE * np.sqrt(np.linalg.det(whole))
     chance = np.minimum(area * density[own], 1.0)
-    # The two points that made the motion tell nothing: those that tell the most are left out.
+    # Two points define the motion and are no evidence: leave out the two most significant.
     log = np.sort(np.log(chance))[2:].sum()
     spanned = int(points.batch[own[-1]] - points.batch[own[0]]) + 1
     free, taken = max(spanned - 2, len(own) - 2), len(own) - 2

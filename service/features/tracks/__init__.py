@@ -1,4 +1,4 @@
-"""Tracks: points that no catalog star explains, linked over batches."""
+"""Tracks of moving objects: observed points without a catalog star, linked over batches."""
 
 from service.feature import Feature
 

@@ -1,4 +1,4 @@
-"""`acquire tracks`: moving points, planets and hot pixels among the unmatched stars of a record."""
+"""Command `acquire tracks`: moving objects, planets and hot pixels among unmatched stars."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -10,7 +10,7 @@ from service.errors import BadInput, Fault
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `tracks` and its options."""
     parser = arguments.add_command(commands, "tracks", run)
     parser.add_argument("spacecraft", metavar="SPACECRAFT", help=arguments.MISSION)
     arguments.add_period(parser, "the run to use; default live")

@@ -1,4 +1,4 @@
-"""The tracks on the pages of a period and of a batch."""
+"""Panels with tracks of unmatched points, on the pages of a period and of a batch."""
 
 from collections.abc import Iterator
 
@@ -9,13 +9,13 @@ from service.web.console.page import PageContext, Panel
 from service.web.console.pages.spacecraft import ShownPeriod
 
 MOST_LINKED = 600
-"""Batches whose tracks are looked for: reading and linking them takes about a second."""
+"""Greatest number of batches in which a page searches tracks; takes about a second."""
 
 
 def tracks_of_period(
     context: PageContext, name: str, run: str, shown: ShownPeriod, found: PeriodStars
 ) -> Iterator[Panel]:
-    """The tracks of a period of a spacecraft, where it has few enough batches."""
+    """Panel with the tracks in a period of a spacecraft, if it has few enough batches."""
     tracks = None
     if found.total <= MOST_LINKED:
         tracks = context.app.part(Tracks).of_period(name, run=run, start=shown.start, end=shown.end)
@@ -30,7 +30,7 @@ def tracks_of_period(
 
 
 def tracks_of_batch(context: PageContext, id: str, answer: Answer) -> Iterator[Panel]:
-    """The tracks of a result's unmatched stars, if it has any and their directions are known."""
+    """Panel with the tracks through the unmatched stars of a result, if its attitude is known."""
     if answer.attitude is None or not answer.counts.unmatched:
         return
     tracks = context.app.part(Tracks).through_batch(id, answer.spacecraft, answer.run)

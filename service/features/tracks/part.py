@@ -1,4 +1,4 @@
-"""Tracks of points that no catalog star explains, computed from the record on request."""
+"""Service that links points without a catalog star to tracks, from the record on request."""
 
 from collections.abc import Iterator
 
@@ -19,19 +19,19 @@ from service.tracks.linking import Batches, Points
 from service.vectors import to_ra_dec
 
 MOST_BATCHES = 2_000
-"""The most batches of a period whose tracks are asked for: they are read in a few seconds."""
+"""Greatest number of batches in a requested period; they are read in a few seconds."""
 EACH_SIDE = 20
-"""Batches before and after one whose tracks are asked for."""
+"""Number of batches before and after a batch in which its tracks are searched."""
 
 
 class Tracks:
-    """Links unexplained points; nothing is recorded."""
+    """Links points without a catalog star to tracks, without recording them."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing: no file and no connection is open."""
 
     def of_period(
         self,
@@ -42,9 +42,9 @@ class Tracks:
         end: Utc | None = None,
         most_batches: int = MOST_BATCHES,
     ) -> tracks.TrackList:
-        """The tracks of a spacecraft's batches in a period; see `find_tracks`.
+        """Tracks in a spacecraft's batches of a period; see `find_tracks`.
 
-        Raises `BadBatch` where the period has more than `most_batches`, or too many points.
+        Raises `BadBatch` if the period has more than `most_batches`, or too many points.
         """
         self._context.mission(name)
         selected = ResultFilter(run or LIVE, name, start, end)
@@ -53,7 +53,7 @@ class Tracks:
         return _tracks(name, run or LIVE, recorded)
 
     def through_batch(self, id: str, spacecraft: str, run: str) -> tracks.TrackList:
-        """The tracks with a point in one result, from it and `EACH_SIDE` batches on either side."""
+        """Tracks through one result, from its batch and `EACH_SIDE` batches on either side."""
         with self._context.reading() as connection:
             recorded = tracks.batches_around(connection, known_id(id, "batch"), EACH_SIDE)
         found = _tracks(spacecraft, run, recorded)
@@ -69,7 +69,7 @@ class Tracks:
         )
 
     def tdm(self, found: tracks.TrackList) -> Iterator[bytes]:
-        """The moving tracks as a CCSDS TDM; raises `NotFound` where there is none."""
+        """Moving tracks as a CCSDS TDM (Tracking Data Message); raises `NotFound` without any."""
         mission = self._context.mission(found.spacecraft)
         moving = [each for each in found.items if each.kind == "moving"]
         if not moving:
@@ -160,5 +160,5 @@ def _record(track: FoundTrack, points: Points, batches: Batches) -> tracks.Track
 
 
 def open_part(app: App) -> Tracks:
-    """The tracks of an open app."""
+    """Create the service for tracks of an open app."""
     return Tracks(app.context)

@@ -1,4 +1,4 @@
-"""Tracks of points that no catalog star explains: what is read for them, and their records."""
+"""Records of tracks for the API, and the recorded batches that they are computed from."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,16 +33,16 @@ _ROWS: Select[Any] = select(
 
 @dataclass(frozen=True, eq=False)
 class RecordedBatches:
-    """Rows of consecutive batches in order of time, with their missions by digest."""
+    """Database rows of consecutive batches in order of time, and their missions by digest."""
 
     rows: tuple[Row, ...]
     missions: dict[str, Mission]
 
 
 def batches_of_period(connection: Connection, selected: ResultFilter, most: int) -> RecordedBatches:
-    """Every current result that is selected.
+    """All selected current results, as input for tracks.
 
-    Raises `BadBatch` where there are more than `most`.
+    Raises `BadBatch` if there are more than `most`.
     """
     query = _ROWS.where(*selected.conditions()).order_by(*PLACE).limit(most + 1)
     rows = [dict(row) for row in connection.execute(query).mappings()]
@@ -53,9 +53,9 @@ def batches_of_period(connection: Connection, selected: ResultFilter, most: int)
 
 
 def batches_around(connection: Connection, id: str, each_side: int) -> RecordedBatches:
-    """A result, and the current ones of its spacecraft and run that are next to it in time.
+    """A result and the current ones nearest in time of its spacecraft and run.
 
-    Raises `NotFound` where there is no such result.
+    Raises `NotFound` without a result of this id.
     """
     result = read_result(connection, id)
     same = ResultFilter(result["run"], result["spacecraft"]).conditions()
@@ -79,9 +79,9 @@ def _with_missions(connection: Connection, rows: Sequence[Row]) -> RecordedBatch
 
 
 def unexplained_points(recorded: RecordedBatches) -> Gathering:
-    """The unmatched stars of the batches that have an attitude, carried to inertial directions.
+    """Unmatched stars of batches with an attitude, converted to inertial directions.
 
-    What was sent is calibrated with the settings of the mission as they were for each result.
+    Observations are corrected with the settings used for their result.
     """
     trackers: dict[str, Tracker] = {}
     for mission in recorded.missions.values():
@@ -115,7 +115,7 @@ TrackKindName = Literal["moving", "planet", "fixed_on_sky", "fixed_on_detector",
 
 
 class TrackPoint(Record, frozen=True, kw_only=True):
-    """A point of a track."""
+    """A point of a track: an unmatched star of one batch and tracker."""
 
     id: Annotated[Id, doc("The result of the batch.")]
     tracker: str
@@ -127,7 +127,7 @@ class TrackPoint(Record, frozen=True, kw_only=True):
 
 
 class Track(Record, frozen=True, kw_only=True):
-    """Points that move together, at most one of each batch and tracker."""
+    """A track: points that move together, at most one per batch and tracker."""
 
     component: ClassVar[str] = "TrackOut"
     kind: Annotated[
@@ -173,7 +173,7 @@ class Track(Record, frozen=True, kw_only=True):
 
 
 class TrackList(Record, frozen=True, kw_only=True):
-    """The tracks of a period, those of most points first."""
+    """The tracks in a period, the track with the most points first."""
 
     spacecraft: str
     run: str

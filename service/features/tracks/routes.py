@@ -1,4 +1,4 @@
-"""The route of tracks."""
+"""Route of the API for tracks."""
 
 from typing import Annotated, Literal
 
@@ -26,7 +26,7 @@ TracksDep = Annotated[Tracks, Depends(_tracks)]
 
 
 class TracksQuery(PeriodQuery):
-    """Tracks of a period, in a format."""
+    """Query for the tracks in a period, in an output format."""
 
     format: Annotated[
         Literal["json", "tdm"],
@@ -41,7 +41,7 @@ class TracksQuery(PeriodQuery):
     problems=(503,),
 )
 def list_tracks(name: SpacecraftPath, query: FromQuery[TracksQuery], tracks: TracksDep) -> Response:
-    """Tracks of a period: points that no catalog star explains and that move together.
+    """The tracks in a period: points without a catalog star that move together.
 
     They are computed from the record: unmatched stars of the batches with an attitude, of at most
     2,000 batches. As `tdm` the moving ones are a CCSDS TDM of right ascensions and declinations;

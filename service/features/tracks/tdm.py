@@ -1,7 +1,7 @@
-"""Tracks as a CCSDS Tracking Data Message (TDM, version 2, KVN), a segment for each object.
+"""Writer of a CCSDS Tracking Data Message (TDM, version 2, KVN), with a segment per object.
 
 Right ascensions and declinations are as seen from the spacecraft, aberration removed, in EME2000;
-a time is that of the point itself.
+times are those of the points.
 """
 
 from collections.abc import Iterator, Sequence
@@ -14,9 +14,9 @@ REFERENCE_FRAME = "EME2000"
 
 @dataclass(frozen=True)
 class TrackedObject:
-    """An object with its points, in order of time: UTC, degrees, magnitudes where known.
+    """A tracked object with its points in order of time: UTC, degrees, magnitudes where known.
 
-    `comments` are comments on it.
+    `comments` are written into its segment.
     """
 
     name: str
@@ -30,7 +30,7 @@ class TrackedObject:
 def write_tdm(
     observer: str, run: str, created: str, version: str, objects: Sequence[TrackedObject]
 ) -> Iterator[bytes]:
-    """Write a message: `observer` is the spacecraft that saw the objects."""
+    """Write a TDM in pieces; `observer` is the spacecraft that saw the objects."""
     opening: Pairs = [
         ("CCSDS_TDM_VERS", "2.0"),
         ("COMMENT", f"Written by attitude-acquisition {one_line(version)}"),

@@ -9,7 +9,7 @@ _HEADING = (
 
 
 def tracks_text(found: TrackList) -> str:
-    """The tracks as a table."""
+    """Format tracks as a table of text."""
     counts = (
         f"{found.batches:,} batches, {found.without_attitude:,} without attitude; "
         f"{found.unexplained:,} unmatched stars, {found.linked:,} of them on tracks"

@@ -1,4 +1,4 @@
-"""Webhooks: sending recorded events to receivers, as Standard Webhooks 1.0.0 says."""
+"""Webhooks: recorded events sent to receivers, following Standard Webhooks 1.0.0."""
 
 from service.feature import Feature
 

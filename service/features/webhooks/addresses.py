@@ -1,8 +1,7 @@
-"""Addresses that webhooks may reach: public ones, and private networks that a setting names.
+"""Check of webhook addresses: public ones, and private networks allowed by a setting.
 
-The name of a receiver is resolved once for each attempt, every address is checked,
-and the connection is made to a checked address: an answer of the name server that
-changes between two look-ups leads nowhere else.
+The host name is resolved once per attempt, every address is checked, and the connection is made to
+a checked address: a DNS answer that changes between two look-ups has no effect.
 """
 
 import asyncio
@@ -21,10 +20,10 @@ METADATA = frozenset(
     ipaddress.ip_address(each)
     for each in ("169.254.169.254", "fd00:ec2::254", "100.100.100.200", "168.63.129.16")
 )
-"""Addresses at which clouds tell a machine its own secrets; no setting allows them."""
+"""Addresses of cloud metadata services, which reveal secrets; no setting allows them."""
 NAT64 = networks("64:ff9b::/96")
 UNICAST_IPV6 = networks("2000::/3")
-"""The only part of IPv6 from which IANA assigns public addresses; `NAT64` stands for IPv4."""
+"""Network from which IANA assigns public IPv6 addresses; `NAT64` stands for IPv4."""
 NOT_PUBLIC = networks(
     # IANA's registry of IPv4 special-purpose addresses, as of October 2025.
     "0.0.0.0/8, 10.0.0.0/8, 100.64.0.0/10, 127.0.0.0/8, 169.254.0.0/16, 172.16.0.0/12,"
@@ -36,31 +35,31 @@ NOT_PUBLIC = networks(
     # Multicast; IPv4-compatible, IPv4-translated (RFC 2765) and site-local addresses.
     "224.0.0.0/4, ff00::/8, ::/96, ::ffff:0:0:0/96, fec0::/10"
 )
-"""Networks that are not public, whatever the table of this version of Python says.
+"""Networks that are not public, independent of the table in this version of Python.
 
-Of 192.0.0.0/24 and 2001::/23 the registries call some addresses reachable: relays and
+The registries list some addresses of 192.0.0.0/24 and 2001::/23 as reachable: relays and
 translators, which receive no webhooks.
 """
 NO_WEB_PORTS = frozenset(
     (1719, 1720, 1723, 2049, 3659, 4045, 4190, 5060, 5061, 6000, 6566, 6679, 6697, 10080)
 ) | frozenset(range(6665, 6670))
-"""Ports from 1024 on that browsers refuse too (WHATWG Fetch, "bad port")."""
+"""Ports above 1023 that browsers block as well (WHATWG Fetch, "bad port")."""
 MAX_URL = 2_000
 MAX_ADDRESSES = 8
 RESOLVE_S = 3.0
-"""How long a name may take to resolve when a webhook is registered."""
+"""Time limit in seconds for resolving a host name when a webhook is registered."""
 MAX_LOOK_UPS = 64
-"""Look-ups of names at once; each has a thread, which a silent name server may hold for 30 s."""
+"""Greatest number of parallel DNS look-ups; a silent name server may block each for 30 s."""
 
 
 class Refused(Exception):
-    """The address of a receiver is one that webhooks must not reach; nothing was connected."""
+    """Raised for an address that webhooks must not reach, before any connection."""
 
 
 def require_url(url: str, allowed: Sequence[Network]) -> None:
     """Raise `BadInput` for a URL that webhooks must not be sent to, whatever its name resolves to.
 
-    The address that stands in a URL is checked here; that of a name with each attempt.
+    An address in the URL is checked here; a host name is checked with each attempt.
     """
 
     def fault(message: str) -> BadInput:
@@ -101,9 +100,9 @@ def require_url(url: str, allowed: Sequence[Network]) -> None:
 
 
 def require_http_allowed(url: str, allowed: Sequence[Network]) -> None:
-    """Raise `BadInput` for plain http to a name that resolves to other networks now.
+    """Raise `BadInput` for plain http to a host name that resolves outside of allowed networks.
 
-    Each attempt would be refused.  A name that cannot be resolved now is accepted.
+    Every attempt would be refused.  A name that cannot be resolved now is accepted.
     """
     import httpx
 
@@ -127,8 +126,8 @@ def require_reachable(
 ) -> None:
     """Raise `Refused` for an address that is neither public nor in an allowed network.
 
-    With `only_allowed` it must be in an allowed network.  An address that stands for
-    another one, as IPv4-mapped and 6to4 ones do, is refused where either is.
+    With `only_allowed` it must be in an allowed network.  An address that embeds another one, as
+    IPv4-mapped and 6to4 addresses do, is refused if either must be.
     """
     if isinstance(address, ipaddress.IPv6Address):
         # Without the name of an interface (%eth0): with one it equals no other address.
@@ -147,9 +146,9 @@ def require_reachable(
 async def reachable_addresses(
     host: str, port: int, allowed: Sequence[Network], *, only_allowed: bool = False
 ) -> list[str]:
-    """The addresses of a host, each of them checked; resolves a name once.
+    """Checked addresses of a host; resolves a name once.
 
-    Raises `Refused` if any of them must not be reached, OSError for an unknown name.
+    Raises `Refused` if one of them must not be reached, OSError for an unknown name.
     """
     literal = _literal(host)
     found = [str(literal)] if literal is not None else await _look_up(host, port)
@@ -180,7 +179,7 @@ def _is_public(address: Address) -> bool:
 
 
 def _embedded(address: Address) -> Iterator[Address]:
-    """The IPv4 addresses that an IPv6 address stands for."""
+    """IPv4 addresses that are embedded in an IPv6 address."""
     if isinstance(address, ipaddress.IPv4Address):
         return
     if address.ipv4_mapped is not None:
@@ -195,10 +194,10 @@ _look_ups = threading.BoundedSemaphore(MAX_LOOK_UPS)
 
 
 async def _look_up(host: str, port: int) -> list[str]:
-    """The addresses of a name, in the order of the system's preference.
+    """Addresses of a host name, in the order preferred by the system.
 
-    In a thread of its own, which nothing waits for: a look-up cannot be ended, and the
-    threads of a pool would hold up the end of the process.
+    Resolves in a thread that nothing waits for: a look-up cannot be cancelled, and threads of a
+    pool would delay the end of the process.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[list[str]] = loop.create_future()

@@ -1,4 +1,4 @@
-"""The events that a webhook wants, the messages that they become, and the outcome of sending."""
+"""Webhook messages: filters on events, message bodies and signatures, delivery outcomes."""
 
 import base64
 import hashlib
@@ -21,18 +21,18 @@ log = logging.getLogger(__name__)
 
 TEST_KIND = "test"
 TOTAL_S = 10.0
-"""The time from the look-up of the name to the end of the answer."""
+"""Time limit of an attempt in seconds, from name look-up to the end of the answer."""
 GONE, TOO_MANY, UNAVAILABLE = 410, 429, 503
 
 
 class _AlarmData(msgspec.Struct):
-    """The part of an alarm's data that a filter looks at."""
+    """Fields of an alarm's data that webhook filters use."""
 
     severity: str
 
 
 class _Message(msgspec.Struct):
-    """The body of a message: `type`, `timestamp` and `data` as Standard Webhooks has them."""
+    """Body of a webhook message: `type`, `timestamp` and `data` as in Standard Webhooks."""
 
     type: str
     timestamp: str
@@ -44,9 +44,9 @@ class _Message(msgspec.Struct):
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of an attempt: a status, or the fault that kept the answer away.
+    """Outcome of a delivery attempt: the HTTP status, or the fault that prevented an answer.
 
-    `retry_after_s` is what the receiver asked for, in seconds.
+    `retry_after_s` is the delay that the receiver requested, in seconds.
     """
 
     status: int | None
@@ -56,7 +56,7 @@ class Outcome:
 
     @property
     def delivered(self) -> bool:
-        """True if the receiver has the event."""
+        """True if the receiver accepted the event."""
         return self.fault is None
 
 
@@ -73,7 +73,7 @@ def wants(webhook: Registered, event: Event) -> bool:
 
 
 def delivery_row(webhook_id: str, event: Event, now: str, *, again: bool = False) -> Row:
-    """An event as a row of `webhook_deliveries`."""
+    """Database row of `webhook_deliveries` for an event."""
     return {
         "webhook_id": webhook_id,
         "event_id": event.id,
@@ -93,9 +93,9 @@ def delivery_row(webhook_id: str, event: Event, now: str, *, again: bool = False
 
 
 def message_id(event: Event) -> str:
-    """The id of an event for receivers: the same for every webhook, attempt and replay.
+    """Message id of an event: the same for every webhook, attempt and replay.
 
-    The number alone is not enough: where a database is restored from a backup, numbers are
+    The event's number alone is not enough: after a database is restored from a backup, numbers are
     assigned again to other events.
     """
     digest = hashlib.sha256(f"{event.kind} {event.at} {event.data}".encode()).hexdigest()
@@ -103,7 +103,7 @@ def message_id(event: Event) -> str:
 
 
 def message_body(event: Event, now: str) -> bytes:
-    """The body of an event's message; `now` stands in for a time that was not recorded."""
+    """Message body of an event; `now` replaces a time that was not recorded."""
     return msgspec.json.encode(
         _Message(
             type=event.kind,
@@ -117,7 +117,7 @@ def message_body(event: Event, now: str) -> bytes:
 
 
 def test_message(id: str, now: str) -> tuple[str, bytes]:
-    """The id and the body of a test event of a webhook."""
+    """Message id and body of a test event for a webhook."""
     body = {"type": TEST_KIND, "timestamp": now, "data": {"webhook": id}}
     digest = hashlib.sha256(f"{id} {now}".encode()).hexdigest()
     return f"test_{digest[:16]}", msgspec.json.encode(body)
@@ -128,14 +128,14 @@ SECRET_BYTES = 32
 
 
 def new_webhook_secret() -> str:
-    """A new random secret, as receivers are given it."""
+    """Create a random signing secret, in the form shown to receivers."""
     return PREFIX + base64.b64encode(secrets.token_bytes(SECRET_BYTES)).decode()
 
 
 def signed_headers(
     secrets: Sequence[str], message_id: str, unix_s: int, body: bytes
 ) -> dict[str, str]:
-    """The headers of an attempt at a time, with a signature by each secret."""
+    """HTTP headers of a delivery attempt, with a signature by each secret."""
     signed = f"{message_id}.{unix_s}.".encode() + body
     return {
         "webhook-id": message_id,
@@ -159,23 +159,23 @@ RESULTS: tuple[Result, ...] = ("delivered", "failed", "dead")
 
 @dataclass
 class _Failing:
-    """The attempts since the last one that succeeded."""
+    """Failed attempts and dead letters since the last successful attempt."""
 
     failed: int = 0
     dead: int = 0
 
 
 class DeliveryLog:
-    """The outcomes of the attempts to deliver, since the start."""
+    """Counts delivery outcomes, and logs when deliveries to a webhook start to fail or recover."""
 
     def __init__(self) -> None:
         self.counts: Counter[tuple[str, str, Result]] = Counter()
-        """Attempts by the webhook's id and name and by their result."""
+        """Number of attempts by id and name of the webhook and by result."""
         self._failing: dict[str, _Failing] = {}
         self._states: dict[str, str] = {}
 
     def listed(self, webhooks: Iterable[Registered]) -> None:
-        """Note the webhooks that there are, and log where the state of one has changed."""
+        """Record the existing webhooks, and log changes of their state."""
         for webhook in webhooks:
             for result in RESULTS:
                 self.counts[webhook.id, webhook.name, result] += 0
@@ -188,7 +188,7 @@ class DeliveryLog:
             self._states[webhook.id] = webhook.state
 
     def delivered(self, webhook: Registered, events: int) -> None:
-        """Count deliveries; after failures, log that they go on."""
+        """Count deliveries; after failures, log the recovery."""
         if not events:
             return
         self.counts[webhook.id, webhook.name, "delivered"] += events
@@ -202,7 +202,7 @@ class DeliveryLog:
             )
 
     def failed(self, webhook: Registered, event: int, fault: str | None, is_dead: bool) -> None:
-        """Count a failed attempt; log the first one, and the first dead letter."""
+        """Count a failed attempt; log the first failure, and the first dead letter."""
         self.counts[webhook.id, webhook.name, "dead" if is_dead else "failed"] += 1
         failing = self._failing.get(webhook.id)
         if failing is None:

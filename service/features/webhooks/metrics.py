@@ -1,4 +1,4 @@
-"""Metrics of webhooks: what waits, and the attempts to deliver."""
+"""Prometheus metrics of webhooks: queue lengths and delivery attempts."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -13,19 +13,19 @@ from service.times import recorded_utc, utc_now
 
 
 def reads(app: App) -> Mapping[str, Callable[[], Any]]:
-    """The webhooks, which the database has."""
+    """Database query for webhooks, read before metrics are collected."""
     return {"webhooks": app.part(Webhooks).all}
 
 
 def collect(app: App, found: Mapping[str, Any]) -> Iterator[Metric]:
-    """The metrics of webhooks, where the database answered, and of attempts since the start."""
+    """Metrics of webhooks, if the database answered, and of attempts since the start."""
     if "webhooks" in found:
         yield from _of_webhooks(found["webhooks"])
     yield _of_attempts(app.part(Webhooks).sender.log.counts)
 
 
 def _of_webhooks(webhooks: Sequence[Webhook]) -> Iterator[Metric]:
-    """The number that waits for each webhook, and whether anything is sent to it."""
+    """Metrics of each webhook: queue length, age of the queue, and if it is active."""
     labels = ("webhook", "name")
     active = GaugeMetricFamily(
         "starid_webhook_active",

@@ -1,4 +1,4 @@
-"""The page of webhooks."""
+"""Console page of webhooks."""
 
 from starlette.responses import Response
 
@@ -13,7 +13,7 @@ SEVERITIES = ("watch", "warning", "critical")
 
 @console_page("/webhooks", "Webhooks", OPERATE, section="/about")
 def webhooks_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Every webhook with what waits for it."""
+    """Console page with all webhooks and their waiting deliveries."""
     part = context.app.part(Webhooks)
     webhooks = part.all()
     waiting = {

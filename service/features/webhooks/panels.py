@@ -1,4 +1,4 @@
-"""What the overview and the page of the service's state say about webhooks."""
+"""Webhook lines for the overview and for the page of the service's state."""
 
 from collections.abc import Iterator
 
@@ -10,7 +10,7 @@ from service.web.console.pages.overview import Notice
 
 
 def notices(context: PageContext) -> Iterator[Notice]:
-    """A line for the overview where webhooks do not deliver, for a reader of their page."""
+    """Line of the overview about failing webhooks, for callers who may see their page."""
     if context.caller.spacecraft is not None or not context.may_operate:
         return
     found = []
@@ -26,7 +26,7 @@ def notices(context: PageContext) -> Iterator[Notice]:
 
 
 def checks(context: PageContext) -> Iterator[Check]:
-    """A line about all webhooks, for operators."""
+    """Line with the state of all webhooks, for operators."""
     if not context.may_operate:
         return
     webhooks = context.app.part(Webhooks).all()

@@ -1,4 +1,4 @@
-"""Webhooks: registered, changed, tried out, and sent to again."""
+"""Service for webhooks: registration, changes, tests, retries and replays."""
 
 from collections.abc import Sequence
 
@@ -31,9 +31,9 @@ MAX_WEBHOOKS = 50
 
 
 class Webhooks:
-    """Reads and changes webhooks, and delivers to them.
+    """Reads and changes webhooks, and delivers events to them.
 
-    `entry` goes to the audit list with a change.
+    `entry` is the audit entry written with a change.
     """
 
     def __init__(self, context: Context, access: Access) -> None:
@@ -44,27 +44,27 @@ class Webhooks:
         self.sender = WebhookSender(context.store, self._allowed, lambda: access.is_open)
 
     def close(self) -> None:
-        """Stop delivering."""
+        """Stop the delivery of events."""
         self.sender.stop()
 
     def all(self) -> list[Webhook]:
-        """Every webhook, the oldest first."""
+        """All webhooks, oldest first."""
         is_open = self._access.is_open
         with self._context.reading() as connection:
             return webhooks.list_webhooks(connection, utc_now().text, is_open)
 
     def get(self, id: str) -> Webhook:
-        """One webhook."""
+        """The webhook with an id; raises `NotFound`."""
         is_open = self._access.is_open
         with self._context.reading() as connection:
             return webhooks.read_webhook(connection, _known(id), utc_now().text, is_open)
 
     def add(self, settings: Row, caller: Caller, entry: Entry | None = None) -> WebhookWithSecret:
-        """Register a webhook, which is sent the events from now on.
+        """Register a webhook, which receives events from now on.
 
-        `settings` are name, url, kinds, spacecraft, severity, run and enabled.
-        Raises `BadInput` for a URL that must not be reached and for a spacecraft without a
-        mission file, `WrongState` where there are too many webhooks.
+        `settings` are name, url, kinds, spacecraft, severity, run and enabled.  Raises `BadInput`
+        for a URL that must not be reached and for a spacecraft without a mission file, `WrongState`
+        if there are too many webhooks.
         """
         self._require(settings)
         id, now, secret = self._ids.new(), utc_now().text, new_webhook_secret()
@@ -83,9 +83,9 @@ class Webhooks:
         return _with_secret(added, secret)
 
     def change(self, id: str, settings: Row, caller: Caller, entry: Entry | None = None) -> Webhook:
-        """Replace the settings of a webhook; from now on it is sent what the caller may read.
+        """Replace the settings of a webhook, with the read permissions of the caller from now on.
 
-        One that was paused or disabled goes on where it stopped.
+        A paused or disabled webhook continues with the next event of its queue.
         """
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
         self._require(settings)
@@ -101,7 +101,7 @@ class Webhooks:
         return changed
 
     def delete(self, id: str, entry: Entry | None = None) -> Webhook:
-        """Delete a webhook, with what waits for it."""
+        """Delete a webhook with its queued deliveries and dead letters."""
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
 
         def change(connection: Connection) -> Webhook:
@@ -114,9 +114,9 @@ class Webhooks:
         return deleted
 
     def rotate(self, id: str, hours: int, entry: Entry | None = None) -> WebhookWithSecret:
-        """Give a webhook a new secret; the one before signs too for so many hours.
+        """Create a new signing secret for a webhook; the previous one stays valid for `hours`.
 
-        Raises `WrongState` where an earlier secret was promised to sign still, except with 0 hours.
+        Raises `WrongState` while an earlier secret is still valid, except with 0 hours.
         """
         known, now, is_open = _known(id), utc_now(), self._access.is_open
         secret, until = new_webhook_secret(), shifted(now, hours * HOUR_S).text
@@ -137,7 +137,7 @@ class Webhooks:
         return _with_secret(rotated, secret)
 
     def try_out(self, id: str) -> WebhookTest:
-        """Send a test event at once, whatever waits, and say what came of it.
+        """Send a test event at once, before any queued event, and return the outcome.
 
         Raises `WrongState` for a webhook that is not active.
         """
@@ -164,7 +164,7 @@ class Webhooks:
         *,
         oldest_first: bool = False,
     ) -> Page[WebhookDelivery]:
-        """A webhook's waiting deliveries and dead letters, or one of these; the latest first."""
+        """One page of a webhook's waiting deliveries, dead letters or both, latest first."""
         known, is_open = _known(id), self._access.is_open
         with self._context.reading() as connection:
             webhooks.read_webhook(connection, known, utc_now().text, is_open)
@@ -180,9 +180,9 @@ class Webhooks:
     def retry(
         self, id: str, numbers: Sequence[int] | None, entry: Entry | None = None
     ) -> WebhookQueued:
-        """Send dead letters again, those of some events or all.
+        """Queue dead letters again, for some events or all.
 
-        Raises `BadInput` for an event that is no dead letter.
+        Raises `BadInput` for an event that is not a dead letter.
         """
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
 
@@ -195,7 +195,7 @@ class Webhooks:
     def replay(
         self, id: str, since: Utc, until: Utc | None, entry: Entry | None = None
     ) -> WebhookQueued:
-        """Send the kept events of a period again, if the webhook wants them."""
+        """Queue stored events of a period again, if they pass the filters of the webhook."""
         known, now, is_open = _known(id), utc_now().text, self._access.is_open
         end = utc_now() if until is None else until
         # Not in the writer, which others would wait for.
@@ -234,5 +234,5 @@ def _with_secret(webhook: Webhook, secret: str) -> WebhookWithSecret:
 
 
 def open_part(app: App) -> Webhooks:
-    """The webhooks of an open app."""
+    """Create the webhook service of an open app."""
     return Webhooks(app.context, app.access)

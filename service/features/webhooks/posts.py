@@ -1,4 +1,4 @@
-"""One attempt to deliver: a POST to a checked address, bounded in time and in what is read."""
+"""Delivery attempt: a POST to a checked address, with limits on time and answer size."""
 
 import asyncio
 import time
@@ -18,7 +18,7 @@ PORTS = {"http": 80, "https": 443}
 
 
 class CheckedTransport(httpx.AsyncBaseTransport):
-    """Connects to the checked addresses of a host; name and certificate stay those of the host."""
+    """HTTP transport to checked addresses of a host; TLS verifies the host name."""
 
     def __init__(self, allowed: Sequence[Network]) -> None:
         self._allowed = allowed
@@ -35,7 +35,7 @@ class CheckedTransport(httpx.AsyncBaseTransport):
     async def handle_async_request(self, request: httpx.Request) -> httpx.Response:
         """Send the request to the first address that accepts a connection.
 
-        Raises `Refused` where an address must not be reached.
+        Raises `Refused` for an address that must not be reached.
         """
         url = request.url
         # As it is sent: decoded and encoded again by the rules of 2003, xn--fa-hia.example would
@@ -64,12 +64,12 @@ class CheckedTransport(httpx.AsyncBaseTransport):
         return await self._inner.handle_async_request(request)
 
     async def aclose(self) -> None:
-        """Close what is open."""
+        """Close the connections of the transport."""
         await self._inner.aclose()
 
 
 class Poster:
-    """Makes attempts, any number at a time."""
+    """Sends webhook messages over HTTP, any number at the same time."""
 
     def __init__(self, allowed: Sequence[Network]) -> None:
         self._client = httpx.AsyncClient(
@@ -86,7 +86,7 @@ class Poster:
         )
 
     async def post(self, url: str, headers: Mapping[str, str], body: bytes) -> Outcome:
-        """Send a body; every failure is an outcome."""
+        """Send a message body; failures are returned as an outcome, not raised."""
         begun_s = time.monotonic()
         status: int | None = None
         retry_after_s: float | None = None
@@ -120,7 +120,7 @@ class Poster:
         return Outcome(status, fault, retry_after_s, time.monotonic() - begun_s)
 
     async def close(self) -> None:
-        """Close what is open."""
+        """Close the HTTP client."""
         await self._client.aclose()
 
 
@@ -133,7 +133,7 @@ def _fault_of(status: int) -> str | None:
 
 
 def _retry_after_s(text: str | None) -> float | None:
-    """The seconds of a header `Retry-After`, which has a number or a date; None: neither."""
+    """Seconds from a header `Retry-After` with a number or a date; None if invalid."""
     if text is None:
         return None
     if text.isascii() and text.isdigit() and len(text) < 10:

@@ -1,7 +1,7 @@
-"""Webhooks in the records: what is registered, what waits, and which process delivers.
+"""Database access for webhooks: registrations, queued deliveries, and the delivering process.
 
-A delivery is a row: one event for one webhook.  It is deleted when it is delivered; a dead
-letter stays until it is sent again, or until there are too many after it.
+A delivery is a row: one event for one webhook.  Delivered rows are deleted; a dead letter stays
+until it is queued again, or until there are too many later ones.
 """
 
 import json
@@ -47,7 +47,7 @@ Fault = Annotated[str | None, doc("null: it succeeded, or was not tried yet.")]
 
 
 class Webhook(Record, frozen=True, kw_only=True):
-    """A receiver of events, and how its deliveries go."""
+    """A webhook: a receiver of events, with the state of its deliveries."""
 
     id: Id
     name: str
@@ -55,7 +55,7 @@ class Webhook(Record, frozen=True, kw_only=True):
     kinds: Annotated[list[EventKind] | None, doc("Only events of these kinds; null: of all.")]
     spacecraft: Annotated[list[str] | None, doc("Only events about these; null: about all.")]
     severity: SeverityName | None
-    """Least severity of the alarms that are sent; null: every alarm."""
+    """Least severity of alarms to send; null: every alarm."""
     run: Annotated[str | None, doc("Only events of this run; null: of every run.")]
     enabled: bool
     state: WebhookStateName
@@ -66,18 +66,18 @@ class Webhook(Record, frozen=True, kw_only=True):
     oldest: Annotated[Stamp | None, doc("When the oldest of them was queued.")]
     dead: Annotated[Count, doc("Dead letters: events that were not delivered within a day.")]
     missed: Count
-    """Events that were no longer kept when their turn to be queued came."""
+    """Number of events that were deleted before they could be queued for the webhook."""
     failing_since: Annotated[Stamp | None, doc("null: the last delivery succeeded.")]
     last_attempt: Stamp | None
     last_delivered: Stamp | None
     last_status: HttpStatus
     last_fault: Fault
     previous_until: Stamp | None
-    """Until then every delivery has a signature by the previous secret too."""
+    """Time until which deliveries are also signed with the previous secret."""
 
 
 class WebhookWithSecret(Webhook, frozen=True, kw_only=True):
-    """A webhook with the secret that signs its deliveries: it is shown this once."""
+    """A webhook with its signing secret, which is shown only once."""
 
     secret: Annotated[str, Field(pattern=r"^whsec_[A-Za-z0-9+/]+=*$")]
 
@@ -86,7 +86,7 @@ WebhookList = list_record("WebhookList", Webhook, "All webhooks, the oldest firs
 
 
 class WebhookDelivery(Record, frozen=True, kw_only=True):
-    """An event that waits to be delivered, or a dead letter."""
+    """An event that is queued for a webhook, or a dead letter."""
 
     event: Annotated[int, doc("The number of the event.")]
     message_id: Annotated[str, doc("The `webhook-id` of every attempt.")]
@@ -105,13 +105,13 @@ WebhookDeliveryPage = page_record("WebhookDeliveryPage", WebhookDelivery, "A pag
 
 
 class WebhookQueued(Record, frozen=True, kw_only=True):
-    """How many events were queued."""
+    """Number of events that were queued."""
 
     queued: Count
 
 
 class WebhookTest(Record, frozen=True, kw_only=True):
-    """The outcome of a test event."""
+    """Outcome of a test event sent to a webhook."""
 
     delivered: bool
     message_id: str
@@ -122,7 +122,7 @@ class WebhookTest(Record, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class Registered:
-    """A webhook as it is stored, with its secrets, which its text leaves out."""
+    """Stored webhook with its secrets, which are left out of its text."""
 
     id: str
     name: str
@@ -140,19 +140,19 @@ class Registered:
     reason: str | None
 
     def secrets(self, now: str) -> list[str]:
-        """The secrets that sign at a time: the present one, then the one before it."""
+        """Secrets that sign messages at a time: the present one, then the previous one if valid."""
         if self.previous_secret is None or self.previous_until is None:
             return [self.secret]
         return [self.secret] + [self.previous_secret] * (now < self.previous_until)
 
 
 def add_webhook(connection: Connection, row: Row) -> None:
-    """Store a webhook."""
+    """Insert a webhook into the database."""
     connection.execute(insert(webhooks).values(_stored(row)))
 
 
 def change_webhook(connection: Connection, id: str, changes: Row) -> None:
-    """Change a webhook; raises `NotFound`."""
+    """Update a webhook in the database; raises `NotFound`."""
     changed = connection.execute(
         update(webhooks).where(webhooks.c.id == id).values(_stored(changes))
     )
@@ -170,16 +170,16 @@ def delete_webhook(connection: Connection, id: str) -> None:
 
 
 def count_webhooks(connection: Connection) -> int:
-    """How many webhooks there are."""
+    """Number of webhooks in the database."""
     return int(connection.scalar(select(func.count()).select_from(webhooks)) or 0)
 
 
 def list_webhooks(
     connection: Connection, now: str, is_open: bool, id: str | None = None
 ) -> list[Webhook]:
-    """Every webhook, or one, as the API shows it; the oldest first.
+    """API records of all webhooks or one, oldest first.
 
-    `is_open`: whether access is open, so that a webhook needs no token.
+    `is_open`: True if access is open, so that a webhook needs no token.
     """
     of_each = {row["webhook_id"]: row for row in connection.execute(_counts()).mappings()}
     return [
@@ -189,7 +189,7 @@ def list_webhooks(
 
 
 def read_webhook(connection: Connection, id: str, now: str, is_open: bool) -> Webhook:
-    """One webhook as the API shows it; raises `NotFound`."""
+    """API record of one webhook; raises `NotFound`."""
     for found in list_webhooks(connection, now, is_open, id):
         return found
     raise _unknown(id)
@@ -198,21 +198,21 @@ def read_webhook(connection: Connection, id: str, now: str, is_open: bool) -> We
 def registered_webhooks(
     connection: Connection, now: str, is_open: bool, id: str | None = None
 ) -> Sequence[Registered]:
-    """Every webhook, or one, as it is sent to."""
+    """Stored webhooks with secrets, all or one, for delivery."""
     names = [each.name for each in fields(Registered)]
     rows = _rows(connection, now, is_open, id)
     return [Registered(**{name: row[name] for name in names}) for row in rows]
 
 
 def registered_webhook(connection: Connection, id: str, now: str, is_open: bool) -> Registered:
-    """One webhook as it is sent to; raises `NotFound`."""
+    """Stored webhook with secrets, for delivery; raises `NotFound`."""
     for found in registered_webhooks(connection, now, is_open, id):
         return found
     raise _unknown(id)
 
 
 def _rows(connection: Connection, now: str, is_open: bool, id: str | None) -> Iterator[Row]:
-    """Webhooks as they are stored, each with its lists, its state and the reason of that."""
+    """Database rows of webhooks with decoded lists, state and reason of the state."""
     tokens = access_tokens.c
     query = (
         select(
@@ -243,7 +243,7 @@ def _counts() -> Any:
 
 
 def _state(row: Any, now: str, is_open: bool) -> tuple[WebhookStateName, str | None]:
-    """The state of a webhook, and the reason where nothing is sent."""
+    """State of a webhook, and the reason if it receives nothing."""
     if row["gone_at"] is not None:
         return "disabled", f"the receiver answered 410 Gone at {row['gone_at']}"
     if not row["enabled"]:
@@ -282,18 +282,18 @@ def _unknown(id: str) -> NotFound:
 # Deliveries: queued, settled, dead-lettered, queued again.
 
 DEAD_KEPT = 10_000
-"""Dead letters of one webhook; of more the oldest are deleted."""
+"""Greatest number of dead letters kept for a webhook; older ones are deleted."""
 
 NUMBERS_AT_ONCE = 500
-"""The numbers in one statement."""
+"""Greatest number of event numbers in one SQL statement."""
 
 
 @dataclass(frozen=True)
 class Queue:
-    """The deliveries of a webhook that wait for each other: of one spacecraft, in order.
+    """A queue of deliveries that must stay in order: one webhook, one spacecraft.
 
-    `spacecraft` is empty for events about none or about all.  `again`: those that
-    were asked for again.
+    `spacecraft` is empty for events about none or about all.  `again` marks retries and replays,
+    which form a queue of their own.
     """
 
     webhook_id: str
@@ -303,7 +303,7 @@ class Queue:
 
 @dataclass(frozen=True)
 class Waiting:
-    """A delivery, as it is sent."""
+    """A queued delivery with its message body."""
 
     event_id: int
     message_id: str
@@ -314,11 +314,11 @@ class Waiting:
 
 @dataclass(frozen=True)
 class Attempt:
-    """What came of attempts in one queue, at a time.
+    """Result of delivery attempts in one queue.
 
-    `failed` is the delivery that failed, if one did; with `due` None it is dead.
-    `held_until`: the receiver asked that nothing be sent before.  `gone`: it asked that
-    nothing be sent again.
+    `failed` is the delivery that failed, if any; with `due` None it becomes a dead letter.
+    `held_until` is the time before which the receiver wants no messages.  `gone`: the receiver
+    wants no messages ever again.
     """
 
     queue: Queue
@@ -335,10 +335,10 @@ class Attempt:
 def queue_events(
     connection: Connection, id: str, *, before: int, after: int, missed: int, rows: Sequence[Row]
 ) -> bool:
-    """Queue the events from the position `before` to `after` that a webhook wants.
+    """Queue the events that a webhook wants, from position `before` to `after`.
 
-    Returns False, with nothing changed, where the webhook is no longer at `before`:
-    another process moved it on, or it was deleted.
+    Returns False, without changes, if the webhook is no longer at `before`: another process
+    advanced it, or it was deleted.
     """
     moved = connection.execute(
         update(webhooks)
@@ -353,9 +353,9 @@ def queue_events(
 
 
 def queue_again(connection: Connection, id: str, rows: Sequence[Row]) -> int:
-    """Queue events anew, dead letters too; those that wait stay where they are.
+    """Queue events again, dead letters included; waiting deliveries keep their place.
 
-    Returns how many there are.
+    Returns the number of events.
     """
     numbers = [row["event_id"] for row in rows]
     for first in range(0, len(numbers), NUMBERS_AT_ONCE):
@@ -368,9 +368,9 @@ def queue_again(connection: Connection, id: str, rows: Sequence[Row]) -> int:
 
 
 def retry_dead(connection: Connection, id: str, numbers: Sequence[int] | None, now: str) -> int:
-    """Queue dead letters again, some or all; returns how many.
+    """Queue dead letters again, some or all; returns their number.
 
-    Raises `BadInput` for a number of another event.
+    Raises `BadInput` for a number that is not a dead letter's.
     """
     chosen = [_row.webhook_id == id, _row.dead]
     if numbers is not None:
@@ -385,7 +385,7 @@ def retry_dead(connection: Connection, id: str, numbers: Sequence[int] | None, n
 
 
 def resume(connection: Connection, id: str, now: str) -> None:
-    """Let what waits be tried at once, and for a whole day from now."""
+    """Make all waiting deliveries of a webhook due now, with a full day of retries."""
     connection.execute(
         update(webhook_deliveries)
         .where(_row.webhook_id == id, ~_row.dead)
@@ -394,13 +394,13 @@ def resume(connection: Connection, id: str, now: str) -> None:
 
 
 def count_waiting(connection: Connection) -> dict[str, int]:
-    """How many deliveries wait, by webhook."""
+    """Number of waiting deliveries by webhook id."""
     query = select(_row.webhook_id, func.count()).where(~_row.dead).group_by(_row.webhook_id)
     return {row[0]: row[1] for row in connection.execute(query)}
 
 
 def heads(connection: Connection) -> list[tuple[Queue, str]]:
-    """Every queue, and when its first delivery is due; the one that is due first comes first."""
+    """All queues with the due time of their first delivery, the earliest first."""
     first = (
         select(_row.webhook_id, func.min(_row.event_id).label("event_id"))
         .where(~_row.dead)
@@ -419,7 +419,7 @@ def heads(connection: Connection) -> list[tuple[Queue, str]]:
 
 
 def next_of(connection: Connection, queue: Queue, limit: int) -> list[Waiting]:
-    """The first deliveries of a queue, in order."""
+    """First deliveries of a queue, in order."""
     query = (
         select(_row.event_id, _row.message_id, _row.body, _row.queued, _row.attempts)
         .where(
@@ -435,9 +435,9 @@ def next_of(connection: Connection, queue: Queue, limit: int) -> list[Waiting]:
 
 
 def settle(connection: Connection, attempt: Attempt) -> None:
-    """Delete what was delivered, note what failed, and both at the webhook.
+    """Delete delivered rows, record a failure, and update the webhook's state.
 
-    A failure is not noted where the delivery was queued again, resumed or tried since.
+    A failure is ignored if the delivery was queued again, resumed or tried since.
     """
     of_webhook = _row.webhook_id == attempt.queue.webhook_id
     noted: Row = {"last_attempt": attempt.at, "last_status": attempt.status}
@@ -461,7 +461,7 @@ def settle(connection: Connection, attempt: Attempt) -> None:
 
 
 def _note_failure(connection: Connection, attempt: Attempt, failed: Waiting) -> bool:
-    """Note a failure; False where the delivery is no longer as it was when it was sent."""
+    """Record a failed delivery; False if the row has changed since the attempt began."""
     of_webhook = _row.webhook_id == attempt.queue.webhook_id
     is_dead = attempt.due is None
     values = {
@@ -502,7 +502,7 @@ def list_deliveries(
     cursor: str | None,
     oldest_first: bool = False,
 ) -> Page[WebhookDelivery]:
-    """Deliveries of a webhook, the latest event first; a cursor is the last number shown."""
+    """One page of a webhook's deliveries, latest event first; the cursor is the last event."""
     query = select(webhook_deliveries).where(_row.webhook_id == id)
     if dead is not None:
         query = query.where(_row.dead if dead else ~_row.dead)
@@ -537,15 +537,15 @@ def _shown(row: Any) -> WebhookDelivery:
 
 
 def read_sender(connection: Connection) -> tuple[str | None, int]:
-    """The process that delivers, None for none, and its number."""
+    """Name of the delivering process, None for none, and its heartbeat number."""
     found = connection.execute(select(webhook_sender.c.holder, webhook_sender.c.beat)).one()
     return found.holder, found.beat
 
 
 def hold_sender(connection: Connection, holder: str | None, beat: int) -> bool:
-    """Deliver from now on, or go on to; False where the number is no longer `beat`.
+    """Claim or keep the role of the delivering process; False if its number is not `beat`.
 
-    With None as holder no process delivers any more.
+    With None as holder the role is released.
     """
     taken = connection.execute(
         update(webhook_sender)

@@ -1,4 +1,4 @@
-"""Webhooks: events that the service sends to receivers."""
+"""API routes for webhooks, which send events to receivers."""
 
 from typing import Annotated, Any, Literal, Self
 
@@ -41,7 +41,7 @@ WebhooksDep = Annotated[Webhooks, Depends(_webhooks)]
 
 
 class WebhookIn(Wire):
-    """The settings of a webhook."""
+    """Request body with the settings of a webhook."""
 
     name: Annotated[
         str,
@@ -76,12 +76,12 @@ class WebhookIn(Wire):
     enabled: Annotated[bool, Field(description="false: it is paused.")] = True
 
     def settings(self) -> dict[str, Any]:
-        """The settings as they are stored."""
+        """Settings of a webhook in the form of the database."""
         return self.model_dump() | {"run": None if self.run == ALL else self.run}
 
 
 class SecretIn(Wire):
-    """How long a replaced secret goes on signing."""
+    """Request body for a new secret: hours for which the previous one stays valid."""
 
     previous_hours: Annotated[
         int, Field(ge=0, le=168, strict=True, description="0: it signs no more.")
@@ -89,7 +89,7 @@ class SecretIn(Wire):
 
 
 class RetryIn(Wire):
-    """Which dead letters are sent again."""
+    """Request body that selects dead letters to send again."""
 
     events: Annotated[
         list[Annotated[int, Field(ge=1, lt=1 << 63, strict=True)]] | None,
@@ -98,7 +98,7 @@ class RetryIn(Wire):
 
 
 class ReplayEventsIn(Wire):
-    """Which events are sent again, by the time at which they were recorded."""
+    """Request body that selects events to send again, by their time of recording."""
 
     since: Annotated[Time, Field(description="By the service's clock, included.")]
     until: Annotated[Time | None, Field(description="Excluded; null: now.")] = None
@@ -111,7 +111,7 @@ class ReplayEventsIn(Wire):
 
 
 class DeliveryQuery(Query):
-    """Which deliveries."""
+    """Query that selects deliveries of a webhook by state."""
 
     state: Annotated[
         Literal["waiting", "dead"] | None, Field(description="Only these; default: both.")
@@ -128,13 +128,13 @@ class DeliveryQuery(Query):
 
 @router.serves("GET /webhooks", OPERATE, Returns("All webhooks.", records.WebhookList))
 def list_webhooks(webhooks: WebhooksDep) -> Response:
-    """Every webhook, with its state and its last failure."""
+    """All webhooks, with their state and last failure."""
     return json_response({"items": webhooks.all()})
 
 
 @router.serves("GET /webhooks/{id}", OPERATE, Returns("The webhook.", records.Webhook))
 def get_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
-    """One webhook."""
+    """One webhook with its state and last failure."""
     return json_response(webhooks.get(id))
 
 
@@ -148,7 +148,7 @@ def get_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
     problems=(409,),
 )
 def add_webhook(body: JsonBody, webhooks: WebhooksDep, change: ChangeDep) -> Response:
-    """Register a receiver, which is sent the events from now on, signed (Standard Webhooks)."""
+    """Register a receiver for events, signed as in Standard Webhooks, from now on."""
     _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
     added = webhooks.add(asked.settings(), change.caller, change.entry(201))
@@ -161,7 +161,7 @@ def add_webhook(body: JsonBody, webhooks: WebhooksDep, change: ChangeDep) -> Res
 def change_webhook(
     id: WebhookId, body: JsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
-    """Replace all settings; a webhook that was paused or disabled goes on where it stopped."""
+    """Replace all settings of a webhook; if paused or disabled it continues where it stopped."""
     _require_reader(change.caller)
     asked = read_model(WebhookIn, body)
     return json_response(webhooks.change(id, asked.settings(), change.caller, change.entry()))
@@ -189,7 +189,7 @@ def delete_webhook(id: WebhookId, webhooks: WebhooksDep, change: ChangeDep) -> R
 def rotate_webhook_secret(
     id: WebhookId, body: OptionalJsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
-    """Make a new secret; deliveries are signed by the previous one too for some hours.
+    """Create a new signing secret; the previous one stays valid for some hours.
 
     A second time within these hours only with `previous_hours` 0, which ends both.
     """
@@ -204,7 +204,7 @@ def rotate_webhook_secret(
     problems=(409, 503),
 )
 def test_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
-    """Send an event of the type `test` at once, and wait for the receiver's answer."""
+    """Send a webhook a test event at once, and wait for the receiver's answer."""
     return json_response(webhooks.try_out(id))
 
 
@@ -216,7 +216,7 @@ def test_webhook(id: WebhookId, webhooks: WebhooksDep) -> Response:
 def list_webhook_deliveries(
     id: WebhookId, request: Request, query: FromQuery[DeliveryQuery], webhooks: WebhooksDep
 ) -> Response:
-    """Events that wait for a webhook, and its dead letters; by default the latest event first."""
+    """Queued events and dead letters of a webhook; by default the latest event first."""
     dead = None if query.state is None else query.state == "dead"
     page = webhooks.deliveries(
         id, dead, query.limit, query.cursor, oldest_first=query.order == "oldest"
@@ -234,7 +234,7 @@ def list_webhook_deliveries(
 def retry_dead_letters(
     id: WebhookId, body: OptionalJsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
-    """Send dead letters again; new events of the spacecraft do not wait for them."""
+    """Queue dead letters again; new events of the spacecraft do not wait for them."""
     asked = read_model(RetryIn, body)
     return json_response(webhooks.retry(id, asked.events, change.entry()))
 
@@ -248,11 +248,11 @@ def retry_dead_letters(
 def replay_events(
     id: WebhookId, body: JsonBody, webhooks: WebhooksDep, change: ChangeDep
 ) -> Response:
-    """Send the kept events of a period again, with the ids that they had."""
+    """Queue stored events of a period again, with their original message ids."""
     asked = read_model(ReplayEventsIn, body)
     return json_response(webhooks.replay(id, asked.since, asked.until, change.entry()))
 
 
 def _require_reader(caller: Caller) -> None:
-    """Raise `Forbidden` unless the caller may read what the webhook is sent."""
+    """Raise `Forbidden` unless the caller may read the events sent to the webhook."""
     require_scope(caller, "read")

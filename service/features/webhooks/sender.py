@@ -1,9 +1,9 @@
-"""Delivers recorded events to webhooks, from one thread with an event loop of its own.
+"""Delivery of recorded events to webhooks, in a thread with its own event loop.
 
-Each second, and after each commit, it queues new events for the webhooks that want
-them and begins to deliver the queues that are due, a few of each webhook at a time.
-A queue is the events of one spacecraft for one webhook: what fails there holds up
-nothing else.  Nothing here waits in the service's own event loop or in its writer.
+Every second, and after each commit, new events are queued for the webhooks that want them, and due
+queues are delivered, a few per webhook at a time.  A queue has the events of one spacecraft for one
+webhook: a failure there delays nothing else.  The thread does not block the service's event loop or
+its writer.
 """
 
 import asyncio
@@ -37,47 +37,47 @@ log = logging.getLogger(__name__)
 
 POLL_S = 1.0
 GATHER_S = 0.2
-"""The wait after a commit: under load many events are queued at once."""
+"""Delay after a commit in seconds, so that many events are queued at once under load."""
 PARALLEL = 4
-"""Attempts for one webhook at a time: a receiver that does not answer occupies its own alone."""
+"""Greatest number of parallel attempts for one webhook."""
 READ_AT_ONCE = 500
 DELIVERED_AT_ONCE = 20
-"""Events that are noted as delivered together."""
+"""Number of delivered events recorded in one transaction."""
 NOTED_AFTER_S = 2.0
 MAX_WAITING = 50_000
-"""Queued events of one webhook; further ones stay in the list of events as long as that is kept."""
+"""Greatest number of queued events of a webhook; later ones wait in the event list."""
 DEAD_AFTER_S = DAY_S
 FIRST_DELAY_S, LAST_DELAY_S = 5.0, 3600.0
 JITTER = 0.2
 NOTE_AGAIN_S = 1.0
-"""The pause after an outcome could not be noted, as while the writer's queue is full."""
+"""Delay in seconds before recording an outcome again, after the writer was busy."""
 STOP_S = 2.0
-"""How long attempts that are under way may take when the service stops."""
+"""Seconds that attempts in progress may take when the service stops."""
 MAX_TESTS = 4
 LISTED_FOR_S = 5.0
-"""Nothing is sent by a list of webhooks that is older: a token may have been revoked."""
+"""Greatest age in seconds of the list of webhooks used: a token may have been revoked."""
 
 T = TypeVar("T")
 
 
 def retry_delay_s(attempts: int, share: float) -> float:
-    """The pause after so many failed attempts: 5 s, twice that each time, an hour at most.
+    """Delay in seconds after failed attempts: 5 s, doubled each time, at most an hour.
 
-    `share` from 0 to 1 is a random number: so much of a fifth is added.
+    `share` is a random number from 0 to 1, for an additional delay of up to a fifth.
     """
     doubled = FIRST_DELAY_S * 2.0 ** min(attempts - 1, 20)
     return min(doubled, LAST_DELAY_S) * (1.0 + JITTER * share)
 
 
 class WebhookSender:
-    """Delivers events to webhooks between `start` and `stop`."""
+    """Delivers events to webhooks, from `start` to `stop`."""
 
     def __init__(
         self, store: Store, allowed: Sequence[Network], is_open: Callable[[], bool]
     ) -> None:
-        """`allowed` are networks that webhooks may reach though they are not public.
+        """Prepare a sender; `allowed` are networks that webhooks may reach though not public.
 
-        `is_open` says whether access is open, so that a webhook needs no token.
+        `is_open` is true if access is open, so that a webhook needs no token.
         """
         self._store = store
         self._allowed = allowed
@@ -97,7 +97,7 @@ class WebhookSender:
         self.log = messages.DeliveryLog()
 
     def start(self) -> None:
-        """Begin to deliver, unless that has begun."""
+        """Start the delivery thread, unless it runs."""
         if self._thread is not None:
             return
         self._thread = threading.Thread(
@@ -107,7 +107,7 @@ class WebhookSender:
         self._started.wait()
 
     def stop(self) -> None:
-        """Wait a little for the attempts under way, and note those that have succeeded."""
+        """Stop the thread; attempts in progress get a short time, and their success is recorded."""
         if self._thread is None:
             return
         with suppress(RuntimeError):
@@ -117,16 +117,16 @@ class WebhookSender:
         self._readers.shutdown(wait=False)
 
     def changed(self) -> None:
-        """Read the webhooks again before anything is sent: one was made, changed or deleted."""
+        """Reload the webhooks before the next delivery, after one was added, changed or deleted."""
         self._changes += 1
         self._listed_s = -LISTED_FOR_S
         if self._thread is not None:
             self._poke()
 
     def try_out(self, webhook: Registered) -> tuple[str, messages.Outcome]:
-        """Send a test event, and wait for what comes of it; returns its id too.
+        """Send a test event and wait; returns its message id and the outcome.
 
-        Raises `Busy` while too many are sent, or where nothing is sent from this process.
+        Raises `Busy` during too many tests, or if this process does not deliver.
         """
         if self._thread is None:
             raise Busy("webhooks are not delivered by this process now")
@@ -172,7 +172,7 @@ class WebhookSender:
             try:
                 await self._round()
             except Exception as error:
-                # The records are out of reach for a while: nothing is lost, it comes later.
+                # The database is out of reach: nothing is lost, events are delivered later.
                 log.warning("webhooks are not delivered: %s", error)
                 await asyncio.sleep(POLL_S)
             with suppress(TimeoutError):
@@ -191,7 +191,7 @@ class WebhookSender:
             known = await self._read(self._list)
             self._webhooks = {webhook.id: webhook for webhook in known}
             self.log.listed(known)
-            # What changed meanwhile is perhaps not in the list.
+            # The list may lack changes made while it was read.
             self._listed_s = now_s if changes == self._changes else -LISTED_FOR_S
         if not self._store.is_projecting:
             # Another service delivers.
@@ -207,7 +207,7 @@ class WebhookSender:
             await self._begin_due()
 
     async def _queue_news(self, webhook: Registered, last: int, room: int) -> None:
-        """Queue the events up to `last` that a webhook wants, while there is room for them."""
+        """Queue the events up to `last` that a webhook wants, while its queue has room."""
         position = self._positions.get(webhook.id, webhook.position)
         # It is beyond `last` where events were recorded after `last` was read.
         while position < last and room > 0:
@@ -247,7 +247,7 @@ class WebhookSender:
                 self._under_way[queue] = asyncio.create_task(self._work_through(queue))
 
     def _receiver(self, webhook_id: str) -> Registered | None:
-        """The webhook, where something may be sent to it now."""
+        """The webhook, if this process may send to it now; otherwise None."""
         webhook = self._webhooks.get(webhook_id)
         is_listed = time.monotonic() - self._listed_s < LISTED_FOR_S
         if webhook is None or webhook.state != "active":
@@ -295,7 +295,7 @@ class WebhookSender:
                     self.changed()
 
     async def _note(self, attempt: Attempt) -> None:
-        """Note what came of attempts; the queue waits, so that nothing is sent again meanwhile."""
+        """Record the result of attempts; the queue waits, so that nothing is sent twice."""
         while True:
             try:
                 return await self._change(partial(webhooks.settle, attempt=attempt))
@@ -366,7 +366,7 @@ class WebhookSender:
             return last_event(connection), webhooks.count_waiting(connection)
 
     def _after(self, position: int) -> tuple[Sequence[Event], int]:
-        """The next events, and how many are no longer kept; none where the position is unknown."""
+        """Next events after a position, and the number of deleted ones; none if it is unknown."""
         with self._store.reading_record() as connection:
             found = events_after(connection, position, READ_AT_ONCE)
             if found is not None:
@@ -388,15 +388,15 @@ class WebhookSender:
 
 BEAT_S = 3.0
 FRESH_S = 8.0
-"""No attempt is begun when the last beat is older; one takes ten seconds at most."""
+"""Greatest age in seconds of the last heartbeat for a new attempt, which takes at most 10 s."""
 TAKE_OVER_S = 20.0
-"""So that the last attempt of a process that stood still is over before another one begins."""
+"""Seconds without a heartbeat after which another process takes over, and attempts have ended."""
 
 Read = Callable[[Callable[[], tuple[str | None, int]]], Awaitable[tuple[str | None, int]]]
 
 
 class Turn:
-    """The claim of one process to deliver."""
+    """Claim of one process to deliver events, kept by heartbeats in the database."""
 
     def __init__(self, store: Store, name: str) -> None:
         self._store = store
@@ -408,11 +408,11 @@ class Turn:
 
     @property
     def is_fresh(self) -> bool:
-        """True if this process delivers, and no other can do so within the next seconds."""
+        """True if this process holds the claim, and no other can take over within seconds."""
         return self._is_held and time.monotonic() - self._beaten_s < FRESH_S
 
     async def take(self, read: Read) -> bool:
-        """True if this process delivers now; call it at least every few seconds."""
+        """Take or renew the claim; True if this process delivers.  Call every few seconds."""
         now_s = time.monotonic()
         if self._is_held:
             if now_s - self._beaten_s >= BEAT_S:
@@ -426,7 +426,7 @@ class Turn:
         return self._is_held
 
     async def give_up(self) -> None:
-        """Let another process deliver at once."""
+        """Release the claim, so that another process can deliver at once."""
         if self._is_held:
             self._is_held = False
             await self._hold(None)

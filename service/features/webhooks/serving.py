@@ -1,4 +1,4 @@
-"""Events are delivered to webhooks while the service serves."""
+"""Start of webhook deliveries with the service."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,11 +10,11 @@ from service.web.requests.metrics import Metrics
 
 
 def check(settings: Settings) -> None:
-    """Every setting of webhooks was checked where it was read."""
+    """Do nothing: settings of webhooks are checked when they are read."""
 
 
 @asynccontextmanager
 async def serving(app: App, metrics: Metrics) -> AsyncIterator[None]:
-    """Start the sender; the app stops it when it closes."""
+    """Start the sender of webhooks; the app stops it on closing."""
     app.part(Webhooks).sender.start()
     yield

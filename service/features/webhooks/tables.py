@@ -1,4 +1,4 @@
-"""The tables of webhooks: receivers of events, what waits for them, and which process delivers."""
+"""Database tables of webhooks, their deliveries, and the delivering process."""
 
 import sqlalchemy as sa
 
