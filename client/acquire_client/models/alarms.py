@@ -102,7 +102,7 @@ class AnnotationChange(Annotation, frozen=True, kw_only=True):
 
 
 class AlarmAction(Model, frozen=True, kw_only=True):
-    """A change of an alarm, by its value or by a person."""
+    """An entry in the history of an alarm, caused by a new value or by a user."""
 
     at: str
     action: str
@@ -114,7 +114,7 @@ class AlarmAction(Model, frozen=True, kw_only=True):
 
 
 class AlarmWithActions(Alarm, frozen=True, kw_only=True):
-    """An alarm with its history."""
+    """An alarm with the history of its actions."""
 
     actions: Sequence[AlarmAction]
     """Oldest first."""

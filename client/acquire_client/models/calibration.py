@@ -72,7 +72,7 @@ class CalibrationInForce(Model, frozen=True, kw_only=True):
 
 
 class CalibrationBatches(Model, frozen=True, kw_only=True):
-    """The batches that a calibration came from."""
+    """Numbers of batches that a calibration used, and their period."""
 
     total: int
     """Batches in the period."""
@@ -87,7 +87,7 @@ class CalibrationBatches(Model, frozen=True, kw_only=True):
 
 
 class CalibrationHeldOut(Model, frozen=True, kw_only=True):
-    """How well a distortion of a degree predicts blocks of time that it was not fitted to."""
+    """Prediction error of a distortion of some degree on blocks of time outside of its fit."""
 
     degree: int
     residual_over_sigma: float
@@ -95,7 +95,7 @@ class CalibrationHeldOut(Model, frozen=True, kw_only=True):
 
 
 class CalibrationResiduals(Model, frozen=True, kw_only=True):
-    """Root mean square of a tracker's residuals per axis, before and after."""
+    """Root mean square of a tracker's residuals per axis, before and after calibration."""
 
     tracker: str
     stars: int
@@ -118,7 +118,7 @@ class CalibrationUnknown(Model, frozen=True, kw_only=True):
 
 
 class CalibrationNotObservable(Model, frozen=True, kw_only=True):
-    """Something that the stars cannot show, and why."""
+    """A parameter that the stars do not determine, and the reason."""
 
     name: str
     reason: str
@@ -148,7 +148,7 @@ class ResidualMap(Model, frozen=True, kw_only=True):
 
 
 class CalibrationResult(Model, frozen=True, kw_only=True):
-    """What the stars say of the trackers."""
+    """Result of a calibration: parameters, residuals, and the settings to change."""
 
     batches: CalibrationBatches
     stars: int
@@ -173,7 +173,7 @@ class CalibrationResult(Model, frozen=True, kw_only=True):
 
 
 class CalibrationProgress(Model, frozen=True, kw_only=True):
-    """What every calibration has from its start on."""
+    """Fields of every calibration, present from its start on."""
 
     id: str
     spacecraft: str
@@ -205,7 +205,7 @@ class CalibrationSummary(CalibrationProgress, frozen=True, kw_only=True):
 
 
 class Calibration(CalibrationProgress, frozen=True, kw_only=True):
-    """A calibration: what was asked, how far it is, and what was found."""
+    """A calibration: its request, its progress and its result."""
 
     request: dict[str, Any]
     fault: str | None

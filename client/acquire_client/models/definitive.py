@@ -1,4 +1,4 @@
-"""Days of grades in the records: a new revision where the facts have changed, none otherwise."""
+"""Database records of filtered and smoothed days: a new revision if the input has changed."""
 # Written by `make client` from service/features/definitive/records.py.
 
 from collections.abc import Sequence
@@ -8,29 +8,29 @@ from ..words import Status
 
 
 class Innovation(Model, frozen=True, kw_only=True):
-    """How a measured attitude met the filter, and how it differs from the smoothed attitude."""
+    """Difference of a measured attitude from the filter's prediction and the smoothed attitude."""
 
     time: str
     outcome: str
-    """`accepted` and `started` measurements are used; `started`: with it the filter began.
-    `undecided`: it agrees with two attitudes that contradict each other."""
+    """`accepted` and `started` measurements were used; `started`: the filter started from it.
+    `undecided`: the measurement agrees with two attitudes that contradict each other."""
     innovation_arcsec: Sequence[float] | None
-    """From prediction to measurement, about the body axes; None: nothing was predicted."""
+    """Rotation vector from prediction to measurement, about the body axes; None: no prediction."""
     innovation_sigma_arcsec: Sequence[float] | None
-    """One sigma of prediction and measurement together."""
+    """One sigma of prediction and measurement together, about each body axis."""
     chi_square: float | None
     """Chi-square of the innovation, with three degrees of freedom: 3 on average."""
     difference_arcsec: Sequence[float]
-    """From the smoothed attitude to the measured one, about the body axes."""
+    """Rotation vector from the smoothed attitude to the measured one, about the body axes."""
     difference_sigma_arcsec: Sequence[float]
-    """One sigma; the smoothed attitude is partly made of the measured one."""
+    """One sigma of the difference; the smoothed attitude depends on the measured one."""
     model: str
     revision: int
     """Revision of the day."""
 
 
 class DefinitiveJob(Model, frozen=True, kw_only=True):
-    """The making of a definitive attitude: filtered and smoothed attitudes of recorded days."""
+    """A job that computes the definitive attitude: filtered and smoothed attitudes of days."""
 
     id: str
     spacecraft: str
@@ -54,7 +54,7 @@ class DefinitiveJob(Model, frozen=True, kw_only=True):
 
 
 class LiveAttitude(Model, frozen=True, kw_only=True):
-    """The filtered attitude at the last epoch of live data; use it only where `status` is good."""
+    """The filtered attitude at the last epoch of live data; use only with `status` good."""
 
     spacecraft: str
     time: str
@@ -68,5 +68,5 @@ class LiveAttitude(Model, frozen=True, kw_only=True):
     bias_sigma_deg_per_h: Sequence[float]
     """One sigma of the bias or, at a constant rate, of the rate."""
     status: Status
-    """`suspect`: measurements contradict it, or have not confirmed it yet."""
+    """Status of the filtered attitude; `suspect`: contradicted or not confirmed yet."""
     model: str

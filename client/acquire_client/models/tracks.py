@@ -1,4 +1,4 @@
-"""Tracks of points that no catalog star explains: what is read for them, and their records."""
+"""Records of tracks for the API, and the recorded batches that they are computed from."""
 # Written by `make client` from service/features/tracks/records.py.
 
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from ..base import Model
 
 
 class TrackPoint(Model, frozen=True, kw_only=True):
-    """A point of a track."""
+    """A point of a track: an unmatched star of one batch and tracker."""
 
     id: str
     """The result of the batch."""
@@ -22,7 +22,7 @@ class TrackPoint(Model, frozen=True, kw_only=True):
 
 
 class Track(Model, frozen=True, kw_only=True):
-    """Points that move together, at most one of each batch and tracker."""
+    """A track: points that move together, at most one per batch and tracker."""
 
     kind: str
     """`moving`: moves on the sky, and no planet does so there. `planet`: as a planet does.
@@ -66,7 +66,7 @@ class Track(Model, frozen=True, kw_only=True):
 
 
 class TrackList(Model, frozen=True, kw_only=True):
-    """The tracks of a period, those of most points first."""
+    """The tracks in a period, the track with the most points first."""
 
     spacecraft: str
     run: str
