@@ -288,7 +288,7 @@ class IngestQueue:
             if pending.key is not None
         ]
         try:
-            outcomes = self._store.writer.change(partial(remember_keys, keys=keys))
+            outcomes = self._store.writer.change(partial(remember_keys, keys=keys), of_posts=True)
         except Exception as error:
             # A client whose key is not kept must send again: it gets the error, not the answer.
             return dict.fromkeys(repeats, error)

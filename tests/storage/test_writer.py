@@ -127,6 +127,18 @@ def test_results_that_waited_too_long_are_refused_and_what_waits_with_them_is_wr
     assert not outcome.replayed
 
 
+def test_a_repeat_with_a_new_key_is_refused_where_its_key_cannot_be_kept_in_time(
+    app, make, monkeypatch, threads
+):
+    app.submissions.submit(make("b1"))
+    monkeypatch.setattr(app.store.writer, "_wait_s", 0.05)
+    go_on = held_up(app.store.writer, threads)
+    with pytest.raises(Busy, match="not written yet"):
+        app.submissions.submit(make("b1"), "given later")
+    go_on.set()
+    assert app.submissions.submit(make("b1"), "given later").replayed
+
+
 def test_an_answer_comes_after_its_commit(store):
     for index in range(20):
         store.writer.change(new_run(f"run{index:02d}"))

@@ -143,7 +143,7 @@ class Writer:
         lock: ProjectorLock | None = None,
         file_lock: FileLock | None = None,
     ) -> None:
-        """Prepare the writer; `file` is SQLite's, `wait_s` bounds the wait of results for a turn.
+        """Prepare the writer; `file` is SQLite's, `wait_s` bounds the wait of posts for a turn.
 
         Results of a bulk load, and other changes, wait as long as it takes.  With a `lock` only the
         session that holds it projects; see `take_lock`.  `file_lock` is taken before the first
@@ -188,11 +188,15 @@ class Writer:
                 self._is_failing = False
         return outcomes
 
-    def change(self, change: Callable[[Connection], T]) -> T:
-        """Make a change in one transaction; after a conflict `change` is called again."""
+    def change(self, change: Callable[[Connection], T], *, of_posts: bool = False) -> T:
+        """Make a change in one transaction; after a conflict `change` is called again.
+
+        Changes of posts wait no longer for their turn than results do; raises `Busy` after that.
+        """
 
         def write(_: bool) -> T:
-            with self._transaction() as connection:
+            wait_s = self._wait_s if of_posts else None
+            with self._transaction(wait_s=wait_s) as connection:
                 return change(connection)
 
         return self._attempted(write, 1)
