@@ -1,1 +1,1 @@
-"""From submissions to recorded answers: single posts, bulk, replays, reprocessing."""
+"""Processing of submissions to recorded answers: single posts, bulk, replays, reprocessing."""

@@ -1,7 +1,7 @@
-"""Many batches at once, from lines of telemetry to stored answers.
+"""Bulk processing of batches, from lines of telemetry to stored answers.
 
-Worker processes compute where there are any; otherwise this process does, a portion at
-a time while no single post waits.  Only this process uses the database.
+Worker processes compute if there are any; otherwise this process does, a portion at a time while no
+single post waits.  Only this process uses the database.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -26,20 +26,19 @@ from service.storage.recording.unsaved_result import Answered, UnsavedResult
 from service.storage.store import Store
 
 PENDING_A_WORKER = 2
-"""Chunks a worker that it has, or that wait for it."""
+"""Number of chunks for each worker, those at work and those waiting."""
 
 LineAnswer = Answered | Recorded | AcquisitionError
-"""The answer to a line: a batch's answer, a gyro block's row, or what is wrong with it."""
+"""Answer to a line of telemetry: a batch's answer, a gyro block's row, or an error."""
 
 
-# Lines of telemetry, a batch or a gyro block each: read and solved many at once.
-#
-# In this process or in a worker.
+# Lines of telemetry, each a batch or a gyro block, are read and solved many at once, in this
+# process or in a worker.
 
 
 @dataclass(frozen=True)
 class TelemetryLines:
-    """Lines for one run; `known` holds the positions of those that seem to be recorded."""
+    """Lines of telemetry for one run; `known` holds the positions of those that seem recorded."""
 
     run: str
     texts: Sequence[bytes]
@@ -48,7 +47,7 @@ class TelemetryLines:
 
 @dataclass(frozen=True)
 class RecordedLine:
-    """A line that was read, but not computed."""
+    """Line of telemetry that was read but not computed, since its batch seems recorded."""
 
     identity: Identity
     fingerprint: str
@@ -56,7 +55,7 @@ class RecordedLine:
 
 @dataclass(frozen=True)
 class InvalidLine:
-    """The error of a line, and the spacecraft of its batch where it can be read."""
+    """Error of a line of telemetry, with its spacecraft if readable."""
 
     spacecraft: str | None
     error: AcquisitionError
@@ -64,7 +63,7 @@ class InvalidLine:
 
 @dataclass(frozen=True)
 class TrackedLine:
-    """A batch that asks for the last attitude, as JSON: only the record has it."""
+    """Batch that asks for the last attitude, as JSON; it needs the record to be computed."""
 
     identity: Identity
     text: str
@@ -77,9 +76,10 @@ ComputeMany = Callable[[Sequence[Submission]], Sequence[UnsavedResult | Acquisit
 def line_results(
     lines: TelemetryLines, compute: ComputeMany, asks_for_last: Callable[[ObservationBatch], bool]
 ) -> list[LineResult]:
-    """The result of each line, in order; `compute` is given all new submissions.
+    """Compute the result of each line of telemetry, in order; `compute` gets all new submissions.
 
-    Except those for which `asks_for_last` is true: they need what is recorded before them.
+    Batches for which `asks_for_last` is true are left out: they need the results recorded before
+    them.
     """
     read = [_read(text, lines.run) for text in lines.texts]
     tracked = {
@@ -123,7 +123,7 @@ _Name = Annotated[str, msgspec.Meta(min_length=1, max_length=128, pattern=r"^[^\
 
 
 class _NamedBatch(msgspec.Struct):
-    """The fields of a batch that identify it: spacecraft and batch id."""
+    """Part of a batch that identifies it: spacecraft and batch id."""
 
     spacecraft: _Name
     batch: _Name
@@ -133,7 +133,7 @@ _NAMED = msgspec.json.Decoder(_NamedBatch)
 
 
 def identity_in(text: bytes, run: str) -> Identity | None:
-    """The identity in a line, without checking the rest; None where it cannot be read."""
+    """Identity of the batch in a line, without checking the rest; None if unreadable."""
     try:
         named = _NAMED.decode(text)
     except (msgspec.MsgspecError, UnicodeError, RecursionError):
@@ -142,31 +142,31 @@ def identity_in(text: bytes, run: str) -> Identity | None:
 
 
 Decided = UnsavedResult | GyroBlock | TrackedLine | Answered | AcquisitionError
-"""The state of a line before it is recorded."""
+"""State of a line of telemetry before it is recorded."""
 
 Check = Callable[[str], None]
-"""Raises an `AcquisitionError` where batches of a spacecraft are not to be taken."""
+"""Function that raises an `AcquisitionError` where batches of a spacecraft are refused."""
 
 RecordBlocks = Callable[[Sequence[GyroBlock]], list[Recorded | AcquisitionError]]
-"""Records gyro blocks in one transaction."""
+"""Function that records gyro blocks in one transaction."""
 
 Require = Callable[[], object]
-"""Raises an `AcquisitionError` where no more is to be computed."""
+"""Function that raises an `AcquisitionError` where the computation must stop."""
 
 
 def solve_lines(solver: Solver, lines: TelemetryLines) -> list[LineResult]:
-    """The results of some lines, computed in a worker."""
+    """Compute the results of lines of telemetry in a worker."""
     return line_results(lines, solver.solve_many, solver.asks_for_last)
 
 
 INTERACTIVE_WINDOW_S = 0.5
-"""Bulk pauses so long after a single batch, because another may follow."""
+"""Seconds that bulk work pauses after a single batch, because another may follow."""
 LINES, FEW_LINES = 64, 8
-"""Lines of a chunk: the more, the less each costs; but a single post waits for up to one chunk."""
+"""Lines in a chunk, and fewer while single posts arrive, which wait for up to one chunk."""
 
 
 class Bulk:
-    """Takes chunks of lines in, by the submission service and by workers of its own."""
+    """Bulk processor of line chunks, by the submission service and by workers of its own."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class Bulk:
         config: WorkerConfig,
         workers: int,
     ) -> None:
-        """`record_blocks` records gyro blocks; see `Gyro.record_many`."""
+        """Prepare bulk processing; `record_blocks` records gyro blocks, see `Gyro.record_many`."""
         self.submissions = submissions
         self.record_blocks = record_blocks
         self._store = store
@@ -186,38 +186,38 @@ class Bulk:
         )
 
     def close(self) -> None:
-        """End the workers; what they were at comes to nothing."""
+        """Stop the workers; their unfinished work is lost."""
         self.workers.close()
 
     @property
     def max_pending(self) -> int:
-        """How many chunks should be begun before the first of them is recorded.
+        """Number of chunks to begin before the first of them is recorded.
 
-        While batches come one by one as well, a worker less is given to do, so that
-        theirs find a processor free.
+        While single batches arrive as well, one worker less is used, so that a processor is free
+        for them.
         """
         up = self.workers.up
         return up - 2 if up > 1 and self._gives_way else PENDING_A_WORKER * up
 
     @property
     def lines(self) -> int:
-        """How many lines a chunk should have."""
+        """Number of lines that a chunk should have."""
         return FEW_LINES if self._gives_way else LINES
 
     @property
     def _gives_way(self) -> bool:
-        """True if batches come one by one as well."""
+        """True while single batches arrive as well."""
         return self.submissions.idle_s < INTERACTIVE_WINDOW_S
 
     def begin(
         self, texts: Sequence[bytes], run: str, check: Check, require: Require = lambda: None
     ) -> "BulkChunk":
-        """Let a chunk be computed; raises `Busy` where the time has not come.
+        """Start the computation of a chunk of lines; raises `Busy` if it cannot start yet.
 
-        `require` is called before each portion that this process computes itself, and
-        ends that where it raises.
+        `require` is called before each portion that this process computes itself, and stops the
+        chunk where it raises.
         """
-        # Without them each worker would compile what it does not find.
+        # Without kernels each worker would compile those it lacks.
         self.submissions.require_kernels()
         self.workers.start()
         self.submissions.yield_to_interactive()
@@ -230,7 +230,7 @@ class Bulk:
         return BulkChunk(self, TelemetryLines(run, texts, known), check, require, registry, stored)
 
     def compute(self, lines: TelemetryLines, require: Require) -> "Future[list[LineResult]]":
-        """The results of lines: from a worker, or computed here if there is none."""
+        """Compute the results of lines in a worker, or in this process if there is none."""
         if self.workers.up:
             return self.workers.submit(lines)
         done: Future[list[LineResult]] = Future()
@@ -238,18 +238,18 @@ class Bulk:
         return done
 
     def compute_here(self, lines: TelemetryLines, require: Require) -> list[LineResult]:
-        """The same in this process; single posts go first."""
+        """Compute the results of lines in this process; single posts go first."""
         solve = partial(self.submissions.solve_many, require=require)
         return line_results(lines, solve, self.submissions.solver.asks_for_last)
 
     def submit_tracked(self, line: TrackedLine) -> Answered | AcquisitionError:
-        """Record a line that asks for the last attitude, when all before it are recorded."""
+        """Record a batch that asks for the last attitude, after all earlier lines."""
         self.submissions.yield_to_interactive()
         return self.submissions.submit_tracked(submission_from_json(line.text))
 
 
 class BulkChunk:
-    """A chunk on its way: computed first, then recorded."""
+    """Chunk of telemetry lines in progress: computed first, then recorded."""
 
     def __init__(
         self,
@@ -264,15 +264,15 @@ class BulkChunk:
         self._require = require
         self._registry, self._stored = registry, stored
         self._blocks: Future[list[Recorded | AcquisitionError]] | None = None
-        """Outcomes of the gyro blocks, recorded or refused, in the order of their lines."""
+        """Future outcomes of the gyro blocks, recorded or refused, in the order of their lines."""
         self._computed = bulk.compute(lines, require)
 
     def is_computed(self, within_s: float) -> bool:
-        """True if it is computed, or comes to be within so many seconds."""
+        """Wait up to `within_s` seconds for the chunk's computation; True if it is done."""
         return bool(wait([self._computed], within_s).done)
 
     def queue_write(self) -> None:
-        """Queue what was computed for the writer; raises `Busy` where it must be called again."""
+        """Queue the computed results for the writer; after `Busy` it must be called again."""
         blocks = [each for each in self._decided if isinstance(each, GyroBlock)]
         if blocks and self._blocks is None:
             self._blocks = self._bulk.later(partial(self._bulk.record_blocks, blocks))
@@ -280,11 +280,11 @@ class BulkChunk:
         self._finish = self._bulk.submissions.begin_writing(unsaved_results)
 
     def cancel(self) -> None:
-        """Let it not be computed, where that has not begun."""
+        """Cancel the chunk's computation, if it has not begun."""
         self._computed.cancel()
 
     def answers(self) -> list[LineAnswer]:
-        """The answer to each line, or what is wrong with it, when all is recorded."""
+        """Wait until the chunk is recorded; the answer or error of each line."""
         written = iter(self._finish())
         blocks = iter(self._recorded_blocks())
         return [
@@ -308,7 +308,7 @@ class BulkChunk:
         found = self._blocks.result()
         for each in found:
             if isinstance(each, Busy):
-                # Says nothing about the block.
+                # `Busy` decides nothing about the block.
                 raise each
         return found
 
@@ -317,7 +317,7 @@ class BulkChunk:
         try:
             found = self._computed.result()
         except ChunkEndsWorkers as error:
-            # Computed here it might end this process as well.
+            # Computed in this process, the line might end this process as well.
             names = identity_in(self._lines.texts[0], self._lines.run)
             refusal = AcquisitionError(f"computing the lines from {names} on failed: {error}")
             return [refusal] * len(self._lines.texts)
@@ -342,7 +342,7 @@ class BulkChunk:
             self._check(found.identity[0])
             return self._repeat(text, found)
         except Busy:
-            # Says nothing about the line.
+            # `Busy` decides nothing about the line.
             raise
         except AcquisitionError as error:
             return error
@@ -354,7 +354,7 @@ class BulkChunk:
         if isinstance(first, AcquisitionError):
             return first
         if first is None:
-            # It is not called what it seemed to be called.
+            # The quick look-up misread the line's identity: process the line as new.
             submission = submission_from_json(text, run=self._lines.run)
             if self._bulk.submissions.solver.asks_for_last(submission.batch):
                 return TrackedLine(seen.identity, submission.text)
@@ -364,6 +364,6 @@ class BulkChunk:
             return made
         answer = self._stored[first.result_id]
         if isinstance(answer, AcquisitionError):
-            # The archive may be out of reach for long: the other lines do not wait for it.
+            # The archive may be out of reach for long: do not delay the other lines.
             return answer
         return Answered(first.result_id, answer, replayed=True)

@@ -1,8 +1,7 @@
-"""Two sets of options over the same recorded batches, side by side; nothing is kept.
+"""Comparison of two sets of options over the same recorded batches; nothing is stored.
 
-Both sides run anew what was sent, so that they differ in their options alone
-and not in when they were recorded.  A star's outcome is compared with the same
-star's on the other side.
+Both sides compute the batches as sent, so that they differ only in their options, and not in the
+time of recording.  A star's outcome is compared with the same star's on the other side.
 """
 
 import math
@@ -27,9 +26,9 @@ from service.trends.quantities import QUANTITIES
 from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 
 MAX_SHOWN = 100
-"""Batches that are shown star by star; the others are counted."""
+"""Largest number of batches shown star by star; further ones are only counted."""
 MOST_AT_ONCE, PORTION_S = 512, 0.1
-"""Largest number of batches solved at once, and the seconds that they may take on both sides."""
+"""Largest number of batches solved at once, and the target seconds for both sides."""
 
 RunManyAgain = Callable[[Sequence[ObservationBatch]], Sequence[Acquisition]]
 
@@ -39,7 +38,7 @@ _OUTCOMES = ("observed", "unique", "ambiguous", "unmatched")
 
 @dataclass(frozen=True)
 class Pair:
-    """A recorded batch twice, with the options of sides a and b in place of its own."""
+    """Recorded batch in two versions, with the options of sides a and b in place of its own."""
 
     id: str
     a: ObservationBatch
@@ -48,7 +47,7 @@ class Pair:
 
 @dataclass
 class _Side:
-    """Results of all batches with one set of options."""
+    """One side of a comparison: results of all batches with one set of options."""
 
     counts: "Counter[str]" = field(default_factory=Counter)
     ratios: list[float] = field(default_factory=list)
@@ -78,7 +77,7 @@ class _Side:
 
 @dataclass
 class ComparedSample:
-    """The choice of batches of a comparison: where from, how many there are and were drawn."""
+    """Sample of batches in a comparison: its source, the number available and the number drawn."""
 
     spacecraft: str
     run: str
@@ -90,7 +89,7 @@ class ComparedSample:
 
 @dataclass
 class ComparisonTally:
-    """Both sides so far, star by star."""
+    """Running totals of a comparison for both sides, star by star."""
 
     a: _Side = field(default_factory=_Side)
     b: _Side = field(default_factory=_Side)
@@ -105,7 +104,7 @@ class ComparisonTally:
     """Time (TAI, ns) of each batch, and its number of stars by outcome on both sides."""
 
     def add(self, pair: Pair, a: Acquisition, b: Acquisition) -> None:
-        """Take one batch's two results."""
+        """Add the two results of one batch to the comparison."""
         self.compared += 1
         self.a.add(a)
         self.b.add(b)
@@ -131,7 +130,7 @@ class ComparisonTally:
         *,
         cut_short: bool,
     ) -> records.Comparison:
-        """The whole comparison; `options` are those of both sides."""
+        """Build the record of the whole comparison; `options` are those of both sides."""
         angles = self.angles_arcsec
         cell_s, trend = self._trend()
         return records.Comparison(
@@ -162,7 +161,7 @@ class ComparisonTally:
         )
 
     def _trend(self) -> tuple[int, list[records.ComparedCell]]:
-        """The width of the cells in seconds, and the stars by outcome in each with a batch."""
+        """Width of the time cells in seconds, and stars by outcome in each non-empty cell."""
         moments_s = unix_seconds([tai_ns for tai_ns, _, _ in self.counted])
         cell_s = cell_width_s(float(np.ptp(moments_s))) if self.counted else HOUR_S
         cells: dict[int, tuple[Counter[str], Counter[str]]] = {}
@@ -193,9 +192,9 @@ _WHICH = {
 def compare(
     pairs: Sequence[Pair], run_again: tuple[RunManyAgain, RunManyAgain], limit_s: float
 ) -> tuple[ComparisonTally, bool]:
-    """Run each side of each batch with its function; whether `limit_s` seconds cut it short.
+    """Run both sides of each batch; the tally, and True if `limit_s` seconds cut it short.
 
-    Many are solved at once, but one alone while each may take seconds.
+    Many batches are solved at once, but singly while each may take seconds.
     """
     found, end_s = ComparisonTally(), time.monotonic() + limit_s
     first, count = 0, 1
@@ -203,7 +202,7 @@ def compare(
         started_s = time.monotonic()
         if started_s > end_s:
             return found, True
-        # In the order of time, the sky of a day is made once.
+        # Sorted by time, a day's sky is computed only once.
         portion = sorted(pairs[first : first + count], key=lambda each: each.a.time.tai_ns)
         sides = run_again[0]([each.a for each in portion]), run_again[1]([e.b for e in portion])
         for each in zip(portion, *sides, strict=True):

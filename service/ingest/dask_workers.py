@@ -1,7 +1,7 @@
-"""Tasks on a Dask scheduler: its workers need this package and the folder of the archive.
+"""Reprocessing tasks on a Dask scheduler, whose workers need this package and the archive.
 
-A scheduler runs whatever code it is sent: its address comes from the command line, never from a
-request, and should be one of TLS.
+A scheduler runs any code that it receives: its address comes from the command line, never from a
+request, and should use TLS.
 """
 
 import logging
@@ -27,7 +27,7 @@ from service.ingest.worker_process import WorkerConfig
 from service.storage.archive.folder import write_whole
 
 RETRIES = 3
-"""Retries of a task that raises; one whose worker dies goes to another worker by itself."""
+"""Retries of a task that raises; after a worker's death the scheduler moves the task itself."""
 CONNECT_S = 20
 FEWEST_PENDING, PENDING_A_WORKER = 4, 2
 SCHEMES = ("tls://", "tcp://")
@@ -36,13 +36,13 @@ log = logging.getLogger(__name__)
 
 
 def require_scheduler(address: str) -> None:
-    """Raise `BadInput` for an address that is none, `NotAvailable` without the package."""
+    """Raise `BadInput` for an invalid scheduler address, `NotAvailable` without the package."""
     if not address.startswith(SCHEMES) or not address.rpartition(":")[2].isdigit():
         raise BadInput(Fault("--scheduler", "must be tls://HOST:PORT or tcp://HOST:PORT", address))
     require_extra("dask", "distributed", "--scheduler", address)
     from distributed.security import Security
 
-    # A client without them fails slowly, and again when it is closed.
+    # A client without certificates fails slowly, and again when it is closed.
     settings: Any = Security
     if address.startswith("tls://") and not settings().get_connection_args("client")["ssl_context"]:
         message = (
@@ -53,13 +53,13 @@ def require_scheduler(address: str) -> None:
 
 
 class DaskWorkers:
-    """The workers of a scheduler, which may come and go."""
+    """Workers of a Dask scheduler, whose number may change."""
 
     def __init__(self, address: str, config: WorkerConfig, folder: Path) -> None:
-        """Raises `BadConfiguration` where the scheduler does not answer."""
+        """Connect to a Dask scheduler; raises `BadConfiguration` if it does not answer."""
         from distributed import Client
 
-        # What goes wrong is told here, in a line and without the trace.
+        # Errors are reported below, in a line and without the trace.
         for name in (
             "asyncio",
             "distributed",
@@ -68,20 +68,20 @@ class DaskWorkers:
             "tornado",
         ):
             logging.getLogger(name).setLevel(logging.CRITICAL)
-        # Its methods have no types.
+        # The client's methods have no types.
         connect: Any = Client
         self._address = address
         self._config = pickle.dumps(replace(config, catalog=_kept_catalog(config, folder)))
         try:
             self._client = connect(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, TypeError, ValueError) as error:
-            # A TypeError tells of certificates that are missing.
+            # A TypeError means that certificates are missing.
             raise BadConfiguration(f"--scheduler: {address}: {error}") from None
         self._unfinished: set[Any] = set()
 
     @property
     def workers(self) -> int:
-        """How many workers the scheduler has."""
+        """Number of workers of the scheduler at present."""
         return len(self._client.scheduler_info(n_workers=-1)["workers"])
 
     @property
@@ -90,8 +90,8 @@ class DaskWorkers:
         return max(FEWEST_PENDING, PENDING_A_WORKER * self.workers)
 
     def submit(self, task: partition_tasks.PartitionTask) -> partition_tasks.Wait:
-        """Queue a task."""
-        # Its file is what it is done for: a result that is known from before would not make one.
+        """Queue a task on the scheduler; returns the function that waits for its result."""
+        # The task writes a file: a cached result of the scheduler would not write it.
         future = self._client.submit(
             do_task, self._config, versions(), task, pure=False, retries=RETRIES
         )
@@ -105,14 +105,14 @@ class DaskWorkers:
             try:
                 outcome = future.result(timeout=seconds)
             except TimeoutError:
-                # A result that went with its worker is computed anew.
+                # A result lost with its worker is computed again.
                 if self._client.status == "closed":
                     raise self._gone(task) from None
                 return None
             except BadConfiguration:
                 raise
             except (Exception, CancelledError) as error:
-                # Of the scheduler: workers died over it, or it is gone itself.
+                # The scheduler's own error: workers died over the task, or the scheduler is gone.
                 raise self._gone(task, error) from None
             self._unfinished.discard(future)
             return partition_tasks.result_of(outcome)
@@ -129,17 +129,17 @@ class DaskWorkers:
         )
 
     def close(self) -> None:
-        """Let what is unfinished go."""
+        """Cancel the unfinished tasks and disconnect."""
         try:
             self._client.cancel(list(self._unfinished), force=True)
         except Exception as error:
-            # Closing goes on whatever the client raises: a lost scheduler has nothing to cancel.
+            # Close whatever the client raises: with a lost scheduler there is nothing to cancel.
             log.debug("nothing was cancelled: %s", error)
         self._client.close()
 
 
 def _kept_catalog(config: WorkerConfig, folder: Path) -> Path | None:
-    """A copy of a site's own catalog in the archive, where workers find it; None: it is shipped."""
+    """Copy a site's own catalog to the archive for the workers; None for the shipped catalog."""
     if config.catalog is None:
         return None
     place = folder / "catalogs" / config.catalog_digest.replace(":", "-") / config.catalog.name
@@ -155,7 +155,7 @@ _solvers: dict[bytes, Solver] = {}
 
 
 def versions() -> dict[str, str]:
-    """The versions on which the bytes of a part depend, beside its batches and the processor."""
+    """Package versions that affect the bytes of an archive part."""
     return {
         "attitude-acquisition": __version__,
         "numba": numba.__version__,
@@ -167,7 +167,7 @@ def versions() -> dict[str, str]:
 def do_task(
     config: bytes, expected: dict[str, str], task: partition_tasks.PartitionTask
 ) -> partition_tasks.Outcome:
-    """Do a task in a worker, whose versions and catalog must be those of the command."""
+    """Run a task in a worker, which must have the command's package versions and catalog."""
     for package, version in versions().items():
         if expected[package] != version:
             raise BadConfiguration(
@@ -180,7 +180,7 @@ def do_task(
 
 
 def _solver_of(config: bytes) -> Solver:
-    """The solver with these settings, whose kernels are compiled; a worker keeps the latest."""
+    """Solver with these settings and compiled kernels; a worker caches the latest."""
     with _lock:
         if config not in _solvers:
             solver = pickle.loads(config).solver()

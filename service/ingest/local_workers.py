@@ -1,11 +1,11 @@
-"""Local processes that compute chunks of long work, kept by the standard executor.
+"""Pool of local processes that compute chunks of long work, on the standard executor.
 
-Each has missions and a sky of its own and never sees the database.  A child that dies
-breaks an executor whole: another takes its place, and what was unfinished is handed
-in again, one chunk at a time, so that a chunk that ends its process is known by name.
+Each process has its own missions and sky and never sees the database.  A dead child breaks a whole
+executor: a new one replaces it and gets the unfinished chunks again, one at a time, so that a chunk
+that kills its process can be named.
 
-The processes are forked from the standard library's fork server, which has imported the
-modules once and does nothing else: no thread, no database, no kernel.
+The processes are forked from the standard library's fork server, which has imported the modules
+once and does nothing else: no thread, no database, no kernel.
 """
 
 import logging
@@ -34,13 +34,13 @@ from service.ingest import worker_process
 from service.ingest.worker_process import Work, WorkerConfig, begin, compute, ready_pid
 
 PAUSE_S, LONGEST_PAUSE_S = 1.0, 60.0
-"""The pause before processes replace some that died: twice as long each time."""
+"""First and longest pause in seconds before dead processes are replaced; it doubles each time."""
 IDLE_S = 600.0
-"""The time without a chunk after which the processes end, and give their memory back."""
+"""Seconds without a chunk after which the processes end, to free their memory."""
 MOST_STARTS = 3
 """Maximum number of process starts for one chunk, when each process dies before receiving it."""
 SERVER_RETRY_S, SERVER_GONE_S = 0.1, 10.0
-"""How often, and for how long, starts are tried while the server of the workers is ending."""
+"""Interval and time limit, in seconds, for new starts while the fork server is ending."""
 MOST_DEATHS = 2
 """Number of processes that die with one chunk alone at work before that chunk is given up."""
 
@@ -51,11 +51,11 @@ Output = TypeVar("Output")
 
 
 class WorkerLost(Exception):
-    """No worker can compute a chunk; its words say why."""
+    """Error: no worker can compute a chunk, for the reason in its message."""
 
 
 class ChunkEndsWorkers(WorkerLost):
-    """Processes died over a chunk again and again."""
+    """Error: processes died repeatedly while computing a chunk."""
 
 
 @dataclass(eq=False)
@@ -70,32 +70,32 @@ class _QueuedTask(Generic[Input, Output]):
 
 @dataclass(eq=False)
 class _Processes(Generic[Input, Output]):
-    """The processes of one executor, and what was handed in to it and is unfinished."""
+    """Processes of one executor, with the unfinished tasks submitted to it."""
 
     executor: ProcessPoolExecutor
     stop: Connection
     tasks: "set[_QueuedTask[Input, Output]]" = field(default_factory=set)
     pids: set[int] = field(default_factory=set)
-    """The processes that are ready to work; all are, as soon as one is."""
+    """Ids of the processes that are ready; all are, as soon as one is."""
     is_ending: bool = False
     _closing: threading.Lock = field(default_factory=threading.Lock)
 
     def end(self) -> None:
-        """Have them exit: they see that the pipe is closed.  May be called again and anywhere."""
+        """Tell the processes to exit by closing their pipe; may be repeated, from any thread."""
         with self._closing:
             self.stop.close()
 
 
 class LocalWorkers(Generic[Input, Output]):
-    """Workers that do one kind of work, from the first `start` to `close`."""
+    """Pool of worker processes for one kind of work, from the first `start` to `close`."""
 
     def __init__(self, config: WorkerConfig, work: "Work[Input, Output]", count: int) -> None:
-        """`work` is a function of a module, so that a worker finds it by its name."""
+        """`work` must be a function of a module, so that a worker finds it by its name."""
         self._config, self._work, self.count = config, work, count
         self._lock = threading.RLock()
         self._processes: _Processes[Input, Output] | None = None
         self._one_by_one: deque[_QueuedTask[Input, Output]] = deque()
-        """Chunks that were unfinished when an executor broke, and those that came since."""
+        """Chunks left unfinished by a broken executor, and those submitted since."""
         self._pause_s = PAUSE_S
         self._not_before_s = 0.0
         self._used_s = 0.0
@@ -104,18 +104,18 @@ class LocalWorkers(Generic[Input, Output]):
 
     @property
     def pids(self) -> frozenset[int]:
-        """The processes that are ready to work."""
+        """Ids of the processes that are ready to work."""
         with self._lock:
             return frozenset(self._processes.pids if self._processes else ())
 
     @property
     def up(self) -> int:
-        """How many processes are ready to work."""
+        """Number of processes that are ready to work."""
         processes = self._processes
         return len(processes.pids) if processes else 0
 
     def start(self) -> None:
-        """Have the processes started, unless they are there; returns at once."""
+        """Start the worker processes unless they are running; returns at once."""
         with self._lock:
             self._used_s = time.monotonic()
             too_soon = self._used_s < self._not_before_s
@@ -127,7 +127,7 @@ class LocalWorkers(Generic[Input, Output]):
                     self._pause()
 
     def submit(self, task: Input) -> "Future[list[Output]]":
-        """Queue a task; the future gives what was found, or raises `WorkerLost` or `Stopping`."""
+        """Queue a task; the future gives its results, or raises `WorkerLost` or `Stopping`."""
         chunk: _QueuedTask[Input, Output] = _QueuedTask(task)
         with self._lock:
             if self._closing:
@@ -140,24 +140,24 @@ class LocalWorkers(Generic[Input, Output]):
         return chunk.done
 
     def restart(self) -> None:
-        """End the processes; the next ones have the settings as they are then.
+        """End the processes; new ones start with the settings of that time.
 
-        Tasks that they were at work on are computed anew.
+        Their unfinished tasks are computed again.
         """
         with self._lock:
             processes = self._end_processes()
         if processes is not None:
-            # Without the lock, which the executor's threads may wait for.
+            # Release the lock first: the executor's threads may wait for it.
             processes.executor.shutdown(wait=False)
 
     def close(self) -> None:
-        """End the processes at once, whatever they compute."""
+        """End the processes at once, even during a computation."""
         with self._lock:
             self._closing = True
             processes = self._end_processes()
             left, self._one_by_one = list(self._one_by_one), deque()
         if processes is not None:
-            # Without the lock, which the executor's threads may wait for.
+            # Release the lock first: the executor's threads may wait for it.
             processes.executor.shutdown(cancel_futures=True)
             with self._lock:
                 left += processes.tasks
@@ -167,14 +167,14 @@ class LocalWorkers(Generic[Input, Output]):
     # ---- with the lock held ------------------------------------------------------------------
 
     def _open(self) -> "_Processes[Input, Output]":
-        """Start the processes; raises `OSError` where that cannot be done."""
+        """Start the processes with a safe import path; raises `OSError` on failure."""
         with safe_path():
             return self._start()
 
     def _start(self) -> "_Processes[Input, Output]":
         context = multiprocessing.get_context("forkserver")
         context.set_forkserver_preload([worker_process.__name__])
-        # Python 3.11.0 would have the server listen where every local user can connect.
+        # Python 3.11.0 would let every local user connect to the server.
         util.abstract_sockets_supported = False  # type: ignore[misc]
         receiver, stop = context.Pipe(duplex=False)
         executor = ProcessPoolExecutor(
@@ -187,20 +187,20 @@ class LocalWorkers(Generic[Input, Output]):
         ready: list[Future[int]] = []
         try:
             resource_tracker.ensure_running()  # it would unblock the signals
-            # The processes are started now, and their server, unless it runs.  It keeps the
-            # signals blocked; each process hears none until it ignores them.
+            # Start the processes now, and their server, unless it runs.  The server keeps the
+            # signals blocked; each process unblocks them only after it ignores them.
             before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
             try:
                 forkserver.ensure_running()
                 ready.extend(executor.submit(ready_pid) for _ in range(self.count))
             except BrokenProcessPool:
-                # One has died already, which `_see_the_end` finds out, too.
+                # A process has died already; `_see_the_end` will notice as well.
                 pass
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, before)
             self._watch(processes)
         except (OSError, RuntimeError) as error:
-            # A thread that cannot be started is a RuntimeError.
+            # A thread that cannot be started raises RuntimeError.
             self._end_processes()
             executor.shutdown(wait=False)
             raise OSError(f"{error}") from error
@@ -210,10 +210,10 @@ class LocalWorkers(Generic[Input, Output]):
         return processes
 
     def _end_processes(self) -> "_Processes[Input, Output] | None":
-        """Have the processes exit; gives them, for their executor is to be shut down."""
+        """Tell the processes to exit; returns them, since their executor must be shut down."""
         processes, self._processes = self._processes, None
         if self._idle_check is not None:
-            # Its thread would keep these workers in memory.
+            # The timer's thread would keep this pool in memory.
             self._idle_check.cancel()
         if processes is not None:
             processes.is_ending = True
@@ -221,11 +221,11 @@ class LocalWorkers(Generic[Input, Output]):
         return processes
 
     def _watch(self, processes: "_Processes[Input, Output]") -> None:
-        """Have a thread that sees to what the processes leave unfinished when one has died.
+        """Start a thread that submits unfinished tasks again after a worker process has died.
 
-        The executor would wait for the rest of a result for as long as any process can write
-        to the pipe of results.  So this process gives up its own writing end, and the other
-        workers end with the one that died: the executor is broken anyhow.
+        The executor would wait for the rest of a result for as long as any process can write to the
+        pipe of results.  So this process closes its own writing end, and the other workers end with
+        the dead one: the executor is broken in any case.
         """
         executor = processes.executor
         executor._result_queue._writer.close()  # type: ignore[attr-defined]
@@ -236,7 +236,7 @@ class LocalWorkers(Generic[Input, Output]):
         ).start()
 
     def _hand_in(self, chunk: _QueuedTask[Input, Output]) -> None:
-        """Have a chunk computed; without processes that stay up it fails."""
+        """Submit a chunk to the executor; it fails if no process stays up."""
         reason = "processes died as soon as they were started"
         for _ in range(MOST_STARTS):
             try:
@@ -256,13 +256,13 @@ class LocalWorkers(Generic[Input, Output]):
         self._go_on(chunk)
 
     def _opened(self) -> "_Processes[Input, Output]":
-        """Started processes; waits for a server of the workers that dies to be gone."""
+        """Start the processes, waiting until a dying fork server is gone."""
         until_s = time.monotonic() + SERVER_GONE_S
         while True:
             try:
                 return self._open()
             except ConnectionError:
-                # It has died, and is not known to have done so yet.
+                # The server has died, but is not known to be dead yet.
                 if time.monotonic() > until_s:
                     raise
                 time.sleep(SERVER_RETRY_S)
@@ -275,7 +275,7 @@ class LocalWorkers(Generic[Input, Output]):
             broken.executor.shutdown(wait=False)
 
     def _pause(self) -> None:
-        """Start no processes for a while, unless a chunk needs them."""
+        """Delay the next start of processes, unless a chunk needs them."""
         self._not_before_s = time.monotonic() + self._pause_s
         self._pause_s = min(2.0 * self._pause_s, LONGEST_PAUSE_S)
 
@@ -296,13 +296,13 @@ class LocalWorkers(Generic[Input, Output]):
     ) -> None:
         error = Stopping("the service is stopping") if future.cancelled() else future.exception()
         if isinstance(error, BrokenProcessPool):
-            # The executor may hold a lock of its own that a thread with ours waits for: what is
-            # unfinished is seen to in `_see_the_end`.
+            # The executor may hold a lock for which a thread that holds ours waits: leave the
+            # unfinished tasks to `_see_the_end`.
             processes.end()
             return
         with self._lock:
             if processes.is_ending and not self._closing:
-                # It has the settings of before: `_see_the_end` has it computed anew.
+                # The result has outdated settings: `_see_the_end` has the chunk computed again.
                 return
         if error is None:
             try:
@@ -329,11 +329,11 @@ class LocalWorkers(Generic[Input, Output]):
         for end in ends:
             os.close(end)
         processes.end()
-        # It fails what is unfinished, and waits for the processes.
+        # The manager thread fails the unfinished tasks, and waits for the processes.
         manager.join()
         with self._lock:
             if not (processes.pids or processes.is_ending):
-                # They died before they were ready: the next ones may, too.
+                # The processes died before they were ready: the next ones may die too.
                 self._pause()
             self._replace(processes)
             left = [] if self._closing else list(processes.tasks)
@@ -366,7 +366,7 @@ class LocalWorkers(Generic[Input, Output]):
         self._go_on(chunk)
 
     def _go_on(self, finished: _QueuedTask[Input, Output]) -> None:
-        """Hand in the next of the chunks that are computed one by one."""
+        """Submit the next of the chunks that are computed one by one."""
         with self._lock:
             if self._one_by_one and self._one_by_one[0] is finished:
                 self._one_by_one.popleft()
@@ -393,5 +393,5 @@ class LocalWorkers(Generic[Input, Output]):
 
 
 def _fail(chunk: _QueuedTask[Any, Any], error: Exception) -> None:
-    with suppress(InvalidStateError):  # done or cancelled before
+    with suppress(InvalidStateError):  # Done or cancelled before.
         chunk.done.set_exception(error)

@@ -1,7 +1,7 @@
-"""The memory that this process may still use: of the machine, and of its control groups.
+"""Memory that this process may still use, limited by the machine and by control groups.
 
-A group is a limit that the kernel keeps for a container or a unit of systemd; what goes beyond
-it is ended without a word.
+A control group is a limit that the kernel keeps for a container or a unit of systemd; processes
+beyond it are killed without a message.
 """
 
 from collections.abc import Iterator
@@ -11,21 +11,21 @@ from pathlib import Path
 from service.errors import Busy
 
 WORKER_BYTES = 280 << 20
-"""The memory of a process that computes replays, with the sky that it maps."""
+"""Memory in bytes of a process that computes replays, with the sky that it maps."""
 REPLAY_BYTES = 96 << 20
-"""The memory of a replay in the service's own process."""
+"""Memory in bytes of a replay in the service's own process."""
 RETRY_S = 60
 _PROC, _GROUPS = Path("/proc"), Path("/sys/fs/cgroup")
 
 
 def free_bytes(proc: Path = _PROC, groups: Path = _GROUPS) -> int | None:
-    """The bytes that are left under the tightest limit; None where the system tells none."""
+    """Free memory in bytes under the tightest limit; None if the system reports none."""
     left = [*_of_machine(proc), *_of_groups(proc, groups)]
     return max(0, min(left)) if left else None
 
 
 def require_memory_for_replay(starting_processes: int) -> None:
-    """Raise `Busy` where a replay, with processes that are yet to be started, has no room."""
+    """Raise `Busy` if memory lacks for a replay and for its processes that are not started yet."""
     needed = REPLAY_BYTES + starting_processes * WORKER_BYTES
     free = free_bytes()
     if free is not None and free < needed:
@@ -60,16 +60,16 @@ def _of_groups(proc: Path, groups: Path) -> Iterator[int]:
 
 
 def _up_from(root: Path, path: str, limit: str, used: str, reclaimable: str) -> Iterator[int]:
-    # In a container the path is that outside of it, and the group itself is at the root.
+    # In a container the path is the one outside of it, and the group itself is at the root.
     inside = root / path.lstrip("/")
     for folder in (inside, *inside.parents):
-        # A group without a limit says "max", or a number beyond any memory.
+        # A group without a limit has "max", or a number beyond any memory.
         with suppress(OSError, ValueError, KeyError):
             most = int((folder / limit).read_text(encoding="ascii"))
             statistics = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
             counted = dict(each.split(maxsplit=1) for each in statistics)
             current = int((folder / used).read_text(encoding="ascii"))
-            # Pages of files that the kernel gives up first.
+            # The kernel reclaims inactive file pages first: count them as free.
             yield most - current + int(counted[reclaimable])
         if folder == root:
             return

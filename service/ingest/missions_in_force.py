@@ -1,9 +1,8 @@
-"""The missions in force: those of the files, with the calibrations that were adopted over them.
+"""Missions in force: those of the mission files, with adopted calibrations applied.
 
-An adopted calibration lies over the mission file: alignment and focal plane of every tracker are
-those that were adopted, and all other settings the file's.  Where the file's own alignments or
-focal planes have changed since, the file holds.  Of several services on a database each follows
-what operators adopt through any of them.
+An adopted calibration replaces the alignment and focal plane of every tracker; all other settings
+are the file's.  Where the file's own alignments or focal planes have changed since the adoption,
+the file takes precedence.  Several services on a database follow adoptions through any of them.
 """
 
 import hashlib
@@ -24,47 +23,47 @@ log = logging.getLogger(__name__)
 
 
 class MissionsInForce:
-    """Keeps a mapping of missions as operators have adopted them.
+    """Mapping of missions that follows the calibrations adopted by operators.
 
-    `missions` is changed in place: everybody who holds it computes with what is in force.
+    `missions` is changed in place: every holder of the mapping uses the missions in force.
     """
 
     def __init__(self, missions: dict[str, Mission], readers: Readers) -> None:
-        """`missions` are at first those of the files."""
+        """Start with `missions` as read from the mission files."""
         self.missions = missions
         self.files: Mapping[str, Mission] = dict(missions)
-        """The settings as the files have them."""
+        """Missions as the mission files have them, by name."""
         self._readers = readers
         self._lock = threading.Lock()
         self._leave: str | None = None
         self._loaded: str | None = None
-        """The newest adoption when they were loaded; empty where there was none."""
+        """Id of the newest adoption at the last load; empty if there was none."""
         self._when_changed: list[Callable[[], None]] = []
 
     def when_changed(self, call: Callable[[], None]) -> None:
-        """Call a function each time a mission was replaced."""
+        """Register a function to call after each replacement of a mission."""
         self._when_changed.append(call)
 
     def follow(self) -> None:
-        """`load` again where another service has adopted one since."""
+        """Load the adopted calibrations again if another service has adopted one since."""
         with self._readers.reading_record() as connection:
             self.follow_in(connection)
 
     def follow_in(self, connection: Connection) -> None:
-        """`follow`, with a connection that sees the record as it is now.
+        """Load the adopted calibrations again if they changed, through a given connection.
 
-        Each group of posts begins with this: whoever posts after an adoption was answered, by
-        whichever service, is answered with the calibration that was adopted.
+        Each group of posts begins here: a client that posts after any service has confirmed an
+        adoption gets an answer with the adopted calibration.
         """
         if newest_adoption(connection) != self._loaded:
             self.load(self._leave)
 
     def adopted_names(self) -> list[str]:
-        """The spacecraft whose settings are an adopted calibration over their file."""
+        """Names of the spacecraft with an adopted calibration in force."""
         return [name for name, file in self.files.items() if self.missions[name] is not file]
 
     def load(self, leave: str | None = None) -> None:
-        """Put what was adopted over the mission files, but for the spacecraft `leave`."""
+        """Apply the adopted calibrations to the file's missions, except for spacecraft `leave`."""
         self._leave = leave
         with self._lock:
             before = dict(self.missions)
@@ -77,7 +76,7 @@ class MissionsInForce:
 
     @contextmanager
     def replacing(self, mission: Mission) -> Iterator[None]:
-        """Replace a mission when the block, which records its adoption, has ended without error."""
+        """Replace a mission after the `with` block that records its adoption has succeeded."""
         with self._lock:
             yield
             self.missions[mission.name] = mission
@@ -91,7 +90,7 @@ class MissionsInForce:
 def adopted_missions(
     connection: Connection, files: Mapping[str, Mission], leave: str | None = None
 ) -> dict[str, Mission]:
-    """The missions of these files with an adopted calibration over them, but for `leave`."""
+    """Missions of the files with an adopted calibration applied, except for `leave`."""
     found: dict[str, Mission] = {}
     for each in latest_adoptions(connection):
         file = files.get(each.spacecraft)
@@ -127,17 +126,17 @@ def geometry_of(tracker: Tracker) -> TrackerGeometry:
 
 
 def geometry_digest(mission: Mission) -> str:
-    """`sha256:` of alignment, focal plane and magnitudes of all trackers, and of nothing else."""
+    """SHA-256 of the alignment, focal plane and magnitudes of all trackers, prefixed `sha256:`."""
     geometries = [msgspec.to_builtins(geometry_of(each)) for each in mission.trackers]
     for each, tracker in zip(geometries, mission.trackers, strict=True):
-        # Adoptions of versions without magnitudes hold the digest of the rest.
+        # Adoptions by versions without magnitudes hold the digest of the other values.
         if tracker.magnitudes == AS_MEASURED:
             del each["magnitudes"]
     return "sha256:" + hashlib.sha256(msgspec.json.encode(geometries)).hexdigest()
 
 
 def with_geometry(mission: Mission, trackers: Sequence[TrackerGeometry]) -> Mission:
-    """The mission with the calibrations of these trackers; those not named stay as they are."""
+    """Copy of a mission with the calibrations of the given trackers; others stay unchanged."""
     named = {each.name: each for each in trackers}
     changed = tuple(
         _with(each, named[each.name]) if each.name in named else each for each in mission.trackers

@@ -1,8 +1,8 @@
-"""Reprocessing into an archive: plans and hands out tasks, names what they wrote, keeps trends.
+"""Coordinator of a reprocessing into an archive: plans tasks, distributes them, records results.
 
 A part is written by a worker, then named in the manifest of its day, then noted in the database
-with its rollups in one transaction.  Whatever ends the command in between leaves a file that the
-next one takes, or a part that it notes.
+with its rollups in one transaction.  An interruption between these steps leaves a file that the
+next call uses, or a part that it notes.
 """
 
 import hashlib
@@ -54,14 +54,14 @@ from service.storage.upkeep.reprocessing import Reprocessing, now_text, write_re
 from service.times import DAY_S, bucket_start, parse_utc
 
 REPORT_EVERY_S = 1.0
-"""How often the state is written, and `step` called, while nothing comes."""
+"""Seconds between progress reports while no result arrives."""
 
 Step = Callable[[ReprocessProgress], object]
 
 
 @dataclass
 class _ProgressReporter:
-    """Writes and shows how far it is."""
+    """Reporter that writes and shows the progress of a reprocessing."""
 
     folder: Path
     source: str
@@ -104,12 +104,12 @@ def reprocess_partitions(
     workers: Callable[[], Workers],
     step: Step,
 ) -> ReprocessProgress:
-    """Run every batch of the plan's stretch that its run does not hold yet, into an archive.
+    """Run the batches of the plan's period that its run lacks, and write results to an archive.
 
-    `workers` makes those that do the tasks.  `step` is called at the start, after each partition,
-    and every second.  Interrupted, it is called again and goes on.  Raises `BadBatch` for a run
+    `workers` creates the workers for the tasks.  `step` is called at the start, after each part,
+    and every second.  After an interruption another call continues.  Raises `BadBatch` for a run
     that is the source itself or has results of other settings, `BadConfiguration` where the folder
-    is missing, in use or of another database, and for what keeps a task from being done.
+    is missing, in use or of another database, and for a failed task.
     """
     with locked(folder):
         require_same_settings(store, plan, catalog_digest)
@@ -135,18 +135,17 @@ def reprocess_partitions(
 
 
 # The partitions to run again: parts of the archive, and days of the record.
-#
-# A batch that the run has already, wherever it is, is in no task: so an interrupted reprocessing
-# goes on, and every batch comes once.
+# A batch that the run has already, in either place, is in no task: an interrupted reprocessing
+# continues, and every batch is run once.
 
 MOST_BATCHES = 10_000
-"""The most batches of a task made of the record, as of a part of the archive."""
+"""Largest number of batches in a task from the database, as in an archive part."""
 _AT_ONCE = 1_000
 
 
 @dataclass(frozen=True)
 class Unit:
-    """A part of the archive, or what the record has of a day; `batches` of it are selected."""
+    """Unit of work: an archive part, or a day's recorded batches, with the number selected."""
 
     spacecraft: str
     day: int
@@ -154,7 +153,7 @@ class Unit:
     part: PlacedPart | None
     batches: int
     before: int = 0
-    """How many of the record's batches the run has."""
+    """Number of the unit's recorded batches that the run has already."""
 
     @property
     def partitions(self) -> int:
@@ -165,7 +164,7 @@ class Unit:
 
 @dataclass(frozen=True)
 class UnitTasks:
-    """The tasks of a unit, and how many of its batches the run has."""
+    """Tasks of a unit of work, and the number of its batches that the run has already."""
 
     before: int
     tasks: Iterator[PartitionTask]
@@ -173,7 +172,7 @@ class UnitTasks:
 
 @dataclass
 class Planner:
-    """Finds what is to be run again, and makes tasks of it."""
+    """Planner that finds the batches to run again, and groups them into tasks."""
 
     store: Store
     folder: Path
@@ -181,7 +180,7 @@ class Planner:
     catalog_digest: str
     _archive: Archive = field(init=False)
     _days: dict[str, set[int]] = field(init=False, default_factory=dict)
-    """The days in which the run has batches, by spacecraft."""
+    """Days on which the run has batches, by spacecraft."""
 
     def __post_init__(self) -> None:
         self._archive = Archive(self.folder)
@@ -212,7 +211,7 @@ class Planner:
         return sorted(found, key=lambda unit: (unit.spacecraft, unit.first_ns))
 
     def tasks_of(self, unit: Unit) -> UnitTasks:
-        """The tasks of a unit."""
+        """Create the tasks of a unit of work."""
         if unit.part is None:
             return UnitTasks(unit.before, self._of_record(unit))
         left_out, before = self._left_out(unit, unit.part)
@@ -298,7 +297,7 @@ class Planner:
         )
 
     def _left_out(self, unit: Unit, part: PlacedPart) -> tuple[frozenset[str], int]:
-        """The batches of a part that are not to be run again, and how many the run has."""
+        """Batches of an archive part to leave out, and the number that the run has already."""
         is_cut = _is_cut(part, self.plan.stretch)
         is_begun = unit.day in self._days[unit.spacecraft]
         if not is_cut and not is_begun:
@@ -318,7 +317,7 @@ class Planner:
         return frozenset(outside | done), len(done)
 
     def _made_of(self, unit: Unit, part: PlacedPart) -> Sequence[Part]:
-        """The parts of the run that were made of a whole part."""
+        """Archive parts of the run that were made from the whole of a given part."""
         day = bucket_start(unit.day, DAY_S).text[:10]
         named = manifest_of(self.folder, unit.spacecraft, day).parts
         return [p for p in named if p.run == self.plan.run and p.source == part.sha256]
@@ -346,7 +345,7 @@ def _days(connection: Connection, spacecraft: str, run: str | None) -> list[int]
 
 
 def _number(day: str) -> int:
-    """The number of a day from its text, as `Utc.bucket` gives it."""
+    """Number of a day from its text, as `Utc.bucket` gives it."""
     return parse_utc(f"{day}T00:00:00Z").bucket(DAY_S)
 
 
@@ -374,7 +373,7 @@ def _run_tasks(
             if not has_tasks:
                 progress.partitions_done += unit.partitions
 
-    # Workers start only if a task is left.
+    # Start workers only if a task is left.
     left = tasks()
     first = next(left, None)
     if first is None:

@@ -1,9 +1,9 @@
-"""One partition reprocessed: batches read, acquired with other settings, written; and by whom.
+"""Reprocessing task for one archive part: read batches, acquire with other settings, write.
 
-A task may run twice, here or on another machine, and be killed anywhere: its bytes follow from its
-input alone, and its file appears whole.  What would differ between two runs is left out of the
-results: ids follow from the source's, a result is dated when its batch was received, and the steps
-took no time.
+The module also has the kinds of workers.  A task may run twice, on any machine, and be killed at
+any point: its bytes follow from its input alone, and its file appears complete.  Values that would
+differ between two runs are replaced in the results: ids derive from the source's ids, a result has
+the time of its batch's receipt, and steps have zero duration.
 """
 
 import hashlib
@@ -44,31 +44,31 @@ from service.storage.upkeep.reprocessed import RunPart, run_part
 from service.times import recorded_utc
 
 COLUMNS = ("id", "batch_id", "batch", "received", "created", "input", "options", "current")
-"""The columns that a task reads of its source."""
+"""Columns that a task reads from its source."""
 AT_ONCE = 1_000
-"""Batches that go through the core together."""
+"""Number of batches acquired together."""
 _DIGITS = 24
-"""The digits of a digest in the name of a file."""
+"""Length of a digest in a file name, in hexadecimal digits."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """The batches of a task: a part of the archive, or a file's content made of the record."""
+    """Source of a task's batches: an archive part, or the content of one made from the database."""
 
     digest: str
-    """SHA-256 of the file."""
+    """SHA-256 of the source file."""
     path: str | None
     """Below the folder; None: the content is here."""
     content: bytes = b""
 
     def read(self, folder: Path) -> bytes:
-        """The content; raises `BadConfiguration` where the file is missing or damaged."""
+        """Read the source file's content; raises `BadConfiguration` if missing or damaged."""
         return self.content if self.path is None else whole_content(folder, self.path, self.digest)
 
 
 @dataclass(frozen=True)
 class PartitionTask:
-    """The batches of a day to run again, and where the results go."""
+    """Task of a reprocessing: a day's batches to run again, and the place of the results."""
 
     folder: Path
     spacecraft: str
@@ -77,13 +77,13 @@ class PartitionTask:
     source: Source
     batches: int
     settings: tuple[str, str]
-    """The digests of the mission and of the catalog."""
+    """Digests of the mission and of the catalog."""
     left_out: frozenset[str] = frozenset()
-    """Names of batches that the run has."""
+    """Names of batches that the run has already, which the task leaves out."""
 
     @property
     def digest(self) -> str:
-        """The digest of the results' origin: the source without what is left out."""
+        """Digest of the task's input: the source without the batches left out."""
         if not self.left_out:
             return self.source.digest
         names = "\0".join((self.source.digest, *sorted(self.left_out)))
@@ -91,7 +91,7 @@ class PartitionTask:
 
     @property
     def target(self) -> Path:
-        """The file of the results: another one for another source, other settings or version."""
+        """Path of the result file, which is unique for the source, settings and version."""
         made_from = "\0".join((self.digest, *self.settings, __version__))
         digest = hashlib.sha256(made_from.encode()).hexdigest()[:_DIGITS]
         place = day_folder(self.folder, self.spacecraft, self.day)
@@ -100,20 +100,20 @@ class PartitionTask:
 
 @dataclass(frozen=True)
 class PartitionResult:
-    """The result of a task: its part, and the batches that the settings cannot take."""
+    """Result of a task: the archive part, and the batches that the settings do not allow."""
 
     made: RunPart | None
-    """The part that was made; None: every batch was refused."""
+    """Archive part that was written; None if every batch was refused."""
     refused: Sequence[RefusedBatch]
 
     @property
     def batches(self) -> int:
-        """How many batches have a result."""
+        """Number of batches with a result."""
         return 0 if self.made is None else self.made.part.batches
 
 
 def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResult]:
-    """Do a task, and write its file unless that is there."""
+    """Run a task, and write its file unless it exists."""
     found: list[UnsavedResult] = []
     refused: list[RefusedBatch] = []
     stored = [row for row in _stored(task) if row["batch"] not in task.left_out]
@@ -134,7 +134,7 @@ def process_partition(solver: Solver, task: PartitionTask) -> list[PartitionResu
     content = encoded(to_partition(rows))
     written = write_first(task.target, content)
     if written != content:
-        # A process of another kind was faster: its results are those of the run.
+        # A different kind of process has written the file first: use its results.
         rows = from_partition(read_partition(written))
     return [PartitionResult(run_part(task.target.name, task.digest, rows, written), refused)]
 
@@ -156,7 +156,8 @@ def _unsaved(
 ) -> UnsavedResult:
     batch = submission.batch
     mission = mission_in_input(solver.missions, batch.spacecraft)
-    # Of the first result, where the source's current one is an adopted what-if.
+    # Derive the id from the first result, also where the source's current one is an adopted
+    # what-if.
     first = row["batch_id"] or row["id"]
     id = derived_ulid(first, batch.run, mission.digest, solver.sky.catalog.digest)
     received = recorded_utc(row["received"] or row["created"])
@@ -173,7 +174,7 @@ def _repeatable(acquisition: Acquisition) -> Acquisition:
 
 
 def _rows_of(found: Sequence[UnsavedResult]) -> Rows:
-    """The rows that recording these results would insert, in the order of `read_rows`."""
+    """Rows that recording the results would insert, in the order of `read_rows`."""
     in_order = sorted(found, key=lambda each: (each.result["time_ns"], each.id))
     children = {
         "stars": [_ordered(each.stars, "tracker", "position") for each in in_order],
@@ -201,28 +202,28 @@ def _table(table: Table, rows: Sequence[Row | None]) -> pa.Table:
 
 Outcome = PartitionResult | AcquisitionError
 Wait = Callable[[float], PartitionResult | None]
-"""Waits at most so many seconds for a result; None: there is none yet.
+"""Function that waits at most the given seconds for a result; returns None if there is none yet.
 
-Raises `BadConfiguration` for what ends the reprocessing.
+Raises `BadConfiguration` for an error that ends the reprocessing.
 """
 
 
 class Workers(Protocol):
-    """Whatever does tasks."""
+    """Interface of the workers that run reprocessing tasks."""
 
     @property
     def most_pending(self) -> int:
         """Number of tasks to submit before the first result is collected."""
 
     def submit(self, task: PartitionTask) -> Wait:
-        """Begin with a task, or queue it."""
+        """Start or queue a task; returns the function that waits for its result."""
 
     def close(self) -> None:
-        """Let what is unfinished go."""
+        """Abandon the unfinished tasks."""
 
 
 def attempt(solver: Solver, task: PartitionTask) -> list[Outcome]:
-    """Do a task in a worker; what went wrong is a result, with its words."""
+    """Run a task in a worker; an error is returned as the outcome."""
     try:
         return list(process_partition(solver, task))
     except OSError as error:
@@ -232,20 +233,20 @@ def attempt(solver: Solver, task: PartitionTask) -> list[Outcome]:
 
 
 def unwritten(task: PartitionTask, error: OSError) -> BadConfiguration:
-    """The error of a disk, such as a full one, in words."""
+    """Convert an error of the disk, such as a full one, to a message that names the file."""
     file = error.filename or task.target
     return BadConfiguration(f"{file}: {error.strerror or error}")
 
 
 def result_of(outcome: Outcome) -> PartitionResult:
-    """The result of a task; raises what went wrong."""
+    """Result of a task's outcome; raises the error, if the outcome is one."""
     if isinstance(outcome, AcquisitionError):
         raise outcome
     return outcome
 
 
 class OwnProcess:
-    """Does a task when its result is asked for."""
+    """Worker that runs a task in this process when its result is requested."""
 
     most_pending = 1
 
@@ -253,15 +254,15 @@ class OwnProcess:
         self._solver = solver
 
     def submit(self, task: PartitionTask) -> Wait:
-        """The task is begun when the function returned is called."""
+        """Return a function that runs the task when it is called."""
         return lambda seconds: result_of(attempt(self._solver, task)[0])
 
     def close(self) -> None:
-        """There is nothing to end."""
+        """Do nothing: there are no processes to end."""
 
 
 class LocalProcesses:
-    """Does tasks in so many processes."""
+    """Workers that run tasks in local processes."""
 
     PENDING_A_WORKER = 2
 
@@ -272,11 +273,11 @@ class LocalProcesses:
 
     @property
     def pids(self) -> frozenset[int]:
-        """The processes that are ready to work."""
+        """Ids of the processes that are ready to work."""
         return self._workers.pids
 
     def submit(self, task: PartitionTask) -> Wait:
-        """Queue a task."""
+        """Queue a task for the local processes; returns the function that waits for its result."""
         future = self._workers.submit(task)
 
         def wait(seconds: float) -> PartitionResult | None:
@@ -295,11 +296,11 @@ class LocalProcesses:
         return wait
 
     def close(self) -> None:
-        """End the processes."""
+        """End the local processes."""
         self._workers.close()
 
 
 def remove_unfinished(folder: Path, run_files: str) -> None:
-    """Delete the files that killed workers left half-written."""
+    """Delete incomplete files of killed workers."""
     for file in folder.glob(f"spacecraft=*/day=*/{run_files}"):
         file.unlink(missing_ok=True)

@@ -1,12 +1,12 @@
-"""The queue of submissions, and the thread that takes them from there to their answers.
+"""Queue of submissions, and the thread that processes them up to their answers.
 
     put ──► take ──► known? ──► compute ──► record ──► answer
                                   │            ▲
-                                  └► solver pool, for those that take long
+                                  └► solver pool, for slow batches
 
-The thread takes whatever waits, so that look-ups and commits are shared under load and
-nothing waits for a timer.  A batch that takes long goes to a thread of the pool, and delays
-no other.  A repeat of a batch that is being computed waits for it and is then looked up.
+The thread takes all waiting submissions at once, so that look-ups and commits are shared under load
+and nothing waits for a timer.  A slow batch goes to a thread of the pool, and delays no other.  A
+repeat of a batch in progress waits for it and is then looked up.
 """
 
 import asyncio
@@ -45,11 +45,11 @@ from service.times import Utc, utc_now
 OUTCOMES = ("unique", "ambiguous", "unmatched")
 MAX_WAITING = 2_000
 TOGETHER = 64
-"""The most batches of one transaction."""
+"""Largest number of batches in one transaction."""
 DRAIN_S = 8.0
-"""The longest wait for submissions to be answered when the service stops."""
+"""Longest wait in seconds for pending submissions when the service stops."""
 STALLED_S = 20.0
-"""A look-up takes at most five seconds, and computing a group much less."""
+"""Seconds after which the queue counts as stalled; a look-up takes at most five seconds."""
 
 log = logging.getLogger(__name__)
 
@@ -72,13 +72,13 @@ class PendingBatch:
     future: "asyncio.Future[Answered] | Future[Answered]" = field(default_factory=Future)
     wait_s: float = WAIT_S
     sequence: Hashable | None = None
-    """Batches of one sequence are computed one after another, each when the last is recorded."""
+    """Key of a sequence of batches; each is computed after the previous one is recorded."""
     time_ns: int = 0
-    """The order of those of a sequence that wait together."""
+    """Time that orders waiting batches of a sequence, in ns of TAI."""
     received: Utc = field(default_factory=utc_now)
     since_s: float = field(default_factory=time.monotonic)
     unsaved: UnsavedResult | None = None
-    """The result, once a thread has computed it."""
+    """Computed result, not yet recorded; None before the computation."""
 
 
 Answer = Answered | Exception
@@ -86,7 +86,7 @@ Answer = Answered | Exception
 
 @dataclass(frozen=True)
 class QueueState:
-    """How many submissions wait for their answers, and the age of the oldest."""
+    """Number of submissions waiting for answers, and age of the oldest in seconds."""
 
     queued: int
     oldest_s: float
@@ -94,14 +94,14 @@ class QueueState:
 
 @dataclass(frozen=True)
 class Backlog:
-    """The queue of submitted batches, and that of the writer."""
+    """State of the queue of submitted batches, and of the writer's queue."""
 
     posts: QueueState
     writes: WriterState
 
 
 class IngestQueue:
-    """Takes submissions from any thread; a thread of its own answers them."""
+    """Queue that takes submissions from any thread and answers them in its own thread."""
 
     def __init__(
         self,
@@ -111,15 +111,15 @@ class IngestQueue:
         counts: "RecordedCounts",
         in_force: MissionsInForce,
     ) -> None:
-        """`in_force` follows a database that services share before each group."""
+        """Prepare the queue; `in_force` is updated before each group on a shared database."""
         self._solver, self._store, self._pool = solver, store, pool
         self._counts = counts
         self._shared_missions = in_force if store.lock is not None else None
         self._changed = threading.Condition()
         self._waiting: deque[PendingBatch] = deque()
-        """Batches that wait for the queue's thread: new ones, and ones that the pool computed."""
+        """Batches that wait for the queue's thread: new ones, and ones computed by the pool."""
         self._in_flight: dict[Identity, list[PendingBatch]] = {}
-        """The batches that are being computed or recorded, each with its repeats."""
+        """Batches being computed or recorded, by identity, each with its waiting repeats."""
         self._sequences: Sequences[PendingBatch] = Sequences()
         self._unanswered: dict[PendingBatch, None] = {}
         self._closing = False
@@ -130,7 +130,7 @@ class IngestQueue:
         self._thread.start()
 
     def put(self, pending: PendingBatch) -> None:
-        """Queue a submission; raises `Busy` where too many wait, `Stopping` after `close`."""
+        """Queue a submission; raises `Busy` if the queue is full, `Stopping` after `close`."""
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -143,14 +143,14 @@ class IngestQueue:
             self._changed.notify_all()
 
     def state(self) -> QueueState:
-        """The submissions that wait for their answers."""
+        """Number and age of the submissions that wait for their answers."""
         with self._changed:
             oldest = next(iter(self._unanswered), None)
             age_s = 0.0 if oldest is None else time.monotonic() - oldest.since_s
             return QueueState(len(self._unanswered), age_s)
 
     def require(self) -> None:
-        """Raise `Stopping` where submissions are not worked on any more."""
+        """Raise `Stopping` if the queue is closed, stalled or without its thread."""
         since_s = self._solving_since_s
         is_stalled = since_s is not None and time.monotonic() - since_s > STALLED_S
         if self._closing or is_stalled or not self._thread.is_alive():
@@ -161,7 +161,7 @@ class IngestQueue:
         self._empty.wait(seconds)
 
     def close(self) -> None:
-        """Refuse new submissions, answer those that wait, and end the thread."""
+        """Refuse new submissions, answer the waiting ones, and end the thread."""
         with self._changed:
             self._closing = True
         self.wait_until_empty(DRAIN_S)
@@ -178,14 +178,14 @@ class IngestQueue:
             while group := self._take():
                 self._work_on(group)
         finally:
-            # Empty after closing in order; otherwise nothing that waits will be answered.
+            # Empty after a regular close; otherwise no thread is left to answer the waiting ones.
             with self._changed:
                 self._closing = True
                 left = list(self._unanswered)
             self._answer([(pending, Stopping("the queue has ended")) for pending in left])
 
     def _take(self) -> list[PendingBatch]:
-        """Take at most `TOGETHER` waiting batches; none after `close` when all are answered."""
+        """Take up to `TOGETHER` waiting batches; returns none after `close` if all are answered."""
         with self._changed:
             self._changed.wait_for(
                 lambda: self._waiting or (self._closing and not self._unanswered)
@@ -193,7 +193,7 @@ class IngestQueue:
             return [self._waiting.popleft() for _ in range(min(TOGETHER, len(self._waiting)))]
 
     def _work_on(self, group: Sequence[PendingBatch]) -> None:
-        """Answer what is recorded already; compute and record the others, each once."""
+        """Answer the batches recorded already; compute and record the others, each once."""
         computed = [pending for pending in group if pending.unsaved is not None]
         fresh = self._in_time([pending for pending in group if pending.unsaved is None])
         if fresh:
@@ -209,7 +209,7 @@ class IngestQueue:
             self._record(computed)
 
     def _in_time(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
-        """Refuse those that have waited too long for their turn; the others remain."""
+        """Refuse batches that have waited too long for their turn; returns the others."""
         now_s = time.monotonic()
         late = [pending for pending in group if now_s - pending.since_s > pending.wait_s]
         if not late:
@@ -220,7 +220,7 @@ class IngestQueue:
         return [pending for pending in group if pending not in late]
 
     def _not_recorded(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
-        """Answer those that are recorded, or whose identity or key is taken; the others remain."""
+        """Answer batches that are recorded, or with a taken identity or key; returns the others."""
         try:
             known = self._recorded_before(group)
         except Exception as error:
@@ -231,9 +231,9 @@ class IngestQueue:
         return [pending for pending in group if pending not in known]
 
     def _recorded_before(self, group: Sequence[PendingBatch]) -> dict[PendingBatch, Answer]:
-        """The stored answers of those that are recorded, and errors where another body is."""
-        # Identities before keys, each as of its moment: a batch recorded in between is found by
-        # its key, or seems new, and then the transaction finds it.
+        """Stored answers of batches that are recorded, or errors where another body is."""
+        # Look up identities before keys, each at its own moment: a batch recorded in between is
+        # found by its key, or seems new until its transaction finds it.
         try:
             with self._store.lookup() as connection:
                 registry = look_up(
@@ -265,7 +265,7 @@ class IngestQueue:
             if isinstance(answer, AcquisitionError):
                 known[pending] = answer
             elif answer is not None:
-                # One that was pruned in between is as new as any other.
+                # A batch that was pruned in between counts as new.
                 known[pending] = Answered(first.result_id, answer, replayed=True)
         # The keys of archived batches are in the archive.
         new_keys = {
@@ -281,7 +281,7 @@ class IngestQueue:
     def _keep_keys(
         self, repeats: Mapping[PendingBatch, ExistingResult]
     ) -> dict[PendingBatch, Exception]:
-        """Let the keys of repeats belong to their bodies from now on; those that are refused."""
+        """Assign the Idempotency-Keys of repeats to their recorded results; returns errors."""
         keys = [
             (pending.identity, pending.key, first)
             for pending, first in repeats.items()
@@ -290,7 +290,7 @@ class IngestQueue:
         try:
             outcomes = self._store.writer.change(partial(remember_keys, keys=keys), of_posts=True)
         except Exception as error:
-            # A client whose key is not kept must send again: it gets the error, not the answer.
+            # A client whose key is not stored must send again: it gets the error, not the answer.
             return dict.fromkeys(repeats, error)
         return {
             pending: outcome
@@ -299,7 +299,7 @@ class IngestQueue:
         }
 
     def _begins(self, pending: PendingBatch) -> bool:
-        """True for a batch to compute now; the others go to the pool, or wait for one like them."""
+        """True for a batch to compute now; others go to the pool, or wait for an equal batch."""
         with self._changed:
             repeats = self._in_flight.get(pending.identity)
             if repeats is not None:
@@ -317,7 +317,7 @@ class IngestQueue:
         return True
 
     def _computed(self, group: Sequence[PendingBatch]) -> list[PendingBatch]:
-        """Compute batches together; those that take long go to the pool, the others get results."""
+        """Compute batches together; slow ones go to the pool, others are returned with results."""
         submissions: dict[PendingBatch, Submission] = {}
         failed: dict[PendingBatch, Exception] = {}
         for pending in group:
@@ -339,7 +339,7 @@ class IngestQueue:
             except NotAtHand:
                 self._start(pending)
             except Exception as error:
-                # It concerns this batch alone, and its client gets it.
+                # The error concerns this batch alone: answer its client with it.
                 failed[pending] = error
             else:
                 pending.unsaved.handed_over_ns = time.perf_counter_ns()
@@ -348,7 +348,7 @@ class IngestQueue:
         return [pending for pending in group if pending.unsaved is not None]
 
     def _record(self, group: Sequence[PendingBatch]) -> None:
-        """Record results in one transaction, and answer."""
+        """Record results in one transaction, and answer their clients."""
         unsaved_results = [pending.unsaved for pending in group if pending.unsaved is not None]
         outcomes: Sequence[WriteOutcome]
         try:
@@ -360,7 +360,7 @@ class IngestQueue:
         done: list[tuple[PendingBatch, Answer]] = []
         for pending, outcome in zip(group, outcomes, strict=True):
             if isinstance(outcome, PredictionOutdated):
-                # Until its time is over it is computed from the attitude that is the last one now.
+                # Compute it again from the present last attitude, until its time is over.
                 pending.unsaved = None
                 self._start(pending)
             else:
@@ -370,7 +370,7 @@ class IngestQueue:
     # ---- a thread of the pool ----------------------------------------------------------------
 
     def _start(self, pending: PendingBatch) -> None:
-        """Queue a batch for the pool."""
+        """Queue a slow batch for the pool."""
         task = SolverTask(
             partial(self._solve, pending),
             lambda error: self._finish([(pending, error)]),
@@ -382,7 +382,7 @@ class IngestQueue:
             self._finish([(pending, error)])
 
     def _solve(self, pending: PendingBatch) -> None:
-        """Compute a batch, and let the queue's thread record it."""
+        """Compute a batch in the pool, and pass its result to the queue's thread."""
         try:
             pending.unsaved = self._solved_alone(pending)
         except BeingBuilt:
@@ -402,7 +402,7 @@ class IngestQueue:
             with self._store.reading_record() as connection:
                 submission = with_prediction(connection, submission, mission)
                 if self._store.lock is not None:
-                    # Other services record attitudes of this spacecraft, too.
+                    # Other services record attitudes of this spacecraft as well.
                     last = predicted_from(connection, batch, mission)
         unsaved = self._solver.solve(submission, pending.received, pending.key)
         unsaved.predicted_from = last
@@ -412,7 +412,7 @@ class IngestQueue:
     # ---- answers -----------------------------------------------------------------------------
 
     def _finish(self, outcomes: Sequence[tuple[PendingBatch, Answer]]) -> None:
-        """Answer what was computed; its repeats are looked up, for it may have failed."""
+        """Answer finished batches, and queue their repeats for a look-up."""
         with self._changed:
             repeats = [each for p, _ in outcomes for each in self._in_flight.pop(p.identity, ())]
             ended = [p.sequence for p, _ in outcomes if p.sequence is not None]
@@ -455,19 +455,19 @@ def _set_futures(outcomes: Sequence[tuple[PendingBatch, Answer]]) -> None:
 
 
 class RecordedCounts:
-    """How many new batches and stars were recorded since the start; the metrics read it."""
+    """Number of new batches and stars recorded since the start, for the metrics."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.batches: Counter[tuple[str, bool, bool]] = Counter()
-        """Batches by spacecraft, whether they are live, and whether they have an attitude."""
+        """Batches by spacecraft, live or not, and with attitude or without."""
         self.stars: Counter[tuple[str, bool, str]] = Counter()
-        """Their stars by spacecraft, whether the batch is live, and outcome."""
+        """Stars of the batches by spacecraft, live or not, and outcome."""
 
     def add(
         self, unsaved_results: Sequence[UnsavedResult], outcomes: Sequence[WriteOutcome]
     ) -> None:
-        """Count the batches that are new; a what-if holds the stars of one that is known."""
+        """Count newly recorded batches and their stars; what-ifs are left out."""
         with self._lock:
             for unsaved, outcome in zip(unsaved_results, outcomes, strict=True):
                 is_new = isinstance(outcome, Answered) and not outcome.replayed
@@ -480,7 +480,7 @@ class RecordedCounts:
                     self.stars[*owner, name] += unsaved.counts[name]
 
     def copy(self) -> "RecordedCounts":
-        """The counts of this moment."""
+        """Copy of the present counts."""
         copied = RecordedCounts()
         with self._lock:
             copied.batches, copied.stars = self.batches.copy(), self.stars.copy()
@@ -491,15 +491,15 @@ T = TypeVar("T")
 
 
 class Sequences(Generic[T]):
-    """The batches of one key that wait while another of it is at work.  The caller holds a lock."""
+    """Waiting batches by sequence, one of which is computed at a time; callers hold a lock."""
 
     def __init__(self) -> None:
         self._waiting: dict[Hashable, list[tuple[int, int, T]]] = {}
-        """By key that has one at work: the time of a waiting batch, a number, the batch."""
+        """Heap of waiting batches (time, number, batch) by the key of each active sequence."""
         self._numbers = count()
 
     def enter(self, key: Hashable, time_ns: int, item: T) -> bool:
-        """True if it may begin; if not, `leave` gives it when its turn has come."""
+        """Start an item of a sequence if none is active; otherwise queue it and return False."""
         waiting = self._waiting.get(key)
         if waiting is None:
             self._waiting[key] = []
@@ -508,7 +508,7 @@ class Sequences(Generic[T]):
         return False
 
     def leave(self, key: Hashable) -> T | None:
-        """The next of a key, whose last one is done; None where none waits."""
+        """Next waiting item of a sequence whose active one is done; None if none waits."""
         waiting = self._waiting[key]
         if waiting:
             return heapq.heappop(waiting)[2]

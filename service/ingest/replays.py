@@ -1,6 +1,6 @@
-"""Replays on the server: a telemetry file processed in the background, a batch a line.
+"""Replays on the server: telemetry files processed in the background, a batch a line.
 
-The progress of one is counted here, stored in its row, and reported by events.
+The progress of a replay is counted here, stored in its row, and reported by events.
 """
 
 import logging
@@ -31,17 +31,17 @@ from service.storage.store import Store
 
 MAX_ERRORS_KEPT = 1_000
 MAX_FAULTS_KEPT = 3
-"""The most faults of one line: each chunk that adds some stores all again, read as a whole."""
+"""Largest number of faults kept for a line: each change stores all again, read as a whole."""
 MAX_TEXT_KEPT = 300
 SAVE_EVERY_S = 0.2
-"""The time between two stored states: each is a transaction, and an event for all listeners."""
+"""Seconds between stored states of a replay: each is a transaction, and an event to listeners."""
 SAVE_PAUSE_S, LONGEST_PAUSE_S = 0.5, 30.0
 
 log = logging.getLogger(__name__)
 
 
 class _CountedAnswer(msgspec.Struct):
-    """The part of an answer that is counted."""
+    """The part of an answer that a replay counts."""
 
     counts: dict[str, int]
     attitude: msgspec.Raw
@@ -51,7 +51,7 @@ _COUNTED = msgspec.json.Decoder(_CountedAnswer)
 
 
 class ProgressRecorder:
-    """Counts what came of the lines of one replay, and stores it."""
+    """Recorder of a replay's progress, which counts the outcomes of its lines and stores them."""
 
     def __init__(
         self,
@@ -60,35 +60,35 @@ class ProgressRecorder:
         replay: records.Replay,
         on_cancelled: Callable[[], object],
     ) -> None:
-        """`on_cancelled` is called in the writer's thread where the row says `cancelled`."""
+        """`on_cancelled` is called in the writer's thread if the replay's row says `cancelled`."""
         self._store = store
         self._now = now
         self._on_cancelled = on_cancelled
         self._started_as = replay.progress()
         self._counts: Counter[str] = Counter(structs.asdict(replay.counts))
         self.lines_done = replay.lines.done
-        """The number of the last line whose batch is recorded."""
+        """Number of the last line whose batch is recorded."""
         self._refused = replay.lines.refused
         self._errors = list(replay.errors)
         self._errors_changed = False
         self.packet_counts: Callable[[], records.ReplayPackets | None] = lambda: None
-        """The counts of the packets that the lines are made of."""
+        """Function that returns the counts of the packets from which the lines are made."""
         self._saving: Future[None] | None = None
         self._is_saved = True
         self._saved_s = 0.0
 
     @property
     def id(self) -> str:
-        """The id of the replay."""
+        """Id of the replay."""
         return self._started_as.id
 
     @property
     def run(self) -> str:
-        """The run that the batches go to."""
+        """Name of the run that gets the batches."""
         return self._started_as.run
 
     def insert(self, also: Callable[[Connection], object]) -> None:
-        """Store the replay as new; `also` is called in the same transaction."""
+        """Store a new replay; `also` is called in the same transaction."""
         progress = self._progress("running", None)
         replay = records.Replay(**structs.asdict(progress), packets=self.packet_counts(), errors=[])
 
@@ -116,22 +116,22 @@ class ProgressRecorder:
         return any(self._counts[name] for name in recorded)
 
     def refuse(self, number: int, error: Exception, *, ends: bool = False) -> None:
-        """Count a refused line; an error that `ends` the replay is kept in any case."""
+        """Count a refused line; its error is kept if there is room, or if it ends the replay."""
         self._refused += 1
         if len(self._errors) < MAX_ERRORS_KEPT or ends:
             self._errors.append(records.RefusedLine(line=number, problem=_shortened_problem(error)))
             self._errors_changed = True
 
     def save_sometimes(self) -> None:
-        """Store how far the replay is, unless that was done a moment ago."""
+        """Store the replay's progress, unless that was done a moment ago."""
         if time.monotonic() - self._saved_s > SAVE_EVERY_S:
             self.save("running")
             self._saved_s = time.monotonic()
 
     def save(self, state: records.ReplayStateName, finished: str | None = None) -> None:
-        """Queue the present progress for the writer; it is stored while the next chunk is solved.
+        """Queue the replay's progress for the writer; it is stored while the next chunk is solved.
 
-        A replay that another process has cancelled stays cancelled.
+        A replay cancelled by another process stays cancelled.
         """
         progress = self._progress(state, finished)
         errors = list(self._errors) if self._errors_changed else None
@@ -154,7 +154,7 @@ class ProgressRecorder:
             self._not_saved(error)
 
     def require_saved(self) -> None:
-        """Wait until the progress that was last queued is stored, or has failed to be."""
+        """Wait until the progress queued last is stored, or its storage has failed."""
         saving, self._saving = self._saving, None
         if saving is None:
             return
@@ -164,9 +164,9 @@ class ProgressRecorder:
             self._not_saved(error)
 
     def conclude(self, state: records.ReplayStateName, closing: threading.Event) -> None:
-        """Store the state at the end; try again until that succeeds or the service closes.
+        """Store the final state of a replay; repeats until that succeeds or the service closes.
 
-        Without this record the replay would look as if it still ran.
+        Otherwise the replay would still appear to be running.
         """
         pause_s = SAVE_PAUSE_S
         while True:
@@ -191,15 +191,15 @@ class ProgressRecorder:
         )
 
     def _not_saved(self, error: Exception) -> None:
-        # The next save has the same and more; the batches themselves are recorded.
+        # The next save has the same counts and more; the batches themselves are recorded.
         self._errors_changed = True
-        # While the service stops nothing is stored; the next start marks it as interrupted.
+        # While the service stops nothing is stored; the next start marks the replay as interrupted.
         self._is_saved = isinstance(error, Stopping)
         log.warning("progress of replay %s not stored: %s", self.id, error)
 
 
 def _shortened_problem(error: Exception) -> records.LineProblem:
-    """The problem of a line: its first faults, long texts shortened."""
+    """Problem of a refused line: its first faults, with long texts shortened."""
     problem = problem_of(error)
     if "errors" not in problem:
         return records.LineProblem(detail=_shortened(problem["detail"]), errors=UNSET)
@@ -223,19 +223,19 @@ T = TypeVar("T")
 
 @runtime_checkable
 class CountedLines(Protocol):
-    """Lines of an upload that is no file of lines, which count what they are made of."""
+    """Lines decoded from an upload that is no file of lines; they count their sources."""
 
     spacecraft: str
-    """The mission that the lines are of."""
+    """Name of the mission that the lines belong to."""
 
     def __iter__(self) -> Iterator[Line]:
-        """Each batch and gyro block; iterated once."""
+        """Iterate over the batches and gyro blocks, only once."""
 
     def counts(self) -> records.ReplayPackets:
-        """What the lines read so far were made of."""
+        """Counts of the packets from which the lines read so far were made."""
 
     def close(self) -> None:
-        """Close the upload."""
+        """Close the uploaded file."""
 
 
 ReplaySource = Iterable[bytes | Line] | CountedLines
@@ -243,31 +243,31 @@ ReplaySource = Iterable[bytes | Line] | CountedLines
 
 # The lines of a telemetry file, in groups that are computed together.
 #
-# A line is text, or a `Line` with a number of its own and perhaps a fault in place of its text:
-# the batches of space packets have the numbers of their packets.
+# A line is text, or a `Line` with its own number and perhaps a fault instead of text: batches from
+# space packets have the numbers of their packets.
 
 MAX_BLANK_LINES = 1_000_000
-"""The blank lines of a file.  They hold nothing, and five gigabytes pack to five megabytes."""
+"""Largest number of blank lines in a file: five gigabytes of them compress to five megabytes."""
 
 
 @dataclass
 class LineGroup:
-    """Lines of a file that are not blank, with their numbers from 1.
+    """Group of a file's lines that are not blank, with their numbers from 1.
 
-    `last` is the number of the last line that was read, blank or not.
+    `last` is the number of the last line read, blank or not.
     """
 
     last: int = 0
     numbers: list[int] = field(default_factory=list)
     texts: list[bytes] = field(default_factory=list)
     faults: list[tuple[int, Fault]] = field(default_factory=list)
-    """The faults of lines that were refused when they were read, with their numbers."""
+    """Faults of lines that were refused on reading, with line numbers."""
 
     def __len__(self) -> int:
         return len(self.texts) + len(self.faults)
 
     def add(self, line: Line) -> None:
-        """Take a line, or its fault."""
+        """Add a line to the group, or its fault."""
         if line.body is None:
             assert line.fault is not None
             self.faults.append((line.number, line.fault))
@@ -282,10 +282,10 @@ def line_groups(
     size: Callable[[], int],
     require: Callable[[], object],
 ) -> Iterator[LineGroup]:
-    """The lines after the first `skipped` ones, `size` of them at a time.
+    """Group the lines after the first `skipped` ones, `size` lines in each group.
 
-    `require` is called before each line, and ends the reading where it raises.  Raises
-    `BadBatch` where there are too many blank lines.
+    `require` is called before each line, and stops the reading where it raises.  Raises `BadBatch`
+    for too many blank lines.
     """
     group, read, handed, blank = LineGroup(), 0, 0, 0
     try:
@@ -318,7 +318,7 @@ def line_groups(
 
 @dataclass
 class _PendingChunk:
-    """Lines that are being computed or written."""
+    """Group of lines with its chunk, which is being computed or written."""
 
     lines: LineGroup
     chunk: BulkChunk
@@ -338,9 +338,9 @@ class RunningReplay:
         longest_s: float,
         ended: Callable[[str], object] = lambda state: None,
     ) -> None:
-        """`owner` is the token that it was started with; it may take `longest_s` at most.
+        """Prepare a replay; `owner` is the token that started it, `longest_s` its time limit.
 
-        `ended` is called with its state in the end.
+        `ended` is called with the final state.
         """
         self._ended = ended
         self._skipped = replay.lines.done
@@ -359,11 +359,11 @@ class RunningReplay:
 
     @property
     def id(self) -> str:
-        """The id of the replay."""
+        """Id of the replay."""
         return self._progress.id
 
     def start(self, lines: ReplaySource, also: Callable[[Connection], object]) -> None:
-        """Store the replay as new and begin in a thread; `lines` are closed at the end.
+        """Store the replay as new and start its thread; `lines` are closed at the end.
 
         `also` is called in the transaction that stores it.
         """
@@ -375,11 +375,11 @@ class RunningReplay:
             raise
 
     def release_slot(self) -> None:
-        """Count as over: the replay could not be started."""
+        """Mark the replay as over, since it could not be started."""
         self._over.set()
 
     def resume(self, lines: ReplaySource) -> None:
-        """Go on after the last line that an earlier process stored as done."""
+        """Resume after the last line that an earlier process stored as done."""
         self._progress.save("running")
         self._progress.require_saved()
         self._start_thread(lines)
@@ -391,21 +391,21 @@ class RunningReplay:
 
     @property
     def is_over(self) -> bool:
-        """True if the replay has ended; one that is about to begin has not."""
+        """True if the replay has ended; False before its start."""
         return self._over.is_set()
 
     def stop(self) -> None:
-        """End after the chunk that is being written, because the service closes."""
+        """Stop the replay after the chunk being written, because the service closes."""
         self._closing.set()
         self._stopping.set()
 
     def cancel(self) -> None:
-        """End after the chunk that is being written, because a client asked for that."""
+        """Stop the replay after the chunk being written, because a client cancelled it."""
         self._cancelled = True
         self._stopping.set()
 
     def wait(self, longest_s: float | None = None) -> None:
-        """Return when it is over, or after so many seconds."""
+        """Wait until the replay is over, at most `longest_s` seconds."""
         self._over.wait(longest_s)
 
     def require_going_on(self) -> None:
@@ -426,7 +426,7 @@ class RunningReplay:
         except Busy:
             state = "interrupted"
         except BadInput as error:
-            # A fault of the file itself; the lines before it are recorded.
+            # The file itself has a fault; the lines before it are recorded.
             self._progress.refuse(self._progress.lines_done + 1, error, ends=True)
         except Exception as error:
             log.exception("replay %s failed", self.id)
@@ -444,7 +444,7 @@ class RunningReplay:
                 self._over.set()
 
     def _process(self, lines: ReplaySource) -> ReplayStateName:
-        """The state in the end; while a chunk is written, those after it are computed."""
+        """Process all lines and return the final state; computing and writing overlap."""
         groups = line_groups(lines, self._skipped, lambda: self._bulk.lines, self.require_going_on)
         try:
             try:
@@ -467,7 +467,7 @@ class RunningReplay:
             self._finish(self._writing)
 
     def _finished_all(self) -> bool:
-        """True if something is recorded once the last chunk is written."""
+        """Wait for the last chunk; True if any data of the file are recorded."""
         self._finish(self._writing)
         self._writing = None
         return self._progress.has_recorded
@@ -476,9 +476,10 @@ class RunningReplay:
         return self._bulk.begin(texts, self._progress.run, self._check, self.require_going_on)
 
     def _write_until(self, left: int) -> None:
-        """Queue chunks for the writer, oldest first, until so many are left."""
+        """Queue chunks for the writer, oldest first, until `left` chunks remain."""
         while len(self._computing) > left:
-            # Chunks of others may be computed first: a stopping replay does not wait for them.
+            # Chunks of other replays may be computed first: a stopping replay does not wait for
+            # them.
             while not self._computing[0].chunk.is_computed(STOP_WITHIN_S):
                 self.require_going_on()
             self._retry_while_busy(self._computing[0].chunk.queue_write)
@@ -527,6 +528,6 @@ class RunningReplay:
                 continue
 
     def _pause(self) -> None:
-        """Wait: single batches go before a replay."""
+        """Pause, since single batches take precedence over a replay."""
         self._stopping.wait(BUSY_PAUSE_S)
         self.require_going_on()

@@ -1,8 +1,7 @@
-"""Recorded batches run again into a named run: over all cores, and resumable.
+"""Reprocessing of recorded batches into a named run, on all cores, and resumable.
 
-Workers compute; this process alone reads and writes, since SQLite has one
-writer.  Batches that the run already holds are not read, so that a stopped or
-killed reprocessing continues where it was.
+Workers compute; this process alone reads and writes, since SQLite has one writer.  Batches that the
+run already holds are skipped, so that an interrupted reprocessing continues.
 """
 
 import json
@@ -31,18 +30,18 @@ from service.storage.store import Store
 from service.times import utc_now
 
 CHUNK = 100
-"""Batches that a worker takes, and that a transaction records."""
+"""Number of batches in a worker's task and in a transaction."""
 PENDING_A_WORKER = 2
-"""Chunks a worker that wait for it, or for being written."""
+"""Number of chunks for each worker that wait to be computed or written."""
 REFUSALS_KEPT = 20
 
 StoredBatch = tuple[str, str]
-"""A batch's input and the options of its result, as the JSON texts that are kept."""
+"""Stored batch: its input and the options of its result, as JSON texts."""
 
 
 @dataclass
 class ReprocessProgress:
-    """How far a reprocessing is: `total` are the batches of the stretch, `before` those done."""
+    """Progress of a reprocessing: `total` batches in the period, `before` of them done earlier."""
 
     run: str
     total: int
@@ -50,13 +49,13 @@ class ReprocessProgress:
     recorded: int = 0
     refused: int = 0
     refusals: list[str] = field(default_factory=list)
-    """The first of them, each naming its batch."""
+    """Messages of the first refused batches, each naming its batch."""
     partitions: int = 0
-    """The most partitions of a reprocessing into an archive."""
+    """Upper bound on the number of archive parts of a reprocessing into an archive."""
     partitions_done: int = 0
 
     def add_refused(self, refused: Sequence["RefusedBatch"]) -> None:
-        """Count refused batches, and note the first ones."""
+        """Count refused batches, and keep the messages of the first ones."""
         self.refused += len(refused)
         room = REFUSALS_KEPT - len(self.refusals)
         self.refusals += [f"{each.batch}: {each.why}" for each in refused[:room]]
@@ -64,7 +63,7 @@ class ReprocessProgress:
 
 @dataclass(frozen=True)
 class ReprocessPlan:
-    """The batches to run again, the run that gets the results, and the settings."""
+    """Plan of a reprocessing: the batches to run again, the target run, and the settings."""
 
     stretch: ResultFilter
     run: str
@@ -72,14 +71,14 @@ class ReprocessPlan:
     catalog: Path | None
     cache_bytes: int
     processes: int = 0
-    """How many workers; 0: one a core, 1: none but this process."""
+    """Number of worker processes; 0: one for each core, 1: none but this process."""
     track: bool = False
-    """True if batches are searched about the last attitude of the run, one after another."""
+    """True if stars are searched about the run's last attitude, batch after batch."""
 
 
 @dataclass(frozen=True)
 class RefusedBatch:
-    """A batch that the settings cannot take, and why."""
+    """Batch that cannot be computed with the settings, and the reason."""
 
     batch: str
     why: str
@@ -92,11 +91,11 @@ def reprocess(
     own: Solver,
     step: Callable[[ReprocessProgress], object],
 ) -> ReprocessProgress:
-    """Run every batch of the plan's stretch that its run does not hold yet.
+    """Run every batch of the plan's period that its run does not hold yet.
 
-    `own` computes what is to be tracked, workers all else.
-    `step` is called at the start and after each chunk.  Raises `BadBatch`
-    for a run that is the source itself, or holds results of other settings.
+    `own` computes the batches to be tracked, workers all others.  `step` is called at the start and
+    after each chunk.  Raises `BadBatch` for a run that is the source itself, or holds results of
+    other settings.
     """
     require_same_settings(store, plan, catalog_digest)
     progress = _counted(store, plan)
@@ -121,16 +120,16 @@ def reprocess(
 
 
 def require_other_run(run: str, source: str | None) -> None:
-    """Raise `BadBatch` for a run that is the source itself."""
+    """Raise `BadBatch` if the target run of a reprocessing is its source."""
     if run == source:
         message = "must be another run than the one whose batches are run again"
         raise BadBatch(Fault("run", message, shown_value(run)))
 
 
 def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str) -> None:
-    """Raise `BadBatch` where the run is the source, or has results of other settings.
+    """Raise `BadBatch` if the target run is the source, or has results of other settings.
 
-    Whether it was begun with tracking is one of them.
+    The settings include tracking, on or off.
     """
     require_other_run(plan.run, plan.stretch.run)
     made_with = select(
@@ -156,7 +155,7 @@ def require_same_settings(store: Store, plan: ReprocessPlan, catalog_digest: str
 
 
 def begin_run(store: Store, plan: ReprocessPlan) -> None:
-    """Note the run, and whether it is tracked, before its first result."""
+    """Create the run with its tracking mode, before its first result."""
 
     def change(connection: Connection) -> None:
         insert_runs(connection, {plan.run: utc_now().text})
@@ -178,7 +177,7 @@ def _conditions(plan: ReprocessPlan) -> list[ColumnElement[bool]]:
 
 
 def not_yet(run: str) -> ColumnElement[bool]:
-    """The SQL condition, beside `batches`, that a batch is not in a run, recorded or archived."""
+    """SQL condition on `batches`: the batch is not in a run, neither recorded nor archived."""
     done = batches.alias("done")
     return and_(
         *(
@@ -203,7 +202,7 @@ def _counted(store: Store, plan: ReprocessPlan) -> ReprocessProgress:
 
 
 def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
-    """The batches still to be run, in order of time; no read transaction stays open."""
+    """Batches still to be run, in order of time, in chunks; no read transaction stays open."""
     place: tuple[int, str] | None = None
     query = (
         select(*PLACE, batches.c.input, results.c.options)
@@ -223,7 +222,7 @@ def _chunks(store: Store, plan: ReprocessPlan) -> Iterator[list[StoredBatch]]:
 
 
 def after_place(place: tuple[int, str]) -> ColumnElement[bool]:
-    """The SQL condition that a result comes after a place in order of time."""
+    """SQL condition that a result follows a position in the order of time."""
     time_ns, batch_id = PLACE
     return (time_ns > place[0]) | and_(time_ns == place[0], batch_id > place[1])
 
@@ -241,7 +240,7 @@ def _record(
         elif isinstance(outcome, AcquisitionError) and not isinstance(outcome, Busy):
             refused.append(RefusedBatch(unsaved.identity[2], str(outcome)))
         else:
-            # Trouble of the database: nothing was decided about any of them.
+            # A fault of the database decides nothing about any of the batches.
             raise outcome
     progress.add_refused(refused)
 
@@ -253,7 +252,7 @@ def _track(
     progress: ReprocessProgress,
     step: Callable[[ReprocessProgress], object],
 ) -> None:
-    """Run batches one after another, each recorded before the next is predicted from it."""
+    """Run batches in sequence, each recorded before the next is predicted from it."""
     for chunk in _chunks(store, plan):
         for input, options in chunk:
             submission = submission_again(input, options, plan.run)
@@ -278,14 +277,14 @@ def _track(
 
 @dataclass(frozen=True)
 class _WorkerTask:
-    """The input of a worker: stored batches, and the run that they go to."""
+    """Task of a worker: stored batches and their target run."""
 
     run: str
     stored: Sequence[StoredBatch]
 
 
 def process_again(solver: Solver, part: _WorkerTask) -> list[UnsavedResult | RefusedBatch]:
-    """The unsaved results of stored batches in a run, with what cannot be taken."""
+    """Compute stored batches again for a run; gives unsaved results and refused batches."""
     submissions = [submission_again(*each, part.run) for each in part.stored]
     received = utc_now()
     found: list[UnsavedResult | RefusedBatch] = []
@@ -299,7 +298,7 @@ def process_again(solver: Solver, part: _WorkerTask) -> list[UnsavedResult | Ref
 
 
 def submission_again(input: str, options: str, run: str) -> Submission:
-    """A stored batch in another run, with the options of its current result."""
+    """Copy a stored batch to another run, with the options of its current result."""
     model = BatchIn.model_validate_json(input).model_copy(
         update={"run": run, "options": OptionsIn.model_validate(json.loads(options))}
     )
@@ -307,7 +306,7 @@ def submission_again(input: str, options: str, run: str) -> Submission:
 
 
 class _ChunkSolver:
-    """Computes in workers, or where only one is wanted or they are lost, in this process."""
+    """Solver of chunks in workers; in this process if there is one worker, or they are lost."""
 
     def __init__(self, plan: ReprocessPlan, catalog_digest: str) -> None:
         self._run = plan.run
@@ -326,7 +325,7 @@ class _ChunkSolver:
     def take(
         self, stored: Sequence[StoredBatch]
     ) -> Callable[[], list[UnsavedResult | RefusedBatch]]:
-        """Begin with some batches; to call what it gives waits for what comes of them."""
+        """Start computing batches; returns a function that waits for the results."""
         part = _WorkerTask(self._run, stored)
         if self.count == 1:
             return lambda: process_again(self._solver, part)
@@ -344,5 +343,5 @@ class _ChunkSolver:
         return found
 
     def close(self) -> None:
-        """End the workers."""
+        """Stop the workers."""
         self._workers.close()

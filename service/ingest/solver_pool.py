@@ -1,4 +1,4 @@
-"""Computing batches, and the threads that do it: kernels release the interpreter's lock."""
+"""Solver of batches and its pool of threads; kernels release the interpreter's lock."""
 
 import logging
 import os
@@ -33,9 +33,9 @@ from service.storage.recording.writer import RETRY_AFTER_S
 from service.times import Utc, utc_now
 
 WAIT_S = 5.0
-"""The longest that a task waits for a thread.  A batch takes a millisecond."""
+"""Longest wait of a task for a thread, in seconds; a batch takes a millisecond."""
 LONG_STARS, LONG_SIGMA_ARCSEC = 60, 60.0
-"""A batch of more stars, or with less accurate ones, may take seconds."""
+"""Number of stars, and sigma in arcsec, above which a batch may take seconds."""
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 
 class Solver:
-    """Computes batches with the missions and the sky of the service, in any thread."""
+    """Solver of batches with the service's missions and sky, usable from any thread."""
 
     def __init__(self, missions: Mapping[str, Mission], sky: SkyModel) -> None:
         self.missions = missions
@@ -51,7 +51,7 @@ class Solver:
         self.ids = Ulids()
 
     def acquire(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
-        """The acquisition of a batch, with other settings than its mission's where given."""
+        """Compute the acquisition of a batch, with its mission's settings or those given."""
         mission = mission or mission_in_input(self.missions, batch.spacecraft)
         return acquire(batch, mission, self.sky)
 
@@ -62,10 +62,10 @@ class Solver:
         *,
         at_once: bool = False,
     ) -> list[Acquisition | Exception]:
-        """The acquisition of each of some batches, or what keeps that one from having one.
+        """Compute the acquisition of each batch, or the error that prevents it.
 
-        With `mission` they are all of that one, with these settings instead of its own.
-        `at_once`: what takes long has `NotAtHand`.
+        With `mission` all batches belong to that mission, with these settings instead of its own.
+        With `at_once` a slow batch gets the error `NotAtHand`.
         """
         if mission is not None:
             return acquired(batches, mission, self.sky, at_once=at_once)
@@ -87,7 +87,7 @@ class Solver:
     def all_acquired(
         self, batches: Sequence[ObservationBatch], mission: Mission | None = None
     ) -> list[Acquisition]:
-        """Acquisitions of all batches; raises the first error, for which it may have to wait."""
+        """Compute the acquisitions of all batches, waiting if necessary; raises the first error."""
         found = []
         for each in self.acquired(batches, mission):
             if isinstance(each, Exception):
@@ -96,7 +96,7 @@ class Solver:
         return found
 
     def asks_for_last(self, batch: ObservationBatch) -> bool:
-        """True if the attitude of a batch is to be predicted from the record first.
+        """True if the attitude of a batch must first be predicted from the record.
 
         False for an unknown spacecraft, whose batch is refused.
         """
@@ -113,7 +113,7 @@ class Solver:
         received: Utc | None = None,
         key: OwnKey | None = None,
     ) -> UnsavedResult:
-        """The result of a submission; raises `BadBatch` for what does not fit its mission."""
+        """Compute the result of a submission; raises `BadBatch` if it does not fit its mission."""
         received = received or utc_now()
         return self.unsaved(submission, self.acquire(submission.batch), received, key)
 
@@ -124,7 +124,7 @@ class Solver:
         received: Utc,
         key: OwnKey | None = None,
     ) -> UnsavedResult:
-        """The result of a submission of which this was found; raises what kept it from that."""
+        """Build the result of a submission from its acquisition, or raise the given error."""
         if isinstance(found, Exception):
             raise found
         return unsaved_submission(submission, found, id=self.ids.new(), received=received, key=key)
@@ -132,7 +132,7 @@ class Solver:
     def solve_many(
         self, submissions: Sequence[Submission]
     ) -> list[UnsavedResult | AcquisitionError]:
-        """The result of each submission, or what is wrong with that one alone."""
+        """Compute the result of each submission, or its own error."""
         received = utc_now()
         several: Sequence[Acquisition | Exception]
         try:
@@ -141,7 +141,7 @@ class Solver:
             raise
         except Exception as error:
             if len(submissions) > 1:
-                # Only the batch with the fault is refused.
+                # Compute one by one, so that only the faulty batch is refused.
                 return [one for each in submissions for one in self.solve_many([each])]
             several = [error]
         return [
@@ -155,12 +155,12 @@ class Solver:
         try:
             return self.unsaved(submission, found, received)
         except Busy:
-            # Nothing is decided about the batch: the whole chunk may come again.
+            # `Busy` decides nothing about the batch: the whole chunk may come again.
             raise
         except AcquisitionError as error:
             return error
         except Exception:
-            # A fault of the service in one batch does not keep the others from being recorded.
+            # A fault of the service in one batch must not prevent the recording of others.
             identity = identity_of(submission.batch)
             run = {"run": submission.batch.run}
             log.exception("%s, run %s, batch %s failed", *identity, extra=run)
@@ -168,7 +168,7 @@ class Solver:
 
 
 def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
-    """The mission that an input names; raises `BadBatch` naming the field where there is none."""
+    """Mission that an input names; raises `BadBatch` naming the field for an unknown one."""
     try:
         return mission_named(missions, name)
     except NotFound:
@@ -177,37 +177,37 @@ def mission_in_input(missions: Mapping[str, Mission], name: str) -> Mission:
 
 
 def may_take_long(batch: ObservationBatch) -> bool:
-    """True if a batch may take seconds rather than a millisecond, as far as its form tells."""
+    """True if a batch may take seconds rather than a millisecond, judged by its form."""
     return (
         (batch.a_priori is None and batch.measurement is None)
         or bool(batch.options.tolerances)
         or batch.options.identifier in ("lost_in_space", "ptp")
         or sum(_most_stars(each) for each in batch.observations) > LONG_STARS
-        # NaN, where a star has the mission's sigma, is not greater.
+        # NaN, for a star with the mission's sigma, is not greater.
         or any((each.sigma_arcsec > LONG_SIGMA_ARCSEC).any() for each in batch.observations)
     )
 
 
 def _most_stars(stars: TrackerStars) -> int:
-    """The stars of a tracker; of a raster, as many as its lines can show."""
+    """Number of stars of a tracker; for a raster, an upper bound from its lines."""
     if not stars.readings:
         return stars.count
     lines = [each for each in stars.readings if each is not None and each.kind == "lines"]
-    # A star is a line that is brighter than its neighbours, in both directions.
+    # A star is a line brighter than its neighbours, in both directions.
     return stars.count + sum(min(len(each.h), len(each.v)) // 2 for each in lines)
 
 
 class SolverTask(NamedTuple):
-    """Work for a thread, and the function that is called if it does not start in time."""
+    """Task for a thread of the pool, with a function to call if it does not start in time."""
 
     work: Callable[[], object]
     refuse: Callable[[Exception], object]
     give_up_s: float
-    """A time on the clock of `time.monotonic`."""
+    """Deadline for the start, on the clock of `time.monotonic`."""
 
 
 class FairQueue:
-    """Tasks by client and spacecraft: one of each that has some, then the next."""
+    """Queue of tasks that alternates between clients and spacecraft."""
 
     def __init__(self) -> None:
         self._tasks: OrderedDict[Hashable, deque[SolverTask]] = OrderedDict()
@@ -216,11 +216,11 @@ class FairQueue:
         return bool(self._tasks)
 
     def put(self, client: Hashable, task: SolverTask) -> None:
-        """Add a task of a client."""
+        """Add a task of a client to the queue."""
         self._tasks.setdefault(client, deque()).append(task)
 
     def get(self) -> SolverTask:
-        """The next task; its client comes again after all others."""
+        """Take the next task; its client comes again after all others."""
         client, tasks = self._tasks.popitem(last=False)
         task = tasks.popleft()
         if tasks:
@@ -229,9 +229,9 @@ class FairQueue:
 
 
 class SolverPool:
-    """Threads that compute; long tasks leave one of them to short ones.
+    """Pool of threads that compute; long tasks leave one thread to short ones.
 
-    A task that raises `BeingBuilt` gives its thread back, and begins anew when that is built.
+    A task that raises `BeingBuilt` frees its thread, and starts again when the table is built.
     """
 
     def __init__(self, threads: int | None = None) -> None:
@@ -242,7 +242,7 @@ class SolverPool:
         self._changed = threading.Condition()
         self._closing = False
         self.builder = ThreadPoolExecutor(BUILDS_AT_ONCE, "sky")
-        """The pool that builds tables that tasks need while they wait."""
+        """Pool of threads that build the tables for which tasks wait."""
         self._threads = [
             threading.Thread(target=self._run, name=f"solver-{number}", daemon=True)
             for number in range(count)
@@ -251,7 +251,7 @@ class SolverPool:
             thread.start()
 
     def put(self, task: SolverTask, client: Hashable, *, is_long: bool) -> None:
-        """Queue a task; raises `Stopping` after `close`."""
+        """Queue a task for the pool; raises `Stopping` after `close`."""
         with self._changed:
             if self._closing:
                 raise Stopping("the service is stopping")
@@ -259,7 +259,7 @@ class SolverPool:
             self._changed.notify()
 
     def call(self, work: Callable[[], T], client: Hashable, *, is_long: bool) -> T:
-        """Have work done by a thread and wait for what it returns or raises."""
+        """Run a function in a thread of the pool and wait for its result or error."""
         done: Future[T] = Future()
 
         def run() -> None:
@@ -275,7 +275,7 @@ class SolverPool:
         return done.result()
 
     def close(self) -> None:
-        """Finish short tasks and those that have begun, refuse the others, end the threads."""
+        """Finish short tasks and those begun, refuse the others, and end the threads."""
         with self._changed:
             self._closing = True
             refused = []
@@ -306,7 +306,7 @@ class SolverPool:
                         self._long_slots += 1
 
     def _put_again(self, task: SolverTask, is_long: bool, built: "Future[Any]") -> None:
-        """Queue a task again that needed what is built now; where that failed, it fails, too."""
+        """Queue a task again after its table is built, or fail it if the build failed."""
         error = built.exception()
         if isinstance(error, Exception):
             task.refuse(error)
@@ -318,7 +318,7 @@ class SolverPool:
             task.refuse(stopping)
 
     def _next(self) -> tuple[SolverTask, bool] | None:
-        """The next task and whether it is long; None when there will be none."""
+        """Next task, and True if it is long; None when no more will come."""
         with self._changed:
             while True:
                 if self._short:

@@ -1,4 +1,4 @@
-"""Telemetry files on disk until their replays are over, so that a restart goes on with them."""
+"""Spool of telemetry files on disk until their replays end, so that a restart can resume them."""
 
 import fcntl
 import json
@@ -19,46 +19,46 @@ from service.storage.sql.database_file import PRIVATE_FILE, PRIVATE_FOLDER
 PART, LINES, ABOUT = ".part", ".lines", ".json"
 RETRY_S = 30
 UNLOCKED_S = 60.0
-"""An upload without a lock is left over after this: until then it may be about to be locked."""
+"""Seconds after which an unlocked upload counts as abandoned; earlier its lock may still come."""
 
 
 @dataclass(frozen=True)
 class SpooledReplay:
-    """The settings that a replay needs beside its row and its file to go on."""
+    """Settings that a replay needs in addition to its row and its file, to be resumed."""
 
     id: str
     coding: Coding
     longest_bytes: int
     owner: str | None
-    """The id of the token that it was started with."""
+    """Id of the token that started the replay; None without tokens."""
     caller: str
-    """The name of that token."""
+    """Name of the token that started the replay."""
     spacecraft: list[str] | None
-    """The spacecraft that the token is bound to; None: all."""
+    """Spacecraft that the token is limited to; None: all."""
     packets: str | None = None
-    """The spacecraft whose space packets the file holds; None: the file has lines."""
+    """Spacecraft whose space packets the file holds; None for a file of lines."""
     is_csv: bool = False
-    """True if the lines are CSV rows, as earlier versions wrote it in place of `form`."""
+    """True for a file of CSV rows, as written by versions without `form`."""
     form: str = ""
-    """The name of the file's format."""
+    """Name of the file's format; empty if an earlier version wrote the settings."""
 
     @property
     def form_name(self) -> str:
-        """The name of the file's format, of earlier versions too."""
+        """Name of the file's format, also for settings of earlier versions."""
         earlier = "packets" if self.packets is not None else CSV if self.is_csv else NDJSON
         return self.form or earlier
 
 
 class Spool:
-    """A folder of telemetry files, each with what its replay needs beside it."""
+    """Folder of telemetry files for replays, each with a file of settings beside it."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._held: dict[str, IO[str]] = {}
-        """The files beside the lines, locked while this process is at work on the replay."""
+        """Open settings files by replay id, locked while this process works on the replay."""
 
     def new_file(self) -> IO[bytes]:
-        """A file for an upload; raises `Busy` where none can be made."""
+        """Create a file for an upload; raises `Busy` if that fails."""
         try:
             self._folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
             self._remove_left_over()
@@ -67,7 +67,7 @@ class Spool:
             raise Busy(f"uploads cannot be stored now: {error.strerror}", RETRY_S) from None
 
     def keep(self, file: IO[bytes], about: SpooledReplay) -> None:
-        """Let an upload outlast this process; raises `Busy` where the disk fails."""
+        """Keep an upload and its settings beyond this process; raises `Busy` if the disk fails."""
         try:
             file.flush()
             os.fsync(file.fileno())
@@ -88,34 +88,34 @@ class Spool:
             raise Busy(f"uploads cannot be stored now: {error.strerror}", RETRY_S) from None
 
     def drop(self, id: str) -> None:
-        """Remove the file of a replay that is over."""
+        """Delete the files of a finished replay."""
         self.release(id)
         for suffix in (LINES, ABOUT):
             with suppress(OSError):
                 (self._folder / id).with_suffix(suffix).unlink()
 
     def release(self, id: str) -> None:
-        """Let another process go on with a replay."""
+        """Unlock a replay, so that another process can resume it."""
         held = self._held.pop(id, None)
         if held is not None:
             held.close()
 
     def path(self, id: str) -> Path:
-        """The place of the file of a replay."""
+        """Path of a replay's telemetry file."""
         return (self._folder / id).with_suffix(LINES)
 
     def open(self, id: str) -> IO[bytes]:
-        """The file of a replay; raises `OSError` where it is gone."""
+        """Open a replay's telemetry file; raises `OSError` if it is missing."""
         return self.path(id).open("rb")
 
     def ids(self) -> set[str]:
-        """The replays whose files are there."""
+        """Ids of the replays whose telemetry files exist."""
         return {place.stem for place in self._folder.glob(f"*{LINES}")}
 
     def left(self) -> Iterator[SpooledReplay]:
-        """The replays that no process is at work on, the oldest first; they are this one's now.
+        """Take over the replays that no process works on, the oldest first.
 
-        Uploads that were broken off are removed.
+        Incomplete uploads are deleted.
         """
         if not self._folder.is_dir():
             return
@@ -134,7 +134,7 @@ class Spool:
         self._remove_left_over()
 
     def _remove_left_over(self) -> None:
-        """Remove uploads that no process is receiving any more."""
+        """Delete incomplete uploads that no process is receiving any more."""
         for place in self._folder.glob(f"*{PART}"):
             with suppress(OSError), place.open("rb") as file:
                 if place.stat().st_mtime < time.time() - UNLOCKED_S:
@@ -143,12 +143,12 @@ class Spool:
 
 
 def _private(path: Path) -> IO[str]:
-    """A new text file that its owner alone can read, open for writing."""
+    """Create a text file that only its owner can read, open for writing."""
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC
     return os.fdopen(os.open(path, flags, PRIVATE_FILE), "w", encoding="utf-8")
 
 
 def _locked(file: IO[bytes]) -> IO[bytes]:
-    """The file with a lock that ends with the process, however that ends."""
+    """Lock a file until it is closed or the process ends."""
     fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     return file

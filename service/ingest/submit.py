@@ -1,4 +1,4 @@
-"""From a submission to its stored answer: read the body, compute, one transaction, answer."""
+"""Submission of a batch up to its stored answer: read, compute, record in one transaction."""
 
 import asyncio
 import logging
@@ -46,13 +46,13 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 YIELD_S = 0.002
-"""The longest wait of each bulk batch for single posts."""
+"""Longest wait in seconds of each bulk batch for single posts."""
 PORTION = 32
-"""Batches of bulk that are solved at once, while no single one comes before them."""
+"""Number of bulk batches solved together, between checks for single ones."""
 MAX_ARRAY = 100
-"""The most batches of an array."""
+"""Largest number of batches in an array."""
 READ_HERE_BYTES, READ_HERE_OBJECTS = 4_096, 64
-"""A body within both bounds is read in the event loop; thirty stars fit."""
+"""Limits on bytes and objects of a body read in the event loop; thirty stars fit."""
 MAX_KEY_LENGTH = 255
 
 _ARRAY: TypeAdapter[list[Any]] = TypeAdapter(
@@ -67,11 +67,11 @@ AnswerFuture = TypeVar("AnswerFuture", "asyncio.Future[Answered]", "Future[Answe
 
 
 class _WarmedUp(Exception):
-    """Rolls the warm-up batch back."""
+    """Exception that rolls the warm-up batch back."""
 
 
 class SubmissionService:
-    """Identifies, solves and records each submission once, however often it is sent."""
+    """Service that identifies, solves and records each submission once, also if sent repeatedly."""
 
     def __init__(
         self,
@@ -91,10 +91,10 @@ class SubmissionService:
         self._single_s = -float("inf")
 
     def require_kernels(self, *, of_zones: bool = False) -> None:
-        """Raise `Busy` while kernels are compiled: no answer depends on which ones exist.
+        """Raise `Busy` while kernels are compiled, so that no answer depends on which ones exist.
 
-        `of_zones`: those of batches with a zone suffice.  A batch that needs others, without a
-        priori attitude or with a wrong one, is refused where it needs them: by
+        With `of_zones` the kernels of batches with a zone suffice.  A batch that needs others,
+        without a priori attitude or with a wrong one, is refused where it needs them: by
         `SkyModel.require_whole_sky`.
         """
         if self._kernels is not None and (self._kernels.zones_needed or not of_zones):
@@ -105,10 +105,10 @@ class SubmissionService:
     async def answered(
         self, sent: bytes, idempotency_key: str | None = None, caller: Caller | None = None
     ) -> Answered:
-        """`submit` of a JSON body, for an event loop.
+        """Submit a batch as JSON from an event loop, and wait for its answer.
 
-        A small batch is read in the event loop.  A larger one is not: every other request
-        would wait for it.
+        A small batch is read in the event loop.  A larger one is not, since it would delay every
+        other request.
         """
         self.require_kernels(of_zones=True)
         loop = asyncio.get_running_loop()
@@ -120,9 +120,9 @@ class SubmissionService:
         return await self.queued(submission, idempotency_key, caller, future)
 
     async def read_array(self, sent: bytes) -> list[Submission | BadBatch]:
-        """The batches of a JSON array; in the place of one that is refused, its error.
+        """Decode a JSON array of batches; a refused element gives its error.
 
-        Raises `BadBatch` where the body is no array of one to `MAX_ARRAY` elements.
+        Raises `BadBatch` unless the body is an array of one to `MAX_ARRAY` elements.
         """
         self.require_kernels(of_zones=True)
         loop = asyncio.get_running_loop()
@@ -131,7 +131,7 @@ class SubmissionService:
     async def answered_each(
         self, read: Sequence[Submission | BadBatch], caller: Caller | None = None
     ) -> list[Outcome]:
-        """`submit` each of the batches of an array; the answers and errors in their order."""
+        """Submit each batch of an array; the answers and errors in order."""
         loop = asyncio.get_running_loop()
         futures: list[asyncio.Future[Answered]] = []
         for each in read:
@@ -151,11 +151,11 @@ class SubmissionService:
         idempotency_key: str | None = None,
         caller: Caller | None = None,
     ) -> Answered:
-        """Record a batch and answer it; a repeat gets the stored answer.
+        """Record a batch and return its answer; a repeated batch gets the stored answer.
 
-        Raises what `queued` and its future raise: `KeyReused` and `Conflict` for another body
-        under a key or a batch that is taken, `BadBatch` also for an unknown spacecraft and for
-        what does not fit its mission.
+        Raises the errors of `queued` and of its future: `KeyReused` and `Conflict` for another body
+        under a key or a batch that is taken, `BadBatch` also for an unknown spacecraft and for a
+        batch that does not fit its mission.
         """
         return self.queued(submission, idempotency_key, caller, Future()).result()
 
@@ -168,9 +168,9 @@ class SubmissionService:
     ) -> AnswerFuture:
         """Queue a batch; the future, of an event loop or of threads, gives the stored answer.
 
-        Raises `Forbidden` where the caller may not ask about the spacecraft,
-        `BadBatch` for a key that cannot be one, and `Busy` where too much is waiting.
-        The future raises what else keeps the batch from being recorded.
+        Raises `Forbidden` where the caller has no access to the spacecraft, `BadBatch` for an
+        invalid key, and `Busy` where the queue is full.  The future raises any other error that
+        keeps the batch from being recorded.
         """
         batch = submission.batch
         if caller is not None:
@@ -199,9 +199,9 @@ class SubmissionService:
         wait_s: float = WAIT_S,
         tracked_ns: int | None = None,
     ) -> AnswerFuture:
-        """`queued` for a batch that `make` makes, in the pool, unless it is recorded already.
+        """Queue a batch that `make` builds in the pool, unless it is recorded already.
 
-        `tracked_ns` is the time of one that asks for the last attitude.
+        `tracked_ns` is the time of a batch that asks for the last attitude.  Otherwise as `queued`.
         """
         token_id = None if caller is None else caller.token_id
         key = None
@@ -222,7 +222,7 @@ class SubmissionService:
     # ---- many together -----------------------------------------------------------------------
 
     def submit_many(self, submissions: Sequence[Submission]) -> Answers:
-        """Record many in one transaction; a refused one has its error in the list.
+        """Record many batches in one transaction; a refused one has its error in the list.
 
         Those that ask for the last attitude follow one by one.
         """
@@ -233,7 +233,7 @@ class SubmissionService:
         return [tracked[k] if k in tracked else next(answers) for k in range(len(submissions))]
 
     def submit_tracked(self, submission: Submission) -> Answered | AcquisitionError:
-        """Record one of many that asks for the last attitude; raises `Busy`."""
+        """Record a bulk batch that asks for the last attitude; raises `Busy`."""
         batch = submission.batch
         pending = PendingBatch(
             identity := identity_of(batch),
@@ -264,8 +264,8 @@ class SubmissionService:
             ]
             repeats = {each.result_id for each in holders if isinstance(each, ExistingResult)}
             stored = self._store.archive.stored_answers(connection, repeats)
-        # The connection is given back: a snapshot of the database that is held for as long as
-        # five hundred batches take keeps SQLite from shortening its log.
+        # Close the connection: a snapshot held during the computation of five hundred batches keeps
+        # SQLite from shortening its log.
         fresh = [each for holder, each in zip(holders, submissions, strict=True) if not holder]
         solved = iter(self.solve_many(fresh))
         found = [holder or next(solved) for holder in holders]
@@ -290,9 +290,9 @@ class SubmissionService:
         adopt: bool,
         entry: Entry | None = None,
     ) -> Answered:
-        """Run a recorded batch again; `options` replace what they name of the result's own.
+        """Run a recorded batch again; `options` override those of its result.
 
-        `entry` is stored in the audit list together with a result that is recorded.
+        `entry` is stored in the audit list together with a recorded result.
         """
         with self._store.reading_batch(id) as (connection, archived):
             parent = read_parent(connection, id, archived=archived, kept=record or adopt)
@@ -322,9 +322,9 @@ class SubmissionService:
         return outcome
 
     def run_again(self, batch: ObservationBatch, mission: Mission | None = None) -> Acquisition:
-        """The acquisition of a recorded batch, with other settings where given; nothing is kept.
+        """Compute a recorded batch again, with other settings if given; nothing is stored.
 
-        Raises `Busy` where every thread is at work for long.
+        Raises `Busy` while all threads have long tasks.
         """
         return self.run_again_many([batch], mission, is_long=may_take_long(batch))[0]
 
@@ -334,7 +334,7 @@ class SubmissionService:
         mission: Mission | None = None,
         is_long: bool = True,
     ) -> list[Acquisition]:
-        """As `run_again` of each of some batches of one spacecraft; raises the first error."""
+        """Compute recorded batches of one spacecraft again; raises the first error."""
         return self.pool.call(
             lambda: self.solver.all_acquired(batches, mission),
             ("again", batches[0].spacecraft),
@@ -342,9 +342,9 @@ class SubmissionService:
         )
 
     def warm_up(self, submission: Submission) -> None:
-        """Look up, solve and record a batch, and take it back: nothing is kept or told.
+        """Look up, solve and record a batch, then roll back: nothing is stored or reported.
 
-        Connections are opened and statements prepared that the first batch would wait for.
+        Opens connections and prepares statements, which would delay the first batch.
         """
         with self._store.lookup() as connection:
             look_up(connection, {identity_of(submission.batch)})
@@ -362,9 +362,9 @@ class SubmissionService:
     def solve_many(
         self, submissions: Sequence[Submission], require: Callable[[], object] = lambda: None
     ) -> list[UnsavedResult | AcquisitionError]:
-        """The result of each of many, or what is wrong with that one; single submissions go first.
+        """Compute many submissions, each to a result or its own error; single submissions go first.
 
-        `require` is called before each portion, and ends this where it raises.
+        `require` is called before each portion, and stops the work where it raises.
         """
         found: list[UnsavedResult | AcquisitionError] = []
         for portion in _portions(submissions):
@@ -374,7 +374,7 @@ class SubmissionService:
         return found
 
     def begin_writing(self, unsaved_results: Sequence[UnsavedResult]) -> Callable[[], Answers]:
-        """Queue many results for a transaction; to call what it gives waits for the answers."""
+        """Queue results for one transaction; returns a function that waits for the answers."""
         if not unsaved_results:
             return list
         self._store.progress.hold_back()
@@ -397,22 +397,22 @@ class SubmissionService:
         return time.monotonic() - self._single_s
 
     def yield_to_interactive(self) -> None:
-        """Wait a little for single batches to be answered."""
+        """Wait a little until single batches are answered."""
         self._queue.wait_until_empty(YIELD_S)
 
     # ---- state -------------------------------------------------------------------------------
 
     def backlog(self) -> Backlog:
-        """The submissions without an answer, and the state of the writes."""
+        """Number of unanswered submissions, and the state of the writer."""
         return Backlog(self._queue.state(), self._store.writer.state())
 
     def require_alive(self) -> None:
-        """Raise `Stopping` where submissions are not worked on any more."""
+        """Raise `Stopping` if the queue or the writer is closed or stalled."""
         self._queue.require()
         self._store.writer.require()
 
     def close(self) -> None:
-        """Answer what was submitted, and take no more."""
+        """Answer the submitted batches, and refuse further ones."""
         self._reader.shutdown(cancel_futures=True)
         self._queue.close()
         self.pool.close()
@@ -435,10 +435,10 @@ def _portions(submissions: Sequence[Submission]) -> Iterator[list[Submission]]:
 
 
 def decided(outcomes: WriteOutcomes) -> Answers:
-    """Answers and errors of single batches; raises the others."""
+    """Answers and errors that concern single batches; raises any other error."""
     answers: Answers = []
     for outcome in outcomes:
-        # Both decide nothing about the batch.
+        # Neither kind of error decides anything about the batch.
         if isinstance(outcome, Busy) or not isinstance(outcome, Answered | AcquisitionError):
             raise outcome
         answers.append(outcome)
@@ -451,7 +451,7 @@ def _submissions_of_array(sent: bytes) -> list[Submission | BadBatch]:
 
 def _submission_of(element: Any) -> Submission | BadBatch:
     try:
-        # As text again: a batch is read by the one reader of batches, NaN and all.
+        # Convert to text again: all batches go through the same reader, including NaN.
         return submission_from_json(to_json(element, inf_nan_mode="constants"))
     except BadBatch as error:
         return error

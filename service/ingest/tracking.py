@@ -1,6 +1,7 @@
-"""The prediction of a batch that asks for the last attitude, from what is recorded.
+"""Prediction of the attitude for a batch that asks for the last attitude in the record.
 
-It becomes a part of the recorded batch: whatever is recorded later, the batch explains its answer.
+It becomes part of the recorded batch, so that the batch explains its answer whatever is recorded
+later.
 """
 
 import json
@@ -31,11 +32,11 @@ from service.times import Utc, recorded_utc, shifted
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 MARGIN_SIGMAS = 3.0
-"""A zone reaches beyond the field of view by so many sigmas of the prediction."""
+"""Margin of a zone beyond the field of view, in sigmas of the prediction."""
 LARGEST_SIGMAS = 5.0
-"""Largest rate that two attitudes may give, in sigmas of the mission's rate."""
+"""Largest rate derived from two attitudes that is believed, in sigmas of the mission's rate."""
 SAMPLES_BEFORE_S = 60.0
-"""Gyro samples are read from so long before the attitude: one of them begins the first step."""
+"""Seconds before the attitude from which gyro samples are read, to cover the first step."""
 
 _LAST = (
     select(
@@ -59,7 +60,7 @@ _LAST = (
 
 @dataclass(frozen=True, eq=False)
 class RecordedAttitude:
-    """A good attitude, the result that it is of, and the rates (3,) that its batch carried."""
+    """Recorded good attitude, with its result and the rates (3,) in its batch."""
 
     result: str
     time: Utc
@@ -70,9 +71,9 @@ class RecordedAttitude:
 def last_attitudes(
     connection: Connection, spacecraft: str, run: str, until: Utc, within_s: float
 ) -> list[RecordedAttitude]:
-    """The last two good attitudes that are not after a time, nor older than so much, latest first.
+    """The last two good attitudes up to a time and no older than `within_s`, latest first.
 
-    A suspect attitude is none of them.
+    Suspect attitudes are left out.
     """
     asked = {
         "spacecraft": spacecraft,
@@ -92,7 +93,7 @@ def last_attitudes(
 def predicted_from(
     connection: Connection, batch: ObservationBatch, mission: Mission
 ) -> PredictedFrom:
-    """The results whose attitudes the prediction of a batch begins with."""
+    """Find the results whose attitudes start the prediction of a batch."""
     settings = mission.tracking or TrackingSettings()
     until_ns = batch.time.tai_ns
     since_ns = until_ns - round(settings.max_age_s * 1e9)
@@ -103,10 +104,10 @@ def predicted_from(
 def with_prediction(
     connection: Connection, submission: Submission, mission: Mission, gyro_run: str | None = None
 ) -> Submission:
-    """The submission with the prediction in its batch, or the reason why there is none.
+    """Add a prediction to the batch of a submission, or the reason why there is none.
 
-    The fingerprint stays that of what was sent.  The gyro is that of `gyro_run`, by default of
-    the batch's own run.
+    The fingerprint stays that of the batch as sent.  Gyro data are those of `gyro_run`, by default
+    of the batch's own run.
     """
     batch = submission.batch
     a_priori: dict[str, Any] = {"from": "last"}
@@ -121,10 +122,10 @@ def with_prediction(
 def tracked_again(
     connection: Connection, submission: Submission, mission: Mission, gyro_run: str
 ) -> Submission:
-    """A recorded batch in another run, with a prediction from the last attitude of that run.
+    """Copy a recorded batch to another run, with a prediction from that run's last attitude.
 
-    It takes the place of any a priori knowledge.  Where nothing can be predicted, knowledge that
-    was sent with the batch stays.  A batch without stars is left as it is.
+    The prediction replaces any a priori knowledge.  Without a prediction, knowledge that was sent
+    with the batch stays.  A batch without stars is left unchanged.
     """
     if submission.batch.measurement is not None:
         return submission
@@ -182,7 +183,7 @@ def _predicted(
     before: RecordedAttitude | None,
     gyro_run: str,
 ) -> tuple[prediction.Known, RateSource]:
-    """The attitude at the batch's time: by the gyro where it is recorded, else at a rate."""
+    """Predict the attitude at the batch's time: by recorded gyro data, else at a constant rate."""
     now_ns = batch.time.tai_ns
     motion = mission.motion or MotionSettings()
     by_gyro = _by_gyro(connection, batch, mission, last, before, gyro_run)
@@ -201,7 +202,7 @@ def _rate(
 ) -> tuple[prediction.Rate, RateSource]:
     passed_s = (batch.time.tai_ns - last.known.tai_ns) * 1e-9
     both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
-    # Zero is what a batch has that tells nothing of its rates.
+    # A batch without rates has zeros.
     rates = [np.radians(each) for each in both if each.any()]
     if rates:
         settings = mission.tracking or TrackingSettings()
@@ -213,15 +214,15 @@ def _rate(
             # A body that turns far may nutate: the difference of the rates is an error then.
             added = float(np.sum((rates[-1] - rates[0]) ** 2))
         if _contradict(before, last):
-            # The rates do not lead from one attitude to the next: they tell how fast, not where.
+            # The rates do not lead from one attitude to the next: trust only their magnitude.
             added = turning**2
         if added:
             given = replace(given, variance=given.variance + np.eye(3) * added)
         return given, "body_rates"
     if before is not None and before.known.tai_ns < last.known.tai_ns:
         derived = prediction.derived_rate(before.known, last.known, passed_s)
-        # Between them there may have been a manoeuvre, such as a flip of the roll; or the body
-        # turned the other way round, if that is no faster than it may turn.
+        # Between the attitudes there may have been a manoeuvre, such as a flip of the roll; or the
+        # body turned the other way round, if its rate may be that large.
         largest = LARGEST_SIGMAS * motion.rate_sigma_rad_s
         h = (last.known.tai_ns - before.known.tai_ns) * 1e-9
         if np.abs(derived.rad_s).max() <= largest < _other_way_rad_s(derived, h):
@@ -230,16 +231,16 @@ def _rate(
 
 
 def _other_way_rad_s(derived: prediction.Rate, step_s: float) -> float:
-    """The largest component of the rate of a body that turned the other way round in a step."""
+    """Largest component (rad/s) of the rate if the body turned the opposite way in a step."""
     angle = float(np.linalg.norm(derived.rad_s)) * step_s
     if angle == 0.0:
-        # About any axis: the largest component is least along a diagonal.
+        # The axis is free: the largest component is least along a diagonal.
         return 2.0 * math.pi / (math.sqrt(3.0) * step_s)
     return float(np.abs(derived.rad_s).max()) * (2.0 * math.pi - angle) / angle
 
 
 def _contradict(before: RecordedAttitude | None, last: RecordedAttitude) -> bool:
-    """True if the rates of two batches do not lead from one attitude to the other."""
+    """True if the rates in two batches do not lead from one attitude to the other."""
     if before is None or not before.body_rates_deg_per_s.any():
         return False
     step_s = (last.known.tai_ns - before.known.tai_ns) * 1e-9
@@ -263,7 +264,7 @@ def _by_gyro(
     if mission.gyro is None:
         return None
     start = shifted(last.time, -SAMPLES_BEFORE_S)
-    # The end of a filter is excluded.
+    # A filter excludes its end: extend it to include the batch's time.
     end = shifted(batch.time, 1e-6)
     selected = BlockFilter(batch.spacecraft, gyro_run, start, end)
     tai_ns, rates = gyro_in(connection, selected)
@@ -286,10 +287,11 @@ def _turns(
     last: RecordedAttitude,
     before: RecordedAttitude | None,
 ) -> bool:
-    """True if the body turns for certain, so that gyro samples of zeros stand for none.
+    """True if the body certainly rotates, so that gyro samples of zero mean missing data.
 
-    The step between the last two attitudes tells it.  Rates of batches tell it where the turn is
-    more than a quarter since the last attitude; where that has none before it, by their errors.
+    The step between the last two attitudes shows the rotation.  Rates of batches show it if the
+    body has turned more than a quarter since the last attitude, or, without an attitude before
+    that, by their errors.
     """
     both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
     fastest_rad_s = math.radians(float(np.linalg.norm(both, axis=1).max()))

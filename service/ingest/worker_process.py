@@ -1,6 +1,6 @@
-"""A local process that computes chunks of long work: its settings, and what it does.
+"""Local worker process that computes chunks of long work: its settings and functions.
 
-It has missions and a sky of its own and never sees the database.
+The process has its own missions and sky and never sees the database.
 """
 
 import gc
@@ -26,9 +26,9 @@ from service.sky.catalog.star_catalog import open_catalog
 from service.sky.model import SkyModel
 
 NICENESS = 10
-"""Single batches go first."""
+"""Niceness of worker processes, so that single batches go first."""
 PACKED_TOGETHER, MOST_BYTES = 8, 65_536
-"""Results of a worker, unless they are larger than so."""
+"""Number of results that a worker packs together, and the size limit of a pack in bytes."""
 
 log = logging.getLogger(__name__)
 
@@ -39,17 +39,17 @@ Work = Callable[[Solver, Input], Sequence[Output]]
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """The settings of a worker: the same missions, catalog and cache as its parent."""
+    """Settings of a worker process: the same missions, catalog and cache as its parent's."""
 
     missions: Mapping[str, Mission]
     catalog: Path | None
     catalog_digest: str
     cache_bytes: int
     source: Source = field(default_factory=own_source)
-    """The version and digest of the parent's code."""
+    """Version and digest of the parent's code."""
 
     def solver(self) -> Solver:
-        """The worker's solver.
+        """Build the worker's solver.
 
         Raises `BadConfiguration` where the catalog's file has changed, or the code is not the
         parent's.
@@ -71,7 +71,7 @@ def begin(
     all_ready: Barrier,
     log_settings: logs.LogSettings | None,
 ) -> None:
-    """Get ready to compute; the process exits when its parent does, or closes `stop`."""
+    """Initialise a worker process; it exits when its parent does, or closes `stop`."""
     global _solver, _all_ready
     end_with_parent(stop)
     _all_ready = all_ready
@@ -81,7 +81,7 @@ def begin(
     try:
         _solver = config.solver()
     except BadConfiguration as error:
-        # Raised here it would break the executor.
+        # Raised here, the error would break the executor.
         log.error("a worker cannot compute: %s", error)
         _solver = error
         return
@@ -97,14 +97,14 @@ def ready_pid() -> int:
 
 
 def compute(work: Work[Any, Any], task: Any) -> list[bytes]:
-    """The results for a task, in packs; raises `BadConfiguration` where it cannot compute."""
+    """Compute a task's results, in packs; raises `BadConfiguration` without a solver."""
     if isinstance(_solver, BadConfiguration):
         raise _solver
     return packed(work(_solver, task))
 
 
 def packed(found: Sequence[object]) -> list[bytes]:
-    """Some together, which share their names; large ones alone: unpacking holds the lock."""
+    """Pickle results in packs that share names; large ones singly: unpickling holds the GIL."""
     packs = []
     for first in range(0, len(found), PACKED_TOGETHER):
         chunk = found[first : first + PACKED_TOGETHER]
