@@ -1,1 +1,1 @@
-"""The typed records of the service: what storage returns, the API encodes, OpenAPI describes."""
+"""Typed records of the service, returned by storage and encoded and described by the API."""

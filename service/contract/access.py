@@ -1,4 +1,4 @@
-"""Callers, tokens, and the audit list of what they changed."""
+"""Records of access: callers, tokens, and the audit list of changes."""
 
 from typing import Annotated, ClassVar, Literal
 
@@ -8,25 +8,25 @@ Scope = Literal["read", "submit", "operate"]
 
 
 class Session(Record, frozen=True, kw_only=True):
-    """The caller and its scopes."""
+    """The caller of a request: name, scopes and spacecraft of its token."""
 
     name: str | None
-    """The token's name, which the audit list records with each change."""
+    """Name of the token, which the audit list records with each change."""
     scopes: list[Scope]
     spacecraft: list[str] | None
-    """Spacecraft that the token is bound to; null: all."""
+    """Spacecraft that the token is limited to; null: all."""
 
 
 TokenState = Literal["good", "expired", "revoked"]
 
 
 class Token(Record, frozen=True, kw_only=True):
-    """A token without its secret, of which only a digest is stored."""
+    """An access token without its secret; the service stores only a digest of the secret."""
 
     name: Annotated[str, doc("The audit list records changes under it; never used again.")]
     scopes: list[Scope]
     spacecraft: list[str] | None
-    """Spacecraft that the token is bound to; null: all."""
+    """Spacecraft that the token is limited to; null: all."""
     rate_per_s: Annotated[float | None, doc("Requests per second; null: no limit.")]
     created: Stamp
     expires: Stamp
@@ -35,7 +35,7 @@ class Token(Record, frozen=True, kw_only=True):
 
 
 class NewToken(Token, frozen=True, kw_only=True):
-    """A new token with its secret, which is shown this once."""
+    """A new access token with its secret, which no other answer shows."""
 
     token: Annotated[str, doc("Sent as `Authorization: Bearer acq_...`.")]
 
@@ -44,7 +44,7 @@ TokenList = list_record("TokenList", Token, "All tokens, the oldest first.")
 
 
 class AuditEntry(Record, frozen=True, kw_only=True):
-    """One change."""
+    """Entry of the audit list: a change, its author, and the request."""
 
     component: ClassVar[str] = "AuditRow"
     id: Id

@@ -1,4 +1,4 @@
-"""Alarms and limits as the overview and events have them, and annotations: notes of people."""
+"""Records of alarms, limits, and annotations, which are notes of people."""
 
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -32,7 +32,7 @@ AlarmActionName = Literal[
 
 
 class Limit(Record, frozen=True, kw_only=True):
-    """The limit of one quantity of a spacecraft."""
+    """Limit of one quantity of a spacecraft or a tracker."""
 
     component: ClassVar[str] = "LimitOut"
     spacecraft: str
@@ -40,7 +40,7 @@ class Limit(Record, frozen=True, kw_only=True):
     tracker: Annotated[str | None, doc("null: of the spacecraft as a whole.")] = None
     unit: str
     is_default: bool
-    """True if this is the shipped limit; for a tracker, if it is the limit of its spacecraft."""
+    """True if the limit is the shipped one; for a tracker, if it is that of its spacecraft."""
     since: Annotated[Stamp | None, doc("null: it was never changed.")]
     who: str | None
     comment: str | None
@@ -48,7 +48,7 @@ class Limit(Record, frozen=True, kw_only=True):
 
 
 class AlarmValue(Record, frozen=True, kw_only=True):
-    """An evaluated value with its time and its batch."""
+    """Value of a quantity that a limit was evaluated for, with its time and batch."""
 
     component: ClassVar[str] = "PointOut"
     value: float
@@ -57,7 +57,7 @@ class AlarmValue(Record, frozen=True, kw_only=True):
 
 
 class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
-    """The value that raised an alarm."""
+    """Value of a quantity that raised an alarm."""
 
     component: ClassVar[str] = "RaisedOut"
     at: Stamp
@@ -65,7 +65,7 @@ class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
 
 
 class Acted(Record, frozen=True, kw_only=True):
-    """The author and the time of an action."""
+    """Author and time of an action on an alarm."""
 
     component: ClassVar[str] = "ActedOut"
     at: Stamp
@@ -73,14 +73,14 @@ class Acted(Record, frozen=True, kw_only=True):
 
 
 class Shelved(Acted, frozen=True, kw_only=True):
-    """Shelved until a time."""
+    """Author, time and end of the shelving of an alarm."""
 
     component: ClassVar[str] = "ShelfOut"
     until: Stamp
 
 
 class Alarm(Record, frozen=True, kw_only=True):
-    """An alarm. It stays until it is acknowledged and its quantity is back in limits."""
+    """Alarm, kept until it is acknowledged and its quantity is back in limits."""
 
     component: ClassVar[str] = "AlarmOut"
     id: Id
@@ -88,7 +88,7 @@ class Alarm(Record, frozen=True, kw_only=True):
     run: str
     quantity: QuantityName
     tracker: str | None = None
-    """The tracker that it is about; null: the spacecraft as a whole."""
+    """Tracker that the alarm is about; null: the spacecraft as a whole."""
     unit: str
     state: AlarmState
     severity: Annotated[SeverityName, doc("The worst severity so far.")]
@@ -104,7 +104,7 @@ class Alarm(Record, frozen=True, kw_only=True):
 
 
 class AlarmSummary(Record, frozen=True, kw_only=True):
-    """How many alarms are active, by state."""
+    """Number of active alarms by state."""
 
     open: int
     acknowledged: int
@@ -116,7 +116,7 @@ class AlarmSummary(Record, frozen=True, kw_only=True):
 
 
 class Annotation(Record, frozen=True, kw_only=True):
-    """A note on a time or a period, signed by its author."""
+    """Annotation: a note about a time or a period, signed by its author."""
 
     id: Id
     spacecraft: Annotated[str | None, doc("null: it is about every spacecraft.")]
@@ -131,7 +131,7 @@ AnnotationPage = page_record("AnnotationPage", Annotation, "A page of annotation
 
 
 class AnnotationChange(Annotation, frozen=True, kw_only=True):
-    """The data of an event: an annotation that was written or deleted."""
+    """Data of an event about an annotation that was written or deleted."""
 
     component: ClassVar[str] = "AnnotationEvent"
     deleted: bool

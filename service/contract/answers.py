@@ -1,4 +1,4 @@
-"""The answer to a batch, the stars of its frame, and answers in lists."""
+"""Records of answers to batches, of the stars on a frame, and of results in lists."""
 
 from functools import cache
 from typing import Annotated, Any, ClassVar, Literal
@@ -37,7 +37,7 @@ Identifier = Annotated[str, DescribedAs(mission.Identifier)]
 
 
 class FrameTimings(Record, frozen=True, kw_only=True):
-    """Microseconds per step from file to stars."""
+    """Duration of each step from a frame's file to its stars, in microseconds."""
 
     component: ClassVar[str] = "FrameTimingsOut"
     read: Count
@@ -46,7 +46,7 @@ class FrameTimings(Record, frozen=True, kw_only=True):
 
 
 class FrameSummary(Record, frozen=True, kw_only=True):
-    """The frame of a batch, and the numbers of detected stars."""
+    """Summary of the frame from which a batch was made, with the numbers of detected stars."""
 
     component: ClassVar[str] = "FrameOut"
     digest: Digest
@@ -66,15 +66,16 @@ class FrameSummary(Record, frozen=True, kw_only=True):
     hot_or_cosmic: Annotated[Count, doc("Detections that are sharper than a star.")]
     timings_us: FrameTimings
     remarks: list[str] | UnsetType = UNSET
-    """What the service fitted, chose of the file, or turned, in words."""
+    """Remarks on the frame in words: fitted values, choices in the file, and changes of
+        orientation."""
 
 
 class Detection(Record, frozen=True, kw_only=True):
-    """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
+    """Candidate for a star on a frame. The first pixel's centre is (0, 0); u counts columns."""
 
     component: ClassVar[str] = "DetectionOut"
     u_px: float | None
-    """null if the position could not be measured; `left_out` states the reason."""
+    """Column of the candidate; null if it could not be measured, for the reason in `left_out`."""
     v_px: float | None
     sigma_u_px: Annotated[float | None, doc("Predicted, one standard deviation.")]
     sigma_v_px: float | None
@@ -103,7 +104,7 @@ class Detection(Record, frozen=True, kw_only=True):
 
 
 class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
-    """A frame with every candidate."""
+    """Summary of a frame with all candidates for stars."""
 
     component: ClassVar[str] = "FrameRecordOut"
     stars: Annotated[list[Detection], doc("The stars in the batch come first.")]
@@ -112,14 +113,14 @@ class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
 
 
 class StarRef(Record, frozen=True, kw_only=True):
-    """A star of the catalog."""
+    """Reference to a star of the catalog."""
 
     catalog: Annotated[str, Field(examples=["HIP"])]
     id: Annotated[str, Field(examples=["HIP 26311"])]
 
 
 class Star(Record, frozen=True, kw_only=True):
-    """The result for one observed star."""
+    """Identification of one observed star."""
 
     component: ClassVar[str] = "StarOut"
     outcome: Outcome
@@ -127,8 +128,8 @@ class Star(Record, frozen=True, kw_only=True):
     votes: Annotated[Count, doc("Highest number of votes (STARID).")]
     runner_up: Annotated[Count, doc("Second highest number of votes; equal to `votes` in a tie.")]
     rivals: list[str] | UnsetType = UNSET
-    """Catalog stars that it can be, if it is not unique: those with equal votes or, with
-    probabilities, the probable ones, most probable first."""
+    """Catalog stars that an ambiguous star may be: those with equal votes or, with
+        probabilities, the probable ones, most probable first."""
     rival_probabilities: list[float] | UnsetType = UNSET
     """Probability of each entry of `rivals`, if the identifier gives probabilities."""
     probability: float | None
@@ -149,7 +150,7 @@ ZonePairCount = Annotated[Count, doc("Number of pairs (NTOT).")]
 
 
 class ZoneSummary(Record, frozen=True, kw_only=True):
-    """The part of the sky in which the service searched for stars."""
+    """Zone: the part of the sky in which the service searched for stars."""
 
     kind: ZoneKind
     ra_deg: ZoneRightAscension
@@ -159,24 +160,24 @@ class ZoneSummary(Record, frozen=True, kw_only=True):
 
 
 class SearchedZone(ZoneSummary, frozen=True, kw_only=True):
-    """The zone of a batch."""
+    """Zone that the service searched for a tracker's stars in a batch."""
 
     component: ClassVar[str] = "ZoneOut"
     cached: bool
 
 
 class TrackerStars(Record, frozen=True, kw_only=True):
-    """One tracker's stars, in the order observed."""
+    """Identified stars of one tracker, in the order observed."""
 
     component: ClassVar[str] = "TrackerOut"
     tracker: str
     zone: SearchedZone | None
-    """null if the whole sky gave no attitude."""
+    """Zone in which the stars were searched for; null if the whole sky gave no attitude."""
     stars: list[Star]
 
 
 class StarCounts(Record, frozen=True, kw_only=True):
-    """Stars by outcome."""
+    """Number of stars by outcome of the identification."""
 
     component: ClassVar[str] = "CountsOut"
     observed: Count
@@ -196,7 +197,7 @@ class TrackerFit(Record, frozen=True, kw_only=True):
 
 
 class Rival(Record, frozen=True, kw_only=True):
-    """A second attitude, from stars that the first one leaves unexplained."""
+    """Rival attitude, from stars that the better attitude leaves unexplained."""
 
     component: ClassVar[str] = "RivalOut"
     quaternion: Quaternion
@@ -204,8 +205,8 @@ class Rival(Record, frozen=True, kw_only=True):
     probability: Annotated[float, doc("Its probability, relative to the first attitude.")]
     angle_deg: Annotated[float, doc("The rotation between the two attitudes.")]
     stars: list[list[str | None]]
-    """The stars of each tracker in the order observed; null for a star that is not in the
-    group."""
+    """Catalog stars of the rival attitude for each tracker, in the order observed; null for a
+        star that does not support it."""
 
 
 class Attitude(Record, frozen=True, kw_only=True):
@@ -216,24 +217,26 @@ class Attitude(Record, frozen=True, kw_only=True):
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
     method: Annotated[str, DescribedAs(Literal["quest", "triad", "measured"])]
-    """`measured`: by a tracker itself; all that needs stars is null then."""
+    """Method that gave the attitude. `measured`: a tracker measured it itself; fields that need
+        stars are null then."""
     residual_rms_arcsec: float | None
     predicted_rms_arcsec: float | None
     taste: Annotated[float | None, doc("Weighted sum of squared residuals; follows chi-square.")]
     degrees_of_freedom: Count
     status: Status
-    """`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."""
+    """Consistency of the attitude. `suspect`: `taste` exceeds its 99.9 % point, or there is a
+        `rival`."""
     triad: Quaternion | None
     quest: Quaternion | None
     triad_quest_angle_arcsec: float | None
     trackers: Annotated[list[TrackerFit] | UnsetType, doc("If there are several trackers.")] = UNSET
     outlier: Annotated[str | UnsetType | None, doc("The tracker that disagrees.")] = UNSET
     rival: Rival | UnsetType | None = UNSET
-    """If two groups of stars give two attitudes: the less probable one."""
+    """The less probable attitude, if two groups of stars give two attitudes."""
 
 
 class Timings(Record, frozen=True, kw_only=True):
-    """Microseconds per step."""
+    """Duration of each step of the processing of a batch, in microseconds."""
 
     component: ClassVar[str] = "TimingsOut"
     zone: Count
@@ -243,7 +246,7 @@ class Timings(Record, frozen=True, kw_only=True):
 
 
 class Provenance(Record, frozen=True, kw_only=True):
-    """The versions of the data and the program that made the answer."""
+    """Versions of the data and of the program that produced an answer."""
 
     component: ClassVar[str] = "ProvenanceOut"
     catalog: Digest
@@ -258,7 +261,7 @@ _NoPrediction = Annotated[str, DescribedAs(NoPrediction)]
 
 
 class Prediction(Record, frozen=True, kw_only=True):
-    """The attitude that was predicted for a batch."""
+    """Attitude that was predicted for a batch that asks for the last attitude."""
 
     component: ClassVar[str] = "PredictionOut"
     quaternion: Quaternion
@@ -272,13 +275,13 @@ class Prediction(Record, frozen=True, kw_only=True):
 
 
 class Tracking(Record, frozen=True, kw_only=True):
-    """What came of asking for the last attitude."""
+    """Tracking state of a batch that asks for the last attitude, with its prediction."""
 
     component: ClassVar[str] = "TrackingOut"
     state: Annotated[str, DescribedAs(TrackingState)]
-    """`tracking`: a good attitude was found about the prediction, or the prediction identified a
-    star of a batch that has no attitude. `acquiring`: a good attitude was found in the whole sky.
-    `lost`: none of these."""
+    """Tracking state. `tracking`: a good attitude was found about the prediction, or the
+        prediction identified a star of a batch that has no attitude. `acquiring`: a good
+        attitude was found in the whole sky. `lost`: none of these."""
     by_default: Annotated[bool, doc("The mission asks for it, not the batch.")]
     prediction: Prediction | None
     reason: Annotated[_NoPrediction | None, doc("Why nothing was predicted.")]
@@ -297,10 +300,11 @@ class Answer(Record, frozen=True, kw_only=True):
     path: Annotated[
         str, DescribedAs(Literal["zone", "lost_in_space", "zone_then_lost_in_space", "measured"])
     ]
-    """`zone`: the service searched about the a priori attitude. `lost_in_space`: without an a
-    priori attitude, it searched about an attitude from the whole sky. `zone_then_lost_in_space`:
-    the first search found nothing good, so the service made the second. `measured`: the batch holds
-    an attitude that a tracker measured; nothing was searched for, and `identifier` was not used."""
+    """Way in which the attitude was found. `zone`: the service searched about the a priori
+        attitude. `lost_in_space`: without an a priori attitude, it searched about an attitude
+        from the whole sky. `zone_then_lost_in_space`: the first search found nothing good, so
+        the service made the second. `measured`: the batch holds an attitude that a tracker
+        measured; nothing was searched for, and `identifier` was not used."""
     observations: list[TrackerStars]
     counts: StarCounts
     attitude: Attitude | None
@@ -309,14 +313,14 @@ class Answer(Record, frozen=True, kw_only=True):
     timings_us: Timings
     provenance: Provenance
     parent: Id | UnsetType | None = UNSET
-    """Only for a what-if: the result that it started from."""
+    """Result that a what-if started from; absent for other results."""
     recorded: Annotated[
         bool | UnsetType, Absent(True), doc("True if this what-if was recorded.")
     ] = UNSET
     frame: FrameSummary | UnsetType | None = UNSET
-    """Only for a batch that was made from a frame."""
+    """Summary of the frame, for a batch that was made from a frame."""
     tracking: Tracking | UnsetType | None = UNSET
-    """Only for a batch that asks for the last attitude."""
+    """Tracking state, for a batch that asks for the last attitude."""
 
 
 class RecordedAnswer(Answer, frozen=True, kw_only=True):
@@ -328,7 +332,7 @@ class RecordedAnswer(Answer, frozen=True, kw_only=True):
 
 
 class _MeasuresShape:
-    """Describes the measures by the registry of quantities."""
+    """Description of a result's measures, built from the registry of quantities."""
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
@@ -349,7 +353,7 @@ Measures = Annotated[dict[str, float | None], DescribedAs(_MeasuresShape)]
 
 
 class Summary(Record, frozen=True, kw_only=True):
-    """A result in a list, without its stars and its attitude."""
+    """Entry of a list of results, without stars and attitude."""
 
     id: Id
     spacecraft: str
@@ -373,7 +377,7 @@ BatchPage = page_record("BatchPage", Summary, "A page of results.")
 
 
 class Signature(Record, frozen=True, kw_only=True):
-    """Who recorded or adopted a what-if, when and why."""
+    """Signature on a recorded or adopted what-if: author, time and comment."""
 
     who: str
     at: Stamp
@@ -395,15 +399,15 @@ class Result(Record, frozen=True, kw_only=True):
     current: bool
     parent: Id | None
     signature: Signature | UnsetType | None = UNSET
-    """Only for a recorded what-if: who recorded it; null where the audit list does not know."""
+    """Signature on a recorded what-if; null if the audit list has none."""
     archived: Annotated[bool, doc("True if it is read from the archive, which takes longer.")]
     what_ifs: list[Summary]
     frame: FrameWithStars | UnsetType | None = UNSET
-    """Only for a batch that was made from a frame."""
+    """Frame with all candidates for stars, for a batch that was made from a frame."""
 
 
 class Neighbours(Struct, frozen=True):
-    """The results next to one in time, and the id of the result that stands for its batch."""
+    """Results before and after a result in time, and the id of the current result of its batch."""
 
     current: str | None
     earlier: Summary | None
@@ -414,8 +418,8 @@ class BatchOutcome(Record, frozen=True, kw_only=True):
     """The outcome of one batch of an array: its answer or its problem, the other is null."""
 
     status: int
-    """The status that the batch alone would have had: 201 if it is now recorded, 200 if it was
-    recorded before, or the status of the problem."""
+    """HTTP status that the batch alone would have had: 201 if it is now recorded, 200 if it was
+        recorded before, or the status of the problem."""
     answer: Annotated[Raw | None, DescribedAs(Answer | None), doc("As it is recorded.")]
     problem: Problem | None
 

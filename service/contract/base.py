@@ -1,9 +1,9 @@
-"""The base of all records, and their descriptions in OpenAPI.
+"""Base class of all records, with their descriptions in the OpenAPI document.
 
-A record is a msgspec struct: storage functions make it, and the API encodes it as
-it is.  Its annotations carry pydantic's `Field` for descriptions and bounds, which
-msgspec ignores; the schema in the OpenAPI document is made of them.  A description too long
-for the line of its field stands below it as a text.
+A record is a msgspec struct: storage functions create it, and the API encodes it unchanged.  Its
+annotations carry pydantic's `Field` for descriptions and bounds, which msgspec ignores; the schema
+in the OpenAPI document is built from them.  A description too long for the line of its field stands
+below it as a text.
 """
 
 import ast
@@ -49,7 +49,7 @@ Moment = Annotated[
         json_schema_extra={"pattern": r"^\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3,9}Z$"},
     ),
 ]
-"""The time of a batch, which may be in a leap second."""
+"""UTC text of a batch's time, which may be in a leap second."""
 Stamp = Annotated[
     str,
     Field(
@@ -58,7 +58,7 @@ Stamp = Annotated[
         json_schema_extra={"format": "date-time"},
     ),
 ]
-"""A time that the service notes itself: RFC 3339."""
+"""UTC text of a time noted by the service itself, in RFC 3339 format."""
 Id = Annotated[
     str, Field(min_length=26, max_length=26, description="Ids sort by the time of recording.")
 ]
@@ -78,12 +78,12 @@ Covariance = Annotated[
 
 
 def doc(description: str) -> Any:
-    """The description of a field in the OpenAPI document."""
+    """Annotation with the description of a field in the OpenAPI document."""
     return Field(description=description)
 
 
 class DescribedAs:
-    """Describes a field by another type than that of its value, such as a request's model."""
+    """Annotation that describes a field by another type than its own, such as a request's model."""
 
     def __init__(self, shape: Any) -> None:
         self.shape = shape
@@ -91,18 +91,18 @@ class DescribedAs:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """The schema of that type."""
+        """Schema of the type that describes the field."""
         return handler.generate_schema(self.shape)
 
 
 @dataclass(frozen=True)
 class Absent:
-    """What the absence of a field means to a client, where it is neither null nor an empty list."""
+    """Annotation for the meaning of an absent field, if that is neither null nor an empty list."""
 
     value: bool
 
 
-# Stored answers may hold words of their day: texts are read as they are.
+# Stored answers may hold words of earlier versions: texts are read unchanged.
 Outcome = Annotated[str, DescribedAs(Literal["unique", "ambiguous", "unmatched"])]
 Status = Annotated[str, DescribedAs(Literal["good", "suspect"])]
 Reason = Annotated[
@@ -120,10 +120,11 @@ Reason = Annotated[
 
 
 class Record(Struct, frozen=True, kw_only=True):
-    """A record of the OpenAPI document; `component` is its name there if not that of the class.
+    """Base class of a record in the OpenAPI document.
 
-    An empty `component` says that only records derived from it are in the document.
-    `client_name` is the name of its model in the Python client, if not that of the class.
+    `component` is its name there, by default that of the class; an empty one leaves the record
+    itself out of the document, but not records derived from it.  `client_name` is the name of its
+    model in the Python client, by default that of the class.
     """
 
     component: ClassVar[str] = ""
@@ -131,7 +132,7 @@ class Record(Struct, frozen=True, kw_only=True):
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """The schema of the record's fields, for the OpenAPI document."""
+        """Schema of the record's fields, for the OpenAPI document."""
         return handler(described(cls))
 
 
@@ -140,32 +141,32 @@ R_co = TypeVar("R_co", covariant=True)
 
 
 class Page(Struct, Generic[R_co], frozen=True):
-    """A part of a list; `next_cursor` leads to the part after it, None at the end."""
+    """Page of a list; `next_cursor` leads to the next page, None at the end."""
 
     items: list[R_co]
     next_cursor: str | None
 
 
 def _without_defaults(schema: dict[str, Any]) -> None:
-    # A default here says that a field may be absent, not what is meant where it is.
+    # The default only marks a field as optional; it does not give the meaning of its absence.
     for each in schema.get("properties", {}).values():
         each.pop("default", None)
 
 
 class Shape(BaseModel):
-    """A description of JSON that has no properties but those described."""
+    """Base class for descriptions of JSON objects that allow no other properties."""
 
     model_config = ConfigDict(extra="forbid", json_schema_extra=_without_defaults)
 
 
 def component_name(shape: type[BaseModel] | type[Record]) -> str:
-    """The name of a shape in the OpenAPI document."""
+    """Name of a record or model in the OpenAPI document."""
     return vars(shape).get("component") or shape.__name__
 
 
 @cache
 def described(record: type[Record]) -> type[BaseModel]:
-    """The pydantic model that describes a record; a field that may be absent has a default."""
+    """Build the pydantic model that describes a record; fields that may be absent have defaults."""
     hints = get_type_hints(record, include_extras=True)
     fields: dict[str, Any] = {}
     for each in structs.fields(record):
@@ -180,7 +181,7 @@ def described(record: type[Record]) -> type[BaseModel]:
 
 
 def text_below(record: type[Record], field: str) -> str | None:
-    """The text below a field in the class of a record or of its bases."""
+    """Description of a record's field from the text below it, in its class or a base class."""
     owners = [each for each in record.__mro__ if issubclass(each, Record)]
     texts = (_texts_below_fields(each.__module__).get((each.__name__, field)) for each in owners)
     return next(filter(None, texts), None)
@@ -188,7 +189,7 @@ def text_below(record: type[Record], field: str) -> str | None:
 
 @cache
 def _texts_below_fields(module: str) -> Mapping[tuple[str, str], str]:
-    """The texts that stand below fields in the source of a module, by class and field."""
+    """Texts that stand below fields in a module's source, by class and field."""
     found = {}
     for record in ast.parse(inspect.getsource(sys.modules[module])).body:
         if isinstance(record, ast.ClassDef):
@@ -208,19 +209,19 @@ def _without_unset(kind: Any) -> Any:
 
 
 class Items(Record, frozen=True, kw_only=True):
-    """A whole list."""
+    """Base class of a record for a whole list."""
 
     component: ClassVar[str] = ""
     items: list[Any]
 
 
 def list_record(name: str, item: type[Record], description: str) -> type[Items]:
-    """The record of a whole list."""
+    """Create the record of a whole list."""
     return _defined(name, item, [("items", list[item])], Items, description)  # type: ignore[valid-type]
 
 
 def page_record(name: str, item: type[Record], description: str) -> type[Record]:
-    """The record that describes a `Page` of a list."""
+    """Create the record that describes a `Page` of a list."""
     fields = [("items", list[item]), ("next_cursor", str | None)]  # type: ignore[valid-type]
     return _defined(name, item, fields, Record, description)
 

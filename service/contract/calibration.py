@@ -1,4 +1,4 @@
-"""Calibrations of trackers: what is in force, and what held before."""
+"""Records of tracker calibrations: the one in force, and earlier ones."""
 
 from typing import Annotated
 
@@ -40,7 +40,7 @@ class TrackerGeometry(Record, frozen=True, kw_only=True):
 
 
 class CalibrationAdoption(Record, frozen=True, kw_only=True):
-    """A change of the calibration in force, by whom and when."""
+    """Adoption of a calibration, or the return to the mission file: author, time and settings."""
 
     id: Id
     spacecraft: str
@@ -55,7 +55,7 @@ class CalibrationAdoption(Record, frozen=True, kw_only=True):
 
 
 class CalibrationInForce(Record, frozen=True, kw_only=True):
-    """The calibration that new batches of a spacecraft use, and what held before."""
+    """Calibration that new batches of a spacecraft use, with its earlier ones."""
 
     spacecraft: str
     mission: Annotated[Digest, doc("The settings in force.")]

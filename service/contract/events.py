@@ -1,4 +1,4 @@
-"""The data of events, as the event stream and webhooks send them."""
+"""Records of events' data, as sent by the event stream and webhooks."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar
@@ -25,7 +25,7 @@ from service.contract.spacecraft import GyroBlockRow
 
 
 class LatestBatch(Record, frozen=True, kw_only=True):
-    """The latest of the batches of an event."""
+    """The latest batch among those of an event."""
 
     id: Id
     batch: str
@@ -36,7 +36,7 @@ class LatestBatch(Record, frozen=True, kw_only=True):
 
 
 class Recorded(Record, frozen=True, kw_only=True):
-    """Batches that were recorded."""
+    """Data of an event about newly recorded batches."""
 
     component: ClassVar[str] = "BatchesEvent"
     spacecraft: str
@@ -46,7 +46,7 @@ class Recorded(Record, frozen=True, kw_only=True):
 
 
 class Adopted(Record, frozen=True, kw_only=True):
-    """A what-if that was adopted."""
+    """Data of an event about an adopted what-if."""
 
     component: ClassVar[str] = "AdoptedEvent"
     spacecraft: str
@@ -56,7 +56,7 @@ class Adopted(Record, frozen=True, kw_only=True):
 
 
 class TrackingChange(Record, frozen=True, kw_only=True):
-    """A change of the tracking state of a spacecraft."""
+    """Data of an event about a change of a spacecraft's tracking state."""
 
     component: ClassVar[str] = "TrackingEvent"
     spacecraft: str
@@ -69,7 +69,7 @@ class TrackingChange(Record, frozen=True, kw_only=True):
 
 
 class CalibrationChange(Record, frozen=True, kw_only=True):
-    """A change of the calibration in force."""
+    """Data of an event about a change of the calibration in force."""
 
     component: ClassVar[str] = "CalibrationEvent"
     id: Id
@@ -83,7 +83,7 @@ class CalibrationChange(Record, frozen=True, kw_only=True):
 
 
 class RecordHead(Record, frozen=True, kw_only=True):
-    """A head of the record's chain, to be kept where nobody can write who can change the record."""
+    """Head of the record's chain, to be stored where nobody who can change the record can write."""
 
     number: Annotated[int, Field(ge=1)]
     sha256: Annotated[
@@ -98,7 +98,7 @@ class RecordHead(Record, frozen=True, kw_only=True):
 
     @property
     def text(self) -> str:
-        """Number, SHA-256 and time, as `acquire database verify --head` reads them."""
+        """The head's number, SHA-256 and time, as `acquire database verify --head` reads them."""
         return f"{self.number} {self.sha256} {self.made}"
 
 

@@ -1,4 +1,4 @@
-"""A picture of any camera, solved without a record: its attitude, its lens and its stars."""
+"""Record of a solved picture from any camera, which is not stored: attitude, lens and stars."""
 
 import math
 from typing import TYPE_CHECKING, Annotated, ClassVar
@@ -11,18 +11,19 @@ if TYPE_CHECKING:
 
 
 class PictureAttitudeFound(Record, frozen=True, kw_only=True):
-    """The attitude of a picture as a viewer shows it."""
+    """Attitude of a picture, in the form that viewers use."""
 
     component: ClassVar[str] = "PictureAttitude"
     client_name: ClassVar[str] = "PictureAttitude"
     status: Annotated[str, doc("`suspect`: the lens was fitted on the picture itself.")]
     quaternion: Quaternion
-    """ICRS to camera, scalar last: x right, y down, z to the sky through the middle."""
+    """Quaternion from ICRS to camera axes, scalar last: x right, y down, z to the sky through
+        the middle."""
     sigma_arcsec: Annotated[Components, doc("One standard deviation about x, y and z.")]
     ra_deg: Annotated[float, doc("Right ascension of the middle of the picture.")]
     dec_deg: Annotated[float, doc("Declination of the middle of the picture.")]
     roll_deg: float
-    """Position angle of the upper edge, from north through east, 0 to 360."""
+    """Position angle of the picture's upper edge, from north through east, 0 to 360."""
     aberration: str
     log_odds: Annotated[float, doc("Logarithm of the odds against chance.")]
 
@@ -40,7 +41,7 @@ class PictureLens(Record, frozen=True, kw_only=True):
 
 
 class PictureStarFound(Record, frozen=True, kw_only=True):
-    """A star on a picture; the residual is its place less the expected one."""
+    """Star found on a picture; its residual is the measured less the expected position."""
 
     component: ClassVar[str] = "PictureStar"
     client_name: ClassVar[str] = "PictureStar"
@@ -53,7 +54,7 @@ class PictureStarFound(Record, frozen=True, kw_only=True):
 
 
 class Picture(Record, frozen=True, kw_only=True):
-    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
+    """Solved picture: attitude, lens and stars; without an attitude, `remarks` suggest remedies."""
 
     width_px: Count
     height_px: Count
@@ -70,15 +71,15 @@ class Picture(Record, frozen=True, kw_only=True):
     sigma_scale: Annotated[float | None, doc("By which the residuals scaled the sigmas.")]
     shared_error_px: Annotated[float | None, doc("The error that neighbouring stars share.")]
     zero_point_mag: float | None
-    """Magnitude of one count, per second if `exposure_s` is known."""
+    """Zero point: the magnitude of one count, per second if `exposure_s` is known."""
     zero_point_sigma_mag: float | None
     stars: Annotated[list[PictureStarFound], doc("The identified stars, brightest first.")]
     overlay_png: str | None = None
-    """Base64: the picture with stars, names, a grid and a scale, if asked for."""
+    """PNG in Base64: the picture with stars, names, a grid and a scale; null unless requested."""
 
 
 def picture_of(result: "PictureResult") -> Picture:
-    """The record of a result; numbers that are not known are null."""
+    """Convert the result of a picture to its record; unknown numbers become null."""
     points, frame, found = result.points, result.frame, result.attitude
     return Picture(
         width_px=points.width_px,
@@ -114,7 +115,7 @@ def picture_of(result: "PictureResult") -> Picture:
 def _attitude(found: "PictureAttitude") -> PictureAttitudeFound:
     ra_deg, dec_deg = found.boresight_deg
     return PictureAttitudeFound(
-        # The lens was fitted on the picture itself: it is not calibrated.
+        # The lens was fitted on the picture itself: do not call it calibrated.
         status="suspect",
         quaternion=[round(part, 9) for part in found.quaternion.tolist()],
         sigma_arcsec=[round(sigma, 2) for sigma in found.sigma_arcsec.tolist()],

@@ -1,4 +1,4 @@
-"""Problems (RFC 9457), and the faults that they name."""
+"""Records of problems (RFC 9457), and of the faults that they list."""
 
 from typing import Annotated, ClassVar
 
@@ -8,7 +8,7 @@ from service.contract.base import Record, doc
 
 
 class FieldFault(Record, frozen=True, kw_only=True):
-    """One fault of a request."""
+    """Fault of one field of a request."""
 
     component: ClassVar[str] = "FaultOut"
     field: str
@@ -17,7 +17,7 @@ class FieldFault(Record, frozen=True, kw_only=True):
 
 
 class Problem(Record, frozen=True, kw_only=True):
-    """A problem (RFC 9457)."""
+    """Problem details of a refused or failed request (RFC 9457)."""
 
     client_name: ClassVar[str] = "ProblemDocument"
     type: Annotated[str, doc("The type of problem; `about:blank` if the status says everything.")]

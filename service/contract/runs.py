@@ -1,4 +1,4 @@
-"""Runs and replays; two runs, and two sets of options, side by side."""
+"""Records of runs and replays, and of comparisons of two runs or two sets of options."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -24,11 +24,12 @@ from service.times import Utc
 from service.vectors import Vector
 
 ReplayStateName = Literal["running", "waiting", "done", "interrupted", "failed", "cancelled"]
-"""A replay that is `waiting` goes on by itself as soon as the service is ready after a restart."""
+"""States of a replay. One that is `waiting` resumes by itself after a restart, when the service
+is ready."""
 
 
 class Run(Record, frozen=True, kw_only=True):
-    """A run."""
+    """Run: a named set of batches and their results."""
 
     component: ClassVar[str] = "RunRow"
     run: str
@@ -44,7 +45,7 @@ RunList = list_record("RunList", Run, "Every run with batches.")
 
 
 class Forgotten(Record, frozen=True, kw_only=True):
-    """What is removed from a run."""
+    """Counts of the data that are removed when a run, or part of one, is forgotten."""
 
     run: str
     spacecraft: Annotated[str | None, doc("null: of every spacecraft.")]
@@ -52,12 +53,12 @@ class Forgotten(Record, frozen=True, kw_only=True):
     archived_batches: Annotated[Count, doc("Batches in the archive.")]
     gyro_blocks: Count
     graded_days: Count
-    """Days of filtered and smoothed attitudes that were computed with them, every revision counted.
-    `acquire smooth` computes them again from what is left."""
+    """Days of filtered and smoothed attitudes that were computed with the removed data, every
+        revision counted. `acquire smooth` computes them again from the remaining data."""
 
 
 class ReplayLines(Record, frozen=True, kw_only=True):
-    """The lines of a replay."""
+    """Number of lines of a replay: total, done and refused."""
 
     total: Annotated[int | None, doc("null if the number is not known in advance.")]
     done: Count
@@ -65,12 +66,12 @@ class ReplayLines(Record, frozen=True, kw_only=True):
 
 
 class ReplayCounts(Record, frozen=True, kw_only=True):
-    """Results of the lines so far."""
+    """Number of batches, stars and gyro blocks in the lines of a replay so far."""
 
     new: Annotated[Count, doc("Batches that this replay recorded.")]
     repeated: Annotated[Count, doc("Batches that were already recorded.")]
     observed: Count
-    """Stars of these batches; the next fields count them by outcome."""
+    """Observed stars of the replay's batches; the next fields count them by outcome."""
     unique: Count
     ambiguous: Count
     unmatched: Count
@@ -80,7 +81,7 @@ class ReplayCounts(Record, frozen=True, kw_only=True):
 
 
 class ApidPackets(Record, frozen=True, kw_only=True):
-    """The packets of one APID."""
+    """Counts of a replay's space packets with one APID."""
 
     apid: Annotated[int, Field(ge=0, le=2047)]
     packets: Count
@@ -88,13 +89,13 @@ class ApidPackets(Record, frozen=True, kw_only=True):
     gaps: Annotated[Count, doc("Places where the sequence count skips packets.")]
     missing: Annotated[Count, doc("Packets that are missing in these places.")]
     backward: Count
-    """Places where the count repeats or goes back: a reset, or a changed order."""
+    """Places where the sequence count repeats or goes back: after a reset, or in changed order."""
     refused: Count
     incomplete: Annotated[Count, doc("Segments of packets of which others are missing.")] = 0
 
 
 class ReplayPackets(Record, frozen=True, kw_only=True):
-    """The space packets of a replay so far."""
+    """Counts of a replay's space packets so far."""
 
     packets: Count
     bytes: Count
@@ -111,9 +112,9 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
     refused: Annotated[Count, doc("Packets that could not be read.")]
     joined: Annotated[Count, doc("Packets that were joined of segments.")] = 0
     incomplete: Count = 0
-    """Segments of packets of which others are missing; they are refused, too."""
+    """Segments of incomplete packets; they are counted as refused as well."""
     unread_bytes: Count = 0
-    """From the packets on at which files could not be read any further."""
+    """Bytes from the first unreadable packet of each file to the end of the file."""
     empty_files: Annotated[Count, doc("Files without a packet.")] = 0
     without_attitude: Count = 0
     """Packets whose a priori quaternion was zero or not finite."""
@@ -121,21 +122,21 @@ class ReplayPackets(Record, frozen=True, kw_only=True):
 
 
 class LineProblem(Record, frozen=True, kw_only=True):
-    """The faults of a line."""
+    """Problem of a refused line, with its faults."""
 
     detail: str
     errors: Annotated[list[FieldFault] | UnsetType, doc("Every fault, field by field.")] = UNSET
 
 
 class RefusedLine(Record, frozen=True, kw_only=True):
-    """A refused line; the replay continues with the next one."""
+    """Refused line of a replay, which continues with the next line."""
 
     line: Annotated[int, doc("Number of the line, or of the packet in its file, from 1.")]
     problem: LineProblem
 
 
 class ReplayProgress(Record, frozen=True, kw_only=True):
-    """A replay and its progress, without the refused lines: the data of an event."""
+    """Replay with its progress, without the refused lines: the data of an event."""
 
     component: ClassVar[str] = "ReplayEvent"
     id: Id
@@ -149,15 +150,15 @@ class ReplayProgress(Record, frozen=True, kw_only=True):
 
 
 class Replay(ReplayProgress, frozen=True, kw_only=True):
-    """A replay and its progress."""
+    """Replay with its progress and refused lines."""
 
     component: ClassVar[str] = "ReplayState"
     packets: Annotated[ReplayPackets | None, doc("null unless the replay reads space packets.")]
     errors: list[RefusedLine]
-    """The first thousand refused lines; then, for a failed replay, the reason."""
+    """The first thousand refused lines of the replay; then, for a failed replay, the reason."""
 
     def progress(self) -> ReplayProgress:
-        """The replay without the refused lines."""
+        """Progress of the replay, without its refused lines."""
         names = ReplayProgress.__struct_fields__
         return ReplayProgress(**{name: getattr(self, name) for name in names})
 
@@ -166,14 +167,14 @@ ReplayList = list_record("ReplayList", Replay, "The latest replays, newest first
 
 
 class RunState(Record, frozen=True, kw_only=True):
-    """A run, and whether its batches can raise alarms."""
+    """Run, with the evaluation of its limits on or off."""
 
     run: str
     alarms: bool
 
 
 class ComparedSide(StarCounts, frozen=True, kw_only=True):
-    """Results of all batches with one set of options."""
+    """One side of a comparison: results of all batches with one set of options."""
 
     component: ClassVar[str] = "SideOut"
     options: MissionSettings
@@ -181,11 +182,11 @@ class ComparedSide(StarCounts, frozen=True, kw_only=True):
     suspect: Count
     residual_ratio_mean: float | None
     us_per_batch: float | None
-    """Median time for zones, identification and attitude."""
+    """Median computing time of a batch in microseconds, for zones, identification and attitude."""
 
 
 class Transition(Record, frozen=True, kw_only=True):
-    """Number of stars with an outcome on side a and an outcome on side b, including equal ones."""
+    """Number of stars by outcome on side a and outcome on side b, including equal outcomes."""
 
     from_: Outcome = field(name="from")
     to: Outcome
@@ -193,7 +194,7 @@ class Transition(Record, frozen=True, kw_only=True):
 
 
 class ComparedAttitudes(Record, frozen=True, kw_only=True):
-    """How many batches have an attitude on either side, and the angles between them."""
+    """Number of batches with an attitude on each side of a comparison, and their angles."""
 
     component: ClassVar[str] = "AttitudesOut"
     both: Count
@@ -205,14 +206,14 @@ class ComparedAttitudes(Record, frozen=True, kw_only=True):
 
 
 class StarSide(Record, frozen=True, kw_only=True):
-    """One star on one side."""
+    """Identification of one star on one side of a comparison."""
 
     outcome: Outcome
     star: str | None
 
 
 class StarChange(Record, frozen=True, kw_only=True):
-    """One star that differs."""
+    """Star whose identification differs between both sides of a comparison."""
 
     tracker: str
     position: Annotated[Count, doc("Position among the tracker's stars, from 0.")]
@@ -221,7 +222,7 @@ class StarChange(Record, frozen=True, kw_only=True):
 
 
 class BatchChange(Record, frozen=True, kw_only=True):
-    """One batch of which a star or the attitude differs."""
+    """Batch with a star or an attitude that differs between both sides of a comparison."""
 
     id: Id
     batch: str
@@ -233,7 +234,7 @@ class BatchChange(Record, frozen=True, kw_only=True):
 
 
 class ComparedCell(Record, frozen=True, kw_only=True):
-    """Stars of the batches of one cell of time, by outcome on both sides."""
+    """Number of stars by outcome on both sides of a comparison, in one cell of time."""
 
     start: Moment
     a: StarCounts
@@ -241,7 +242,7 @@ class ComparedCell(Record, frozen=True, kw_only=True):
 
 
 class Comparison(Record, frozen=True, kw_only=True):
-    """The results of both sides, and their differences."""
+    """Comparison of two sets of options: the results of both sides, and their differences."""
 
     spacecraft: str
     run: str
@@ -257,14 +258,14 @@ class Comparison(Record, frozen=True, kw_only=True):
     b: ComparedSide
     transitions: list[Transition]
     renamed: Count
-    """Stars that are unique on both sides, but as different catalog stars."""
+    """Stars that are unique on both sides, but identified as different catalog stars."""
     attitudes: ComparedAttitudes
     changed_batches: Count
     changed: Annotated[list[BatchChange], doc("The first hundred, oldest first.")]
 
 
 class OutcomeCounts(Struct, frozen=True, kw_only=True):
-    """Stars by outcome, without their sum."""
+    """Number of unique, ambiguous and unmatched stars."""
 
     unique: int
     ambiguous: int
@@ -280,7 +281,7 @@ class StatusCounts(Struct, frozen=True, kw_only=True):
 
 
 class RunTransition(Struct, frozen=True, kw_only=True):
-    """Number of stars with an outcome in one run and an outcome in the other."""
+    """Number of stars by outcome in one run and outcome in the other run."""
 
     before: str
     after: str
@@ -289,12 +290,12 @@ class RunTransition(Struct, frozen=True, kw_only=True):
 
     @property
     def is_change(self) -> bool:
-        """True if the outcome differs, or the named star."""
+        """True if the outcome or the named catalog star differs."""
         return self.before != self.after or (self.before == "unique" and not self.same_star)
 
 
 class RunStars(Struct, frozen=True, kw_only=True):
-    """Outcomes of the stars of the batches that both runs have."""
+    """Outcomes of the stars in batches that both compared runs have."""
 
     observed: int
     before: OutcomeCounts
@@ -311,7 +312,7 @@ class AngleStatistics(Struct, frozen=True, kw_only=True):
 
 
 class RunAttitudes(Struct, frozen=True, kw_only=True):
-    """Attitudes of the batches that both runs have, and the angles between them."""
+    """Attitudes of the batches that both compared runs have, and the angles between them."""
 
     before: StatusCounts
     after: StatusCounts
@@ -320,7 +321,7 @@ class RunAttitudes(Struct, frozen=True, kw_only=True):
 
 
 class RunComparison(Struct, frozen=True, kw_only=True):
-    """The batches that two runs have in common: `before` in `run`, `after` in `other`."""
+    """Comparison of two runs over their common batches: `before` in `run`, `after` in `other`."""
 
     run: str | None
     other: str
@@ -330,7 +331,7 @@ class RunComparison(Struct, frozen=True, kw_only=True):
 
 
 class RunChangeSide(Struct, frozen=True, kw_only=True):
-    """What a batch came to in one of two runs."""
+    """Counts and status of a batch in one of two compared runs."""
 
     id: Id
     counts: OutcomeCounts
@@ -338,7 +339,7 @@ class RunChangeSide(Struct, frozen=True, kw_only=True):
 
 
 class RunChange(Struct, frozen=True, kw_only=True):
-    """A batch that came to something else in another run."""
+    """Batch whose counts or status differ between two runs."""
 
     batch: str
     time: Moment
@@ -348,18 +349,18 @@ class RunChange(Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True)
 class RunRates:
-    """All current results of a spacecraft in one run."""
+    """Rates of stars by outcome over all current results of a spacecraft in one run."""
 
     run: str
     totals: Mapping[str, int]
-    """The totals of a rollup's counts, such as `observed`."""
+    """Totals of a rollup's counts by name, such as `observed`."""
     shares: Mapping[str, Vector]
-    """Shares of the observed stars: `ambiguous`, `unmatched` in each cell; NaN without a star."""
+    """Fractions of observed stars by outcome (`ambiguous`, `unmatched`) in each time cell."""
 
 
 @dataclass(frozen=True)
 class RatesOfRuns:
-    """Runs over one period, divided into cells of an hour, a day or several days."""
+    """Rates of several runs over one period, divided into cells of hours or days."""
 
     start: Utc
     end: Utc

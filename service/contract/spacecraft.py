@@ -1,6 +1,6 @@
-"""Spacecraft: state, settings, rates, histories, gyro blocks; and all of them at a glance.
+"""Records of spacecraft: state, settings, rates, histories, gyro blocks, and the overview.
 
-With them the state of the service: its versions, and the cache of zones.
+The state of the service is here too: its versions, and the cache of zones.
 """
 
 from typing import Annotated, ClassVar, Literal
@@ -34,7 +34,7 @@ from service.trends.quantities import QuantityName
 
 
 class AttitudeRow(Record, frozen=True, kw_only=True):
-    """An attitude in a history; use it only where `status` is good."""
+    """Entry of an attitude history; use the attitude only where `status` is good."""
 
     id: Id
     batch: str
@@ -43,7 +43,8 @@ class AttitudeRow(Record, frozen=True, kw_only=True):
     frame: Annotated[str, DescribedAs(Literal["EME2000"])]
     covariance_arcsec2: Covariance
     residual_rms_arcsec: float | None
-    """Null, as the next two, of an attitude that a tracker measured itself."""
+    """Rms of the attitude's residuals; null, as the next two, for an attitude that a tracker
+        measured itself."""
     predicted_rms_arcsec: float | None
     taste: float | None
     method: Annotated[str, DescribedAs(Literal["quest", "triad", "measured"])]
@@ -60,28 +61,28 @@ class SpacecraftRow(Record, frozen=True, kw_only=True):
     description: str
     retired: Annotated[bool, doc("True if no mission file describes it any more.")]
     state: Literal["good", "suspect", "no_attitude", "no_batches"]
-    """State of the latest batch."""
+    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`."""
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     """Attitude of the latest batch; null if this batch has none."""
     last_attitude: AttitudeRow | None
-    """The latest attitude. It can be older than the latest batch; see its time."""
+    """Latest attitude of the spacecraft. It can be older than the latest batch; see its time."""
     tracking: Annotated[str, DescribedAs(TrackingState)] | None
-    """State of the latest batch; null if that does not ask for the last attitude."""
+    """Tracking state of the latest batch; null if that does not ask for the last attitude."""
 
 
 SpacecraftList = list_record("SpacecraftList", SpacecraftRow, "Every spacecraft.")
 
 
 class MissionNow(Record, frozen=True, kw_only=True):
-    """The present settings of a mission."""
+    """Present settings of a mission."""
 
     digest: Digest
     settings: MissionSettings
 
 
 class MissionThen(MissionNow, frozen=True, kw_only=True):
-    """The settings of a mission at some time."""
+    """Settings of a mission, with the time from which they were in use."""
 
     since: Stamp
 
@@ -91,11 +92,11 @@ class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
 
     mission: MissionNow
     history: list[MissionThen]
-    """Oldest first; a return to earlier settings is a new entry."""
+    """Settings of the mission, oldest first; a return to earlier settings is a new entry."""
 
 
 class Rates(Record, frozen=True, kw_only=True):
-    """Sums over the batches of a bucket."""
+    """Counts of batches and stars in an hour or a day."""
 
     start: Moment
     batches: Count
@@ -114,52 +115,52 @@ Numbers = list[float | None]
 
 
 class Series(Record, frozen=True, kw_only=True):
-    """A quantity. `minmax`: mean, least and greatest of each bucket; `latest`: single values."""
+    """Values of a quantity over time: bucket statistics (`minmax`) or single values (`latest`)."""
 
     unit: Annotated[str, Field(examples=["arcsec"])]
     count: Annotated[list[Count] | UnsetType, doc("`minmax`: batches with a value.")] = UNSET
     mean: Numbers | UnsetType = UNSET
-    """`minmax`: for shares, over all stars or batches."""
+    """Mean of each bucket (`minmax`); for shares, over all stars or batches."""
     min: Annotated[Numbers | UnsetType, doc("Least value of a batch.")] = UNSET
     max: Annotated[Numbers | UnsetType, doc("Greatest value of a batch.")] = UNSET
     value: Annotated[Numbers | UnsetType, doc("`latest`: the value of each batch.")] = UNSET
 
 
 class History(Record, frozen=True, kw_only=True):
-    """Quantities over a period of time, oldest first; null: unknown."""
+    """History of quantities over a period, oldest first; null: unknown."""
 
     spacecraft: str
     run: str
     tracker: Annotated[str | UnsetType, doc("If the request names one.")] = UNSET
     not_split: Annotated[bool | UnsetType, Absent(False)] = UNSET
-    """True while older batches of the run are not split by tracker yet, and so are missing here;
-    only with `tracker`."""
+    """True while older batches of the run are not split by tracker yet, and are missing here;
+        only with `tracker`."""
     start: Moment | None
     end: Moment | None
     strategy: Literal["minmax", "latest"]
     bucket_s: Annotated[int | None, doc("The width of a bucket; null for single batches.")]
     source: Literal["batch", "hour", "day"]
-    """The source of the data; both ends of the period are exact in any case."""
+    """Source of the history: batches, or sums by hour or day; both ends of the period are exact."""
     thinned: Annotated[bool, doc("True if the period has more batches than the answer has points.")]
     unix_s: list[float]
     """POSIX time of the beginning of each bucket, or of each batch. Empty buckets are omitted."""
     batches: Annotated[list[Count] | UnsetType, doc("`minmax`: batches in each bucket.")] = UNSET
     time: list[Moment] | UnsetType = UNSET
-    """`latest` only, like the next two fields."""
+    """Time of each batch; `latest` only, like the next two fields."""
     id: list[Id] | UnsetType = UNSET
     batch: list[str] | UnsetType = UNSET
     series: dict[QuantityName, Series]
 
 
 class RankedBatch(Summary, frozen=True, kw_only=True):
-    """A batch with its value of the chosen quantity."""
+    """Batch in a ranking, with its value of the ranked quantity."""
 
     component: ClassVar[str] = "WorstBatch"
     value: float
 
 
 class Ranking(Record, frozen=True, kw_only=True):
-    """The worst batches of a period."""
+    """Ranking of the worst batches of a period by a quantity."""
 
     component: ClassVar[str] = "WorstList"
     by: QuantityName
@@ -182,7 +183,7 @@ class GyroBlockRow(Record, frozen=True, kw_only=True):
     end: Annotated[Moment, doc("Time of the last sample.")]
     samples: Annotated[int, Field(ge=1)]
     step_s: float | None
-    """From each sample to the next; null: the block has times of its own."""
+    """Interval between samples in seconds; null: the block has a time for each sample."""
     received: Stamp
 
 
@@ -194,14 +195,14 @@ class GyroSamples(GyroBlockRow, frozen=True, kw_only=True):
 
     times_s: Annotated[list[float], doc("Times of the samples, in seconds of TAI after `start`.")]
     rates_rad_per_s: list[Components]
-    """Rates of each sample, as they were sent: about the three axes of the mission's gyro."""
+    """Angular rates of each sample as sent, about the three axes of the mission's gyro."""
 
 
 Shares = list[float]
 
 
 class WindowCounts(Record, frozen=True, kw_only=True):
-    """Counts in a period that ends with the run's latest batch."""
+    """Counts of batches and stars in a period that ends with the run's latest batch."""
 
     component: ClassVar[str] = "WindowOut"
     start: Moment
@@ -216,7 +217,7 @@ class WindowCounts(Record, frozen=True, kw_only=True):
 
 
 class Sparkline(Record, frozen=True, kw_only=True):
-    """Shares of stars in time steps; steps without batches are omitted."""
+    """Shares of stars by outcome in time steps; steps without batches are omitted."""
 
     bucket_s: int
     unix_s: Annotated[list[float], doc("POSIX time of the beginning of each step.")]
@@ -227,13 +228,13 @@ class Sparkline(Record, frozen=True, kw_only=True):
 
 
 class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
-    """The state of one spacecraft; null without a batch in the run."""
+    """Overview of one spacecraft; fields are null without a batch in the run."""
 
     sigma_arcsec: Components | None
     """Standard deviations of `last_attitude` about the body axes."""
     age_s: Annotated[float | None, doc("Time from its latest batch to the run's latest batch.")]
     received_age_s: float | None
-    """Time since the service received its latest batch."""
+    """Time since the service received the spacecraft's latest batch."""
     last_hour: WindowCounts | None
     last_day: WindowCounts | None
     sparkline_hour: Sparkline | None
@@ -242,7 +243,7 @@ class OverviewRow(SpacecraftRow, frozen=True, kw_only=True):
 
 
 class Overview(Record, frozen=True, kw_only=True):
-    """Every spacecraft in a run."""
+    """Overview of every spacecraft in a run."""
 
     run: str
     default_run: Annotated[str, doc("`live`; while it is empty, the newest run.")]
@@ -253,7 +254,7 @@ class Overview(Record, frozen=True, kw_only=True):
 
 
 class CatalogAbout(Record, frozen=True, kw_only=True):
-    """The star catalog."""
+    """Star catalog of the service: digest, name and number of stars."""
 
     digest: Digest
     name: str
@@ -261,7 +262,7 @@ class CatalogAbout(Record, frozen=True, kw_only=True):
 
 
 class MissionAbout(Record, frozen=True, kw_only=True):
-    """A mission of this service."""
+    """Mission that the service serves: name, description and digest of its settings."""
 
     name: str
     description: str
@@ -269,7 +270,7 @@ class MissionAbout(Record, frozen=True, kw_only=True):
 
 
 class About(Record, frozen=True, kw_only=True):
-    """The service and its data."""
+    """The service: its version, start, database, catalog and missions."""
 
     version: str
     started: Stamp
@@ -280,7 +281,7 @@ class About(Record, frozen=True, kw_only=True):
 
 
 class CacheUse(Record, frozen=True, kw_only=True):
-    """Cost and use of a cache entry."""
+    """Size, use and building time of a cache entry."""
 
     bytes: Count
     hits: Count
@@ -288,7 +289,7 @@ class CacheUse(Record, frozen=True, kw_only=True):
 
 
 class CachedZone(CacheUse, frozen=True, kw_only=True):
-    """A zone in the cache."""
+    """Zone of the sky in the service's cache."""
 
     kind: answers.ZoneKind
     ra_deg: answers.ZoneRightAscension
@@ -301,7 +302,7 @@ class CachedZone(CacheUse, frozen=True, kw_only=True):
 
 
 class CachedRunCatalog(CacheUse, frozen=True, kw_only=True):
-    """A run catalog in the cache."""
+    """Run catalog in the service's cache."""
 
     digest: Digest
     epoch_year: float
@@ -309,7 +310,7 @@ class CachedRunCatalog(CacheUse, frozen=True, kw_only=True):
 
 
 class ZoneCache(Record, frozen=True, kw_only=True):
-    """The content of the cache, least recently used first, and its counters.
+    """Cache of zones and run catalogs, least recently used first, with its counters.
 
     A batch looks up its run catalog, and the zone of each tracker. The counters here cover
     both; each entry has its own.
@@ -329,6 +330,6 @@ ZoneList = list_record("ZoneList", answers.ZoneSummary, "Zones.")
 
 
 class Dropped(Record, frozen=True, kw_only=True):
-    """How many zones were dropped."""
+    """Number of zones dropped from the cache."""
 
     dropped: Count

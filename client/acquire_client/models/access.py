@@ -1,4 +1,4 @@
-"""Callers, tokens, and the audit list of what they changed."""
+"""Records of access: callers, tokens, and the audit list of changes."""
 # Written by `make client` from service/contract/access.py.
 
 from collections.abc import Sequence
@@ -7,23 +7,23 @@ from ..base import Model
 
 
 class Session(Model, frozen=True, kw_only=True):
-    """The caller and its scopes."""
+    """The caller of a request: name, scopes and spacecraft of its token."""
 
     name: str | None
-    """The token's name, which the audit list records with each change."""
+    """Name of the token, which the audit list records with each change."""
     scopes: Sequence[str]
     spacecraft: Sequence[str] | None
-    """Spacecraft that the token is bound to; None: all."""
+    """Spacecraft that the token is limited to; None: all."""
 
 
 class Token(Model, frozen=True, kw_only=True):
-    """A token without its secret, of which only a digest is stored."""
+    """An access token without its secret; the service stores only a digest of the secret."""
 
     name: str
     """The audit list records changes under it; never used again."""
     scopes: Sequence[str]
     spacecraft: Sequence[str] | None
-    """Spacecraft that the token is bound to; None: all."""
+    """Spacecraft that the token is limited to; None: all."""
     rate_per_s: float | None
     """Requests per second; None: no limit."""
     created: str
@@ -33,7 +33,7 @@ class Token(Model, frozen=True, kw_only=True):
 
 
 class NewToken(Token, frozen=True, kw_only=True):
-    """A new token with its secret, which is shown this once."""
+    """A new access token with its secret, which no other answer shows."""
 
     token: str
     """Sent as `Authorization: Bearer acq_...`."""

@@ -1,4 +1,4 @@
-"""Alarms and limits as the overview and events have them, and annotations: notes of people."""
+"""Records of alarms, limits, and annotations, which are notes of people."""
 # Written by `make client` from service/contract/alarms.py and
 # service/features/alarms/records.py.
 
@@ -9,7 +9,7 @@ from ..base import Model
 
 
 class Limit(Model, frozen=True, kw_only=True):
-    """The limit of one quantity of a spacecraft."""
+    """Limit of one quantity of a spacecraft or a tracker."""
 
     spacecraft: str
     quantity: str
@@ -17,7 +17,7 @@ class Limit(Model, frozen=True, kw_only=True):
     """None: of the spacecraft as a whole."""
     unit: str
     is_default: bool
-    """True if this is the shipped limit; for a tracker, if it is the limit of its spacecraft."""
+    """True if the limit is the shipped one; for a tracker, if it is that of its spacecraft."""
     since: str | None
     """None: it was never changed."""
     who: str | None
@@ -26,7 +26,7 @@ class Limit(Model, frozen=True, kw_only=True):
 
 
 class AlarmValue(Model, frozen=True, kw_only=True):
-    """An evaluated value with its time and its batch."""
+    """Value of a quantity that a limit was evaluated for, with its time and batch."""
 
     value: float
     time: str
@@ -35,7 +35,7 @@ class AlarmValue(Model, frozen=True, kw_only=True):
 
 
 class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
-    """The value that raised an alarm."""
+    """Value of a quantity that raised an alarm."""
 
     at: str
     bound: float
@@ -43,27 +43,27 @@ class AlarmRaised(AlarmValue, frozen=True, kw_only=True):
 
 
 class Acted(Model, frozen=True, kw_only=True):
-    """The author and the time of an action."""
+    """Author and time of an action on an alarm."""
 
     at: str
     who: str
 
 
 class Shelved(Acted, frozen=True, kw_only=True):
-    """Shelved until a time."""
+    """Author, time and end of the shelving of an alarm."""
 
     until: str
 
 
 class Alarm(Model, frozen=True, kw_only=True):
-    """An alarm. It stays until it is acknowledged and its quantity is back in limits."""
+    """Alarm, kept until it is acknowledged and its quantity is back in limits."""
 
     id: str
     spacecraft: str
     run: str
     quantity: str
     tracker: str | None = None
-    """The tracker that it is about; None: the spacecraft as a whole."""
+    """Tracker that the alarm is about; None: the spacecraft as a whole."""
     unit: str
     state: str
     severity: str
@@ -81,7 +81,7 @@ class Alarm(Model, frozen=True, kw_only=True):
 
 
 class Annotation(Model, frozen=True, kw_only=True):
-    """A note on a time or a period, signed by its author."""
+    """Annotation: a note about a time or a period, signed by its author."""
 
     id: str
     spacecraft: str | None
@@ -96,7 +96,7 @@ class Annotation(Model, frozen=True, kw_only=True):
 
 
 class AnnotationChange(Annotation, frozen=True, kw_only=True):
-    """The data of an event: an annotation that was written or deleted."""
+    """Data of an event about an annotation that was written or deleted."""
 
     deleted: bool
 

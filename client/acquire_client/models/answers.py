@@ -1,4 +1,4 @@
-"""The answer to a batch, the stars of its frame, and answers in lists."""
+"""Records of answers to batches, of the stars on a frame, and of results in lists."""
 # Written by `make client` from service/contract/answers.py.
 
 from collections.abc import Sequence
@@ -9,7 +9,7 @@ from ..words import Identifier, Outcome, Status
 
 
 class FrameTimings(Model, frozen=True, kw_only=True):
-    """Microseconds per step from file to stars."""
+    """Duration of each step from a frame's file to its stars, in microseconds."""
 
     read: int
     detect: int
@@ -17,7 +17,7 @@ class FrameTimings(Model, frozen=True, kw_only=True):
 
 
 class FrameSummary(Model, frozen=True, kw_only=True):
-    """The frame of a batch, and the numbers of detected stars."""
+    """Summary of the frame from which a batch was made, with the numbers of detected stars."""
 
     digest: str
     format: str
@@ -40,14 +40,15 @@ class FrameSummary(Model, frozen=True, kw_only=True):
     """Detections that are sharper than a star."""
     timings_us: FrameTimings
     remarks: Sequence[str] = ()
-    """What the service fitted, chose of the file, or turned, in words."""
+    """Remarks on the frame in words: fitted values, choices in the file, and changes of
+    orientation."""
 
 
 class Detection(Model, frozen=True, kw_only=True):
-    """One measured candidate.  The centre of the first pixel is (0, 0); u counts columns."""
+    """Candidate for a star on a frame. The first pixel's centre is (0, 0); u counts columns."""
 
     u_px: float | None
-    """None if the position could not be measured; `left_out` states the reason."""
+    """Column of the candidate; None if it could not be measured, for the reason in `left_out`."""
     v_px: float | None
     sigma_u_px: float | None
     """Predicted, one standard deviation."""
@@ -64,7 +65,7 @@ class Detection(Model, frozen=True, kw_only=True):
 
 
 class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
-    """A frame with every candidate."""
+    """Summary of a frame with all candidates for stars."""
 
     stars: Sequence[Detection]
     """The stars in the batch come first."""
@@ -73,14 +74,14 @@ class FrameWithStars(FrameSummary, frozen=True, kw_only=True):
 
 
 class StarRef(Model, frozen=True, kw_only=True):
-    """A star of the catalog."""
+    """Reference to a star of the catalog."""
 
     catalog: str
     id: str
 
 
 class Star(Model, frozen=True, kw_only=True):
-    """The result for one observed star."""
+    """Identification of one observed star."""
 
     outcome: Outcome
     star: StarRef | None
@@ -89,8 +90,8 @@ class Star(Model, frozen=True, kw_only=True):
     runner_up: int
     """Second highest number of votes; equal to `votes` in a tie."""
     rivals: Sequence[str] = ()
-    """Catalog stars that it can be, if it is not unique: those with equal votes or, with
-    probabilities, the probable ones, most probable first."""
+    """Catalog stars that an ambiguous star may be: those with equal votes or, with probabilities,
+    the probable ones, most probable first."""
     rival_probabilities: Sequence[float] = ()
     """Probability of each entry of `rivals`, if the identifier gives probabilities."""
     probability: float | None
@@ -102,7 +103,7 @@ class Star(Model, frozen=True, kw_only=True):
 
 
 class ZoneSummary(Model, frozen=True, kw_only=True):
-    """The part of the sky in which the service searched for stars."""
+    """Zone: the part of the sky in which the service searched for stars."""
 
     kind: str
     ra_deg: float
@@ -115,22 +116,22 @@ class ZoneSummary(Model, frozen=True, kw_only=True):
 
 
 class SearchedZone(ZoneSummary, frozen=True, kw_only=True):
-    """The zone of a batch."""
+    """Zone that the service searched for a tracker's stars in a batch."""
 
     cached: bool
 
 
 class TrackerStars(Model, frozen=True, kw_only=True):
-    """One tracker's stars, in the order observed."""
+    """Identified stars of one tracker, in the order observed."""
 
     tracker: str
     zone: SearchedZone | None
-    """None if the whole sky gave no attitude."""
+    """Zone in which the stars were searched for; None if the whole sky gave no attitude."""
     stars: Sequence[Star]
 
 
 class StarCounts(Model, frozen=True, kw_only=True):
-    """Stars by outcome."""
+    """Number of stars by outcome of the identification."""
 
     observed: int
     unique: int
@@ -148,7 +149,7 @@ class TrackerFit(Model, frozen=True, kw_only=True):
 
 
 class Rival(Model, frozen=True, kw_only=True):
-    """A second attitude, from stars that the first one leaves unexplained."""
+    """Rival attitude, from stars that the better attitude leaves unexplained."""
 
     quaternion: Sequence[float]
     covariance_arcsec2: Sequence[Sequence[float]]
@@ -157,7 +158,8 @@ class Rival(Model, frozen=True, kw_only=True):
     angle_deg: float
     """The rotation between the two attitudes."""
     stars: Sequence[Sequence[str | None]]
-    """The stars of each tracker in the order observed; None for a star that is not in the group."""
+    """Catalog stars of the rival attitude for each tracker, in the order observed; None for a star
+    that does not support it."""
 
 
 class Attitude(Model, frozen=True, kw_only=True):
@@ -167,14 +169,16 @@ class Attitude(Model, frozen=True, kw_only=True):
     frame: str
     covariance_arcsec2: Sequence[Sequence[float]]
     method: str
-    """`measured`: by a tracker itself; all that needs stars is None then."""
+    """Method that gave the attitude. `measured`: a tracker measured it itself; fields that need
+    stars are None then."""
     residual_rms_arcsec: float | None
     predicted_rms_arcsec: float | None
     taste: float | None
     """Weighted sum of squared residuals; follows chi-square."""
     degrees_of_freedom: int
     status: Status
-    """`suspect`: `taste` exceeds its 99.9 % point, or there is a `rival`."""
+    """Consistency of the attitude. `suspect`: `taste` exceeds its 99.9 % point, or there is a
+    `rival`."""
     triad: Sequence[float] | None
     quest: Sequence[float] | None
     triad_quest_angle_arcsec: float | None
@@ -183,11 +187,11 @@ class Attitude(Model, frozen=True, kw_only=True):
     outlier: str | None = None
     """The tracker that disagrees."""
     rival: Rival | None = None
-    """If two groups of stars give two attitudes: the less probable one."""
+    """The less probable attitude, if two groups of stars give two attitudes."""
 
 
 class Timings(Model, frozen=True, kw_only=True):
-    """Microseconds per step."""
+    """Duration of each step of the processing of a batch, in microseconds."""
 
     zone: int
     identify: int
@@ -197,7 +201,7 @@ class Timings(Model, frozen=True, kw_only=True):
 
 
 class Provenance(Model, frozen=True, kw_only=True):
-    """The versions of the data and the program that made the answer."""
+    """Versions of the data and of the program that produced an answer."""
 
     catalog: str
     run_catalog: str
@@ -207,7 +211,7 @@ class Provenance(Model, frozen=True, kw_only=True):
 
 
 class Prediction(Model, frozen=True, kw_only=True):
-    """The attitude that was predicted for a batch."""
+    """Attitude that was predicted for a batch that asks for the last attitude."""
 
     quaternion: Sequence[float]
     covariance_arcsec2: Sequence[Sequence[float]]
@@ -223,12 +227,12 @@ class Prediction(Model, frozen=True, kw_only=True):
 
 
 class Tracking(Model, frozen=True, kw_only=True):
-    """What came of asking for the last attitude."""
+    """Tracking state of a batch that asks for the last attitude, with its prediction."""
 
     state: str
-    """`tracking`: a good attitude was found about the prediction, or the prediction identified a
-    star of a batch that has no attitude. `acquiring`: a good attitude was found in the whole sky.
-    `lost`: none of these."""
+    """Tracking state. `tracking`: a good attitude was found about the prediction, or the prediction
+    identified a star of a batch that has no attitude. `acquiring`: a good attitude was found in the
+    whole sky. `lost`: none of these."""
     by_default: bool
     """The mission asks for it, not the batch."""
     prediction: Prediction | None
@@ -247,10 +251,11 @@ class WhatIf(Model, frozen=True, kw_only=True):
     time: str
     identifier: Identifier
     path: str
-    """`zone`: the service searched about the a priori attitude. `lost_in_space`: without an a
-    priori attitude, it searched about an attitude from the whole sky. `zone_then_lost_in_space`:
-    the first search found nothing good, so the service made the second. `measured`: the batch holds
-    an attitude that a tracker measured; nothing was searched for, and `identifier` was not used."""
+    """Way in which the attitude was found. `zone`: the service searched about the a priori
+    attitude. `lost_in_space`: without an a priori attitude, it searched about an attitude from the
+    whole sky. `zone_then_lost_in_space`: the first search found nothing good, so the service made
+    the second. `measured`: the batch holds an attitude that a tracker measured; nothing was
+    searched for, and `identifier` was not used."""
     observations: Sequence[TrackerStars]
     counts: StarCounts
     attitude: Attitude | None
@@ -260,13 +265,13 @@ class WhatIf(Model, frozen=True, kw_only=True):
     timings_us: Timings
     provenance: Provenance
     parent: str | None = None
-    """Only for a what-if: the result that it started from."""
+    """Result that a what-if started from; absent for other results."""
     recorded: bool = True
     """True if this what-if was recorded."""
     frame: FrameSummary | None = None
-    """Only for a batch that was made from a frame."""
+    """Summary of the frame, for a batch that was made from a frame."""
     tracking: Tracking | None = None
-    """Only for a batch that asks for the last attitude."""
+    """Tracking state, for a batch that asks for the last attitude."""
 
 
 class Answer(WhatIf, frozen=True, kw_only=True):
@@ -276,7 +281,7 @@ class Answer(WhatIf, frozen=True, kw_only=True):
 
 
 class Summary(Model, frozen=True, kw_only=True):
-    """A result in a list, without its stars and its attitude."""
+    """Entry of a list of results, without stars and attitude."""
 
     id: str
     spacecraft: str
@@ -304,7 +309,7 @@ class Summary(Model, frozen=True, kw_only=True):
 
 
 class Signature(Model, frozen=True, kw_only=True):
-    """Who recorded or adopted a what-if, when and why."""
+    """Signature on a recorded or adopted what-if: author, time and comment."""
 
     who: str
     at: str
@@ -325,9 +330,9 @@ class Result(Model, frozen=True, kw_only=True):
     current: bool
     parent: str | None
     signature: Signature | None = None
-    """Only for a recorded what-if: who recorded it; None where the audit list does not know."""
+    """Signature on a recorded what-if; None if the audit list has none."""
     archived: bool
     """True if it is read from the archive, which takes longer."""
     what_ifs: Sequence[Summary]
     frame: FrameWithStars | None = None
-    """Only for a batch that was made from a frame."""
+    """Frame with all candidates for stars, for a batch that was made from a frame."""

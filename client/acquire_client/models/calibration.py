@@ -1,4 +1,4 @@
-"""Calibrations of trackers: what is in force, and what held before."""
+"""Records of tracker calibrations: the one in force, and earlier ones."""
 # Written by `make client` from service/contract/calibration.py and
 # service/features/calibration/records.py.
 
@@ -39,7 +39,7 @@ class TrackerGeometry(Model, frozen=True, kw_only=True):
 
 
 class CalibrationAdoption(Model, frozen=True, kw_only=True):
-    """A change of the calibration in force, by whom and when."""
+    """Adoption of a calibration, or the return to the mission file: author, time and settings."""
 
     id: str
     spacecraft: str
@@ -58,7 +58,7 @@ class CalibrationAdoption(Model, frozen=True, kw_only=True):
 
 
 class CalibrationInForce(Model, frozen=True, kw_only=True):
-    """The calibration that new batches of a spacecraft use, and what held before."""
+    """Calibration that new batches of a spacecraft use, with its earlier ones."""
 
     spacecraft: str
     mission: str

@@ -1,4 +1,4 @@
-"""The data of events, as the event stream and webhooks send them."""
+"""Records of events' data, as sent by the event stream and webhooks."""
 # Written by `make client` from service/contract/events.py.
 
 from ..base import Model
@@ -7,7 +7,7 @@ from .answers import StarCounts
 
 
 class LatestBatch(Model, frozen=True, kw_only=True):
-    """The latest of the batches of an event."""
+    """The latest batch among those of an event."""
 
     id: str
     batch: str
@@ -18,7 +18,7 @@ class LatestBatch(Model, frozen=True, kw_only=True):
 
 
 class Recorded(Model, frozen=True, kw_only=True):
-    """Batches that were recorded."""
+    """Data of an event about newly recorded batches."""
 
     spacecraft: str
     run: str
@@ -28,7 +28,7 @@ class Recorded(Model, frozen=True, kw_only=True):
 
 
 class Adopted(Model, frozen=True, kw_only=True):
-    """A what-if that was adopted."""
+    """Data of an event about an adopted what-if."""
 
     spacecraft: str
     run: str
@@ -39,7 +39,7 @@ class Adopted(Model, frozen=True, kw_only=True):
 
 
 class TrackingChange(Model, frozen=True, kw_only=True):
-    """A change of the tracking state of a spacecraft."""
+    """Data of an event about a change of a spacecraft's tracking state."""
 
     spacecraft: str
     run: str
@@ -52,7 +52,7 @@ class TrackingChange(Model, frozen=True, kw_only=True):
 
 
 class CalibrationChange(Model, frozen=True, kw_only=True):
-    """A change of the calibration in force."""
+    """Data of an event about a change of the calibration in force."""
 
     id: str
     spacecraft: str
@@ -67,7 +67,7 @@ class CalibrationChange(Model, frozen=True, kw_only=True):
 
 
 class RecordHead(Model, frozen=True, kw_only=True):
-    """A head of the record's chain, to be kept where nobody can write who can change the record."""
+    """Head of the record's chain, to be stored where nobody who can change the record can write."""
 
     number: int
     sha256: str

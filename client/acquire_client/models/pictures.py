@@ -1,4 +1,4 @@
-"""A picture of any camera, solved without a record: its attitude, its lens and its stars."""
+"""Record of a solved picture from any camera, which is not stored: attitude, lens and stars."""
 # Written by `make client` from service/contract/pictures.py.
 
 from collections.abc import Sequence
@@ -7,12 +7,13 @@ from ..base import Model
 
 
 class PictureAttitude(Model, frozen=True, kw_only=True):
-    """The attitude of a picture as a viewer shows it."""
+    """Attitude of a picture, in the form that viewers use."""
 
     status: str
     """`suspect`: the lens was fitted on the picture itself."""
     quaternion: Sequence[float]
-    """ICRS to camera, scalar last: x right, y down, z to the sky through the middle."""
+    """Quaternion from ICRS to camera axes, scalar last: x right, y down, z to the sky through the
+    middle."""
     sigma_arcsec: Sequence[float]
     """One standard deviation about x, y and z."""
     ra_deg: float
@@ -20,7 +21,7 @@ class PictureAttitude(Model, frozen=True, kw_only=True):
     dec_deg: float
     """Declination of the middle of the picture."""
     roll_deg: float
-    """Position angle of the upper edge, from north through east, 0 to 360."""
+    """Position angle of the picture's upper edge, from north through east, 0 to 360."""
     aberration: str
     log_odds: float
     """Logarithm of the odds against chance."""
@@ -42,7 +43,7 @@ class PictureLens(Model, frozen=True, kw_only=True):
 
 
 class PictureStar(Model, frozen=True, kw_only=True):
-    """A star on a picture; the residual is its place less the expected one."""
+    """Star found on a picture; its residual is the measured less the expected position."""
 
     id: str
     name: str | None
@@ -53,7 +54,7 @@ class PictureStar(Model, frozen=True, kw_only=True):
 
 
 class Picture(Model, frozen=True, kw_only=True):
-    """The attitude, lens and stars of a picture; without an attitude, `remarks` say what to try."""
+    """Solved picture: attitude, lens and stars; without an attitude, `remarks` suggest remedies."""
 
     width_px: int
     height_px: int
@@ -76,9 +77,9 @@ class Picture(Model, frozen=True, kw_only=True):
     shared_error_px: float | None
     """The error that neighbouring stars share."""
     zero_point_mag: float | None
-    """Magnitude of one count, per second if `exposure_s` is known."""
+    """Zero point: the magnitude of one count, per second if `exposure_s` is known."""
     zero_point_sigma_mag: float | None
     stars: Sequence[PictureStar]
     """The identified stars, brightest first."""
     overlay_png: str | None = None
-    """Base64: the picture with stars, names, a grid and a scale, if asked for."""
+    """PNG in Base64: the picture with stars, names, a grid and a scale; None unless requested."""

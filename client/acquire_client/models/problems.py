@@ -1,4 +1,4 @@
-"""Problems (RFC 9457), and the faults that they name."""
+"""Records of problems (RFC 9457), and of the faults that they list."""
 # Written by `make client` from service/contract/problems.py.
 
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from ..base import Model
 
 
 class FieldFault(Model, frozen=True, kw_only=True):
-    """One fault of a request."""
+    """Fault of one field of a request."""
 
     field: str
     message: str
@@ -15,7 +15,7 @@ class FieldFault(Model, frozen=True, kw_only=True):
 
 
 class ProblemDocument(Model, frozen=True, kw_only=True):
-    """A problem (RFC 9457)."""
+    """Problem details of a refused or failed request (RFC 9457)."""
 
     type: str
     """The type of problem; `about:blank` if the status says everything."""

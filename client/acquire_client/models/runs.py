@@ -1,4 +1,4 @@
-"""Runs and replays; two runs, and two sets of options, side by side."""
+"""Records of runs and replays, and of comparisons of two runs or two sets of options."""
 # Written by `make client` from service/contract/runs.py.
 
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from .problems import FieldFault
 
 
 class Run(Model, frozen=True, kw_only=True):
-    """A run."""
+    """Run: a named set of batches and their results."""
 
     run: str
     created: str
@@ -21,7 +21,7 @@ class Run(Model, frozen=True, kw_only=True):
 
 
 class ReplayLines(Model, frozen=True, kw_only=True):
-    """The lines of a replay."""
+    """Number of lines of a replay: total, done and refused."""
 
     total: int | None
     """None if the number is not known in advance."""
@@ -30,14 +30,14 @@ class ReplayLines(Model, frozen=True, kw_only=True):
 
 
 class ReplayCounts(Model, frozen=True, kw_only=True):
-    """Results of the lines so far."""
+    """Number of batches, stars and gyro blocks in the lines of a replay so far."""
 
     new: int
     """Batches that this replay recorded."""
     repeated: int
     """Batches that were already recorded."""
     observed: int
-    """Stars of these batches; the next fields count them by outcome."""
+    """Observed stars of the replay's batches; the next fields count them by outcome."""
     unique: int
     ambiguous: int
     unmatched: int
@@ -50,7 +50,7 @@ class ReplayCounts(Model, frozen=True, kw_only=True):
 
 
 class ApidPackets(Model, frozen=True, kw_only=True):
-    """The packets of one APID."""
+    """Counts of a replay's space packets with one APID."""
 
     apid: int
     packets: int
@@ -61,14 +61,14 @@ class ApidPackets(Model, frozen=True, kw_only=True):
     missing: int
     """Packets that are missing in these places."""
     backward: int
-    """Places where the count repeats or goes back: a reset, or a changed order."""
+    """Places where the sequence count repeats or goes back: after a reset, or in changed order."""
     refused: int
     incomplete: int = 0
     """Segments of packets of which others are missing."""
 
 
 class ReplayPackets(Model, frozen=True, kw_only=True):
-    """The space packets of a replay so far."""
+    """Counts of a replay's space packets so far."""
 
     packets: int
     bytes: int
@@ -94,9 +94,9 @@ class ReplayPackets(Model, frozen=True, kw_only=True):
     joined: int = 0
     """Packets that were joined of segments."""
     incomplete: int = 0
-    """Segments of packets of which others are missing; they are refused, too."""
+    """Segments of incomplete packets; they are counted as refused as well."""
     unread_bytes: int = 0
-    """From the packets on at which files could not be read any further."""
+    """Bytes from the first unreadable packet of each file to the end of the file."""
     empty_files: int = 0
     """Files without a packet."""
     without_attitude: int = 0
@@ -106,7 +106,7 @@ class ReplayPackets(Model, frozen=True, kw_only=True):
 
 
 class LineProblem(Model, frozen=True, kw_only=True):
-    """The faults of a line."""
+    """Problem of a refused line, with its faults."""
 
     detail: str
     errors: Sequence[FieldFault] = ()
@@ -114,7 +114,7 @@ class LineProblem(Model, frozen=True, kw_only=True):
 
 
 class RefusedLine(Model, frozen=True, kw_only=True):
-    """A refused line; the replay continues with the next one."""
+    """Refused line of a replay, which continues with the next line."""
 
     line: int
     """Number of the line, or of the packet in its file, from 1."""
@@ -122,7 +122,7 @@ class RefusedLine(Model, frozen=True, kw_only=True):
 
 
 class ReplayProgress(Model, frozen=True, kw_only=True):
-    """A replay and its progress, without the refused lines: the data of an event."""
+    """Replay with its progress, without the refused lines: the data of an event."""
 
     id: str
     run: str
@@ -135,16 +135,16 @@ class ReplayProgress(Model, frozen=True, kw_only=True):
 
 
 class Replay(ReplayProgress, frozen=True, kw_only=True):
-    """A replay and its progress."""
+    """Replay with its progress and refused lines."""
 
     packets: ReplayPackets | None
     """None unless the replay reads space packets."""
     errors: Sequence[RefusedLine]
-    """The first thousand refused lines; then, for a failed replay, the reason."""
+    """The first thousand refused lines of the replay; then, for a failed replay, the reason."""
 
 
 class RunState(Model, frozen=True, kw_only=True):
-    """A run, and whether its batches can raise alarms."""
+    """Run, with the evaluation of its limits on or off."""
 
     run: str
     alarms: bool

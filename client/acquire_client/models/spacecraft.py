@@ -1,4 +1,4 @@
-"""Spacecraft: state, settings, rates, histories, gyro blocks; and all of them at a glance."""
+"""Records of spacecraft: state, settings, rates, histories, gyro blocks, and the overview."""
 # Written by `make client` from service/contract/spacecraft.py.
 
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from .answers import (
 
 
 class AttitudeRow(Model, frozen=True, kw_only=True):
-    """An attitude in a history; use it only where `status` is good."""
+    """Entry of an attitude history; use the attitude only where `status` is good."""
 
     id: str
     batch: str
@@ -21,7 +21,8 @@ class AttitudeRow(Model, frozen=True, kw_only=True):
     frame: str
     covariance_arcsec2: Sequence[Sequence[float]]
     residual_rms_arcsec: float | None
-    """None, as the next two, of an attitude that a tracker measured itself."""
+    """Rms of the attitude's residuals; None, as the next two, for an attitude that a tracker
+    measured itself."""
     predicted_rms_arcsec: float | None
     taste: float | None
     method: str
@@ -36,25 +37,25 @@ class SpacecraftRow(Model, frozen=True, kw_only=True):
     retired: bool
     """True if no mission file describes it any more."""
     state: str
-    """State of the latest batch."""
+    """Status of the latest batch's attitude, `no_attitude`, or `no_batches`."""
     latest_batch: Summary | None
     attitude: AttitudeRow | None
     """Attitude of the latest batch; None if this batch has none."""
     last_attitude: AttitudeRow | None
-    """The latest attitude. It can be older than the latest batch; see its time."""
+    """Latest attitude of the spacecraft. It can be older than the latest batch; see its time."""
     tracking: str | None
-    """State of the latest batch; None if that does not ask for the last attitude."""
+    """Tracking state of the latest batch; None if that does not ask for the last attitude."""
 
 
 class MissionNow(Model, frozen=True, kw_only=True):
-    """The present settings of a mission."""
+    """Present settings of a mission."""
 
     digest: str
     settings: dict[str, Any]
 
 
 class MissionThen(MissionNow, frozen=True, kw_only=True):
-    """The settings of a mission at some time."""
+    """Settings of a mission, with the time from which they were in use."""
 
     since: str
 
@@ -64,11 +65,11 @@ class SpacecraftState(SpacecraftRow, frozen=True, kw_only=True):
 
     mission: MissionNow
     history: Sequence[MissionThen]
-    """Oldest first; a return to earlier settings is a new entry."""
+    """Settings of the mission, oldest first; a return to earlier settings is a new entry."""
 
 
 class Rates(Model, frozen=True, kw_only=True):
-    """Sums over the batches of a bucket."""
+    """Counts of batches and stars in an hour or a day."""
 
     start: str
     batches: int
@@ -83,13 +84,13 @@ class Rates(Model, frozen=True, kw_only=True):
 
 
 class Series(Model, frozen=True, kw_only=True):
-    """A quantity. `minmax`: mean, least and greatest of each bucket; `latest`: single values."""
+    """Values of a quantity over time: bucket statistics (`minmax`) or single values (`latest`)."""
 
     unit: str
     count: Sequence[int] = ()
     """`minmax`: batches with a value."""
     mean: Sequence[float | None] = ()
-    """`minmax`: for shares, over all stars or batches."""
+    """Mean of each bucket (`minmax`); for shares, over all stars or batches."""
     min: Sequence[float | None] = ()
     """Least value of a batch."""
     max: Sequence[float | None] = ()
@@ -99,22 +100,22 @@ class Series(Model, frozen=True, kw_only=True):
 
 
 class History(Tabulated, frozen=True, kw_only=True):
-    """Quantities over a period of time, oldest first; None: unknown."""
+    """History of quantities over a period, oldest first; None: unknown."""
 
     spacecraft: str
     run: str
     tracker: str | None = None
     """If the request names one."""
     not_split: bool = False
-    """True while older batches of the run are not split by tracker yet, and so are missing here;
-    only with `tracker`."""
+    """True while older batches of the run are not split by tracker yet, and are missing here; only
+    with `tracker`."""
     start: str | None
     end: str | None
     strategy: str
     bucket_s: int | None
     """The width of a bucket; None for single batches."""
     source: str
-    """The source of the data; both ends of the period are exact in any case."""
+    """Source of the history: batches, or sums by hour or day; both ends of the period are exact."""
     thinned: bool
     """True if the period has more batches than the answer has points."""
     unix_s: Sequence[float]
@@ -122,20 +123,20 @@ class History(Tabulated, frozen=True, kw_only=True):
     batches: Sequence[int] = ()
     """`minmax`: batches in each bucket."""
     time: Sequence[str] = ()
-    """`latest` only, like the next two fields."""
+    """Time of each batch; `latest` only, like the next two fields."""
     id: Sequence[str] = ()
     batch: Sequence[str] = ()
     series: dict[str, Series]
 
 
 class RankedBatch(Summary, frozen=True, kw_only=True):
-    """A batch with its value of the chosen quantity."""
+    """Batch in a ranking, with its value of the ranked quantity."""
 
     value: float
 
 
 class Ranking(Model, frozen=True, kw_only=True):
-    """The worst batches of a period."""
+    """Ranking of the worst batches of a period by a quantity."""
 
     by: str
     tracker: str | None = None
@@ -158,7 +159,7 @@ class GyroBlock(Model, frozen=True, kw_only=True):
     """Time of the last sample."""
     samples: int
     step_s: float | None
-    """From each sample to the next; None: the block has times of its own."""
+    """Interval between samples in seconds; None: the block has a time for each sample."""
     received: str
 
 
@@ -168,4 +169,4 @@ class GyroSamples(GyroBlock, frozen=True, kw_only=True):
     times_s: Sequence[float]
     """Times of the samples, in seconds of TAI after `start`."""
     rates_rad_per_s: Sequence[Sequence[float]]
-    """Rates of each sample, as they were sent: about the three axes of the mission's gyro."""
+    """Angular rates of each sample as sent, about the three axes of the mission's gyro."""
