@@ -1,7 +1,7 @@
-"""The `acquire` command.
+"""Command line of the service, `acquire`.
 
-Nothing is imported before it is needed: help answers at once, and each command
-loads its own part of the service alone.
+Modules are imported only when needed: help answers at once, and each command loads just its own
+part of the service.
 """
 
 import argparse
@@ -25,10 +25,10 @@ INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit code.
+    """Run one command of `acquire` and return its exit code.
 
-    0: done; 1: done, with lines or differences that are reported; 2: refused
-    for its usage, configuration or input, or no service to talk to.
+    0: done; 1: done, with faults or differences reported; 2: refused for its usage, configuration
+    or input, or no service to talk to.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, TextIOWrapper):
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except AcquisitionError as error:
         text = str(error)
         if getattr(parsed, "database", None) is not None:
-            # It stands in the place of the setting.
+            # The option replaces the setting of the environment.
             text = text.replace("ACQUIRE_DATABASE", "--database")
         _complain(text)
     except KeyboardInterrupt:
@@ -71,11 +71,11 @@ def _complain(text: str) -> None:
 
 
 def build_parser(features_off: str = "") -> argparse.ArgumentParser:
-    """The parser of the whole command; `function` of what it parses runs the chosen command.
+    """Argument parser of `acquire`; the parsed `function` runs the chosen command.
 
-    `features_off` are the features whose commands are left out; see `service.feature`.
-    An installed package adds commands by an entry point of the group `acquire.commands`: a function
-    that takes what `add` of the modules in `commands` takes.
+    `features_off` are the features whose commands are left out; see `service.feature`.  An
+    installed package adds commands by an entry point of the group `acquire.commands`: a function
+    with the arguments of `add` in the modules of `commands`.
     """
     parser = add_command(
         None,

@@ -1,4 +1,4 @@
-"""`python -m service.cli` is `acquire`."""
+"""Entry point of `python -m service.cli`, equal to `acquire`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""How commands are declared and what they share: arguments, settings, missions, periods, progress.
+"""Declaration of commands, and shared parts: arguments, settings, missions, periods, progress.
 
 Modules of commands import nothing heavy before they run: help answers at once.
 """
@@ -33,35 +33,35 @@ CAMERA_MISSION = "IMAGER, or one of your own whose tracker has a camera, or its 
 FILE_OR_NAME = "a mission file (.toml), or the name of a spacecraft"
 
 MOST_OPTIONS, MOST_FIRST = 8, 7
-"""Arguments of a command whose help is one list, and those that stand first in a longer one."""
+"""Greatest number of options in a single help list, and of options shown first in a longer one."""
 
 Function = Callable[[argparse.Namespace], int]
 
 
 def print_json(value: Any) -> None:
-    """Print a value of plain types as JSON; numbers that are not finite become null."""
+    """Print a plain value as JSON; numbers that are not finite become null."""
     import msgspec
 
     print(msgspec.json.format(msgspec.json.encode(value), indent=1).decode())
 
 
 _Section = tuple[str | None, str | None, Sequence[argparse.Action]]
-"""A title, a description, and the arguments or commands of a part of the help."""
+"""Section of a help text: title, description, and arguments or commands."""
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose error messages fit on one line, name what was meant and point to the help.
+    """Argument parser with one-line error messages that suggest the likely word and name the help.
 
-    A command that has commands of its own prints its help where none is given.
+    A command with subcommands prints its help if none is given.
     """
 
     commands: Any = None
-    """What takes the commands of this command; None for one without."""
+    """Action that holds the subcommands; None for a command without."""
     first: Sequence[str] = ()
-    """Options, or commands, that most people need: the help shows these before all others."""
+    """Most common options or commands, which the help shows before all others."""
 
     def format_help(self) -> str:
-        """The help; with `first` these, and what is required, before all others."""
+        """Text of the help; options in `first`, and required ones, before all others."""
         if not self.first:
             return super().format_help()
         formatter = self._get_formatter()
@@ -120,7 +120,7 @@ class Parser(argparse.ArgumentParser):
         ]
 
     def error(self, message: str) -> NoReturn:
-        """Print the message and exit with code 2."""
+        """Print an error message and exit with code 2."""
         self.exit(2, f"acquire: {message} (see `{self.prog} --help`)\n")
 
     # The stubs of argparse declare two overloads, by whether a namespace is given; here one
@@ -128,7 +128,7 @@ class Parser(argparse.ArgumentParser):
     def parse_known_args(  # type: ignore[override]
         self, args: Sequence[str] | None = None, namespace: Any = None
     ) -> tuple[argparse.Namespace, list[str]]:
-        """Parse; an option that does not exist is an error that names the nearest one."""
+        """Parse arguments; for an unknown option the error suggests the nearest known one."""
         words = sys.argv[1:] if args is None else list(args)
         has_commands = self._subparsers is not None
         # Before a missing argument is reported: the misspelt option may be the missing one.
@@ -164,7 +164,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _meant(text: str, known: Iterable[str]) -> str:
-    """The end of an error message: the nearest word that there is, or nothing."""
+    """Suggestion of the most similar known word, for an error message; empty without any."""
     near = difflib.get_close_matches(text, tuple(known), n=1)
     return f"; did you mean {near[0]}?" if near else ""
 
@@ -179,13 +179,12 @@ def add_command(
     notes: str = "",
     first: str = "",
 ) -> argparse.ArgumentParser:
-    """Add a command that runs `function`, which returns the exit code.
+    """Add a command whose `function` runs it and returns the exit code.
 
-    The help is the function's docstring: what the command does, an empty line, examples.  A group,
-    and a command whose function serves several, has `summary` and `examples` instead.  `notes`
-    follow the examples.  `first` are the options that most people need, of a command with more
-    than `MOST_OPTIONS`, or the commands to begin with.  `parent` None makes the parser of the whole
-    command.
+    The help is the function's docstring: a summary, an empty line, examples.  A group, or a command
+    whose function serves several, has `summary` and `examples` instead.  `notes` follow the
+    examples.  `first` are the most common options of a command with more than `MOST_OPTIONS`, or
+    the commands to begin with.  `parent` None creates the parser of the whole command.
     """
     if not summary:
         summary, _, examples = (inspect.getdoc(function) or "").partition("\n\n")
@@ -212,12 +211,12 @@ def add_command(
 
 
 def add_group(parent: Any, name: str, summary: str, examples: str) -> Any:
-    """Add a command that has commands of its own; returns what takes these."""
+    """Add a command with subcommands; returns the action to add these to."""
     return add_subcommands(add_command(parent, name, summary=summary, examples=examples))
 
 
 def add_subcommands(parser: argparse.ArgumentParser) -> Any:
-    """Let a parser take one of several commands; without one it prints its help."""
+    """Allow a parser one of several subcommands; without one it prints its help."""
     taken = parser.add_subparsers(title="commands", metavar="COMMAND", parser_class=Parser)
     if isinstance(parser, Parser):
         parser.commands = taken
@@ -225,12 +224,12 @@ def add_subcommands(parser: argparse.ArgumentParser) -> Any:
 
 
 def commands_of(parent: Any, name: str) -> Any:
-    """Return what takes the commands of a group added before; a package adds its own to it."""
+    """Action that holds the subcommands of a group, to add further ones from a package."""
     return parent.choices[name].commands
 
 
 def add_database(parser: argparse.ArgumentParser) -> None:
-    """Add `--database`."""
+    """Add the option `--database` to a parser."""
     parser.add_argument(
         "--database",
         metavar="URL",
@@ -239,7 +238,7 @@ def add_database(parser: argparse.ArgumentParser) -> None:
 
 
 def add_url_or_in_process(parser: argparse.ArgumentParser) -> None:
-    """Add `--url` and `--in-process`, of which one may be given."""
+    """Add the exclusive options `--url` and `--in-process` to a parser."""
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--url", help=SERVICE)
     way.add_argument(
@@ -250,12 +249,12 @@ def add_url_or_in_process(parser: argparse.ArgumentParser) -> None:
 
 
 def add_json(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add `--json`, which prints `what` as JSON in the place of text for people."""
+    """Add the option `--json`, which prints `what` as JSON instead of text."""
     parser.add_argument("--json", action="store_true", help=f"print {what} as JSON")
 
 
 def add_output(parser: argparse.ArgumentParser) -> None:
-    """Add `--output` of a command that writes one file."""
+    """Add the option `--output` to the parser of a command that writes one file."""
     parser.add_argument(
         "--output", type=Path, metavar="FILE", help="the file to write; default: standard output"
     )
@@ -265,7 +264,7 @@ STANDARD_OUTPUT = Path("-")
 
 
 def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
-    """Add `--json [OUT]`: `what` as JSON to a file, or printed in the place of text."""
+    """Add the option `--json [OUT]`, which writes `what` as JSON to a file or prints it."""
     parser.add_argument(
         "--json",
         type=Path,
@@ -277,7 +276,7 @@ def add_json_file(parser: argparse.ArgumentParser, what: str) -> None:
 
 
 def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
-    """Add `--run`, `--start` and `--end`; see `period_of`."""
+    """Add the options `--run`, `--start` and `--end`; see `period_of`."""
     parser.add_argument("--run", metavar="NAME", help=run_help)
     parser.add_argument("--start", metavar="UTC", help="start of the period (batch time), included")
     parser.add_argument("--end", metavar="UTC", help="end of the period (batch time), excluded")
@@ -287,7 +286,7 @@ def add_period(parser: argparse.ArgumentParser, run_help: str) -> None:
 
 
 def add_grade(parser: argparse.ArgumentParser) -> None:
-    """Add `--grade` of attitudes."""
+    """Add the option `--grade`, which selects raw, filtered or smoothed attitudes."""
     parser.add_argument(
         "--grade",
         choices=("raw", "filtered", "smoothed"),
@@ -297,7 +296,7 @@ def add_grade(parser: argparse.ArgumentParser) -> None:
 
 
 def count(text: str) -> int:
-    """Parse a whole number of at least one."""
+    """Parse a whole number of at least one, for an option."""
     try:
         number = int(text)
     except ValueError:
@@ -308,7 +307,7 @@ def count(text: str) -> int:
 
 
 def speed(text: str) -> float | None:
-    """Parse a factor above zero; `max` gives None."""
+    """Parse a speed factor above zero, for an option; `max` gives None."""
     if text == "max":
         return None
     try:
@@ -321,7 +320,7 @@ def speed(text: str) -> float | None:
 
 
 def positive(text: str) -> float:
-    """Parse a number above zero."""
+    """Parse a number above zero, for an option."""
     try:
         number = float(text)
     except ValueError:
@@ -332,7 +331,7 @@ def positive(text: str) -> float:
 
 
 def degrees(text: str) -> float:
-    """Parse a field of view."""
+    """Parse a field of view in degrees, above 0 and below 120, for an option."""
     number = positive(text)
     if number >= 120:
         raise argparse.ArgumentTypeError(f"must be below 120 degrees (got {text!r})")
@@ -340,9 +339,9 @@ def degrees(text: str) -> float:
 
 
 def written_to(file: Path | None, content: Iterator[bytes]) -> None:
-    """Write content to a file, or to the standard output where there is none.
+    """Write content to a file, or to standard output if `file` is None.
 
-    The file appears when it is whole: it is written under another name beside its place.
+    The file appears only when complete: it is written under a temporary name in the same folder.
     """
     if file is None:
         for piece in content:
@@ -361,7 +360,7 @@ def written_to(file: Path | None, content: Iterator[bytes]) -> None:
 
 
 def settings_of(parsed: Namespace) -> Settings:
-    """The settings of the environment, overridden by the command's options."""
+    """Settings from the environment, overridden by the options of a command."""
     overrides = {
         name: value
         for name in ("database", "host", "port")
@@ -373,13 +372,13 @@ def settings_of(parsed: Namespace) -> Settings:
 
 
 def service_url(parsed: Namespace) -> str:
-    """The address of the service: that of `--url`, else where the settings have it listen."""
+    """Address of the service: from `--url`, otherwise from the settings."""
     settings = settings_of(parsed)
     return parsed.url or url_of(settings.host, settings.port)
 
 
 def http_client(settings: Settings, url: str, timeout_s: float) -> "httpx.Client":
-    """A client of the service at an address, with the token of the settings."""
+    """HTTP client for the service at an address, with the access token of the settings."""
     import httpx
 
     headers = {} if settings.token is None else {"Authorization": f"Bearer {settings.token}"}
@@ -388,7 +387,7 @@ def http_client(settings: Settings, url: str, timeout_s: float) -> "httpx.Client
 
 
 def refusal_of(response: "httpx.Response") -> str:
-    """The reason that the service gives in an answer that refuses a request."""
+    """Reason given by the service in an answer that refuses a request."""
     try:
         return str(response.json()["detail"])
     except (ValueError, KeyError, TypeError):
@@ -396,7 +395,7 @@ def refusal_of(response: "httpx.Response") -> str:
 
 
 def settings_of_existing(parsed: Namespace) -> Settings:
-    """`settings_of` a command that reads records; raises `BadConfiguration` without a database.
+    """Settings for a command that reads records; raises `BadConfiguration` without a database.
 
     Opening a SQLite file that does not exist would create it.
     """
@@ -408,7 +407,7 @@ def settings_of_existing(parsed: Namespace) -> Settings:
 
 
 def existing_store(parsed: Namespace) -> "Store":
-    """The database of a command that changes records, open; see `settings_of_existing`."""
+    """Open the existing database for a command that changes it; see `settings_of_existing`."""
     from service.storage.store import Store
 
     settings = settings_of_existing(parsed)
@@ -416,7 +415,7 @@ def existing_store(parsed: Namespace) -> "Store":
 
 
 def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
-    """The times of `--start` and `--end`; raises `BadInput` where they are out of order."""
+    """Times of `--start` and `--end`; raises `BadInput` if they are out of order."""
     from service.times import parse_utc
 
     start = None if parsed.start is None else parse_utc(parsed.start, "--start")
@@ -427,16 +426,16 @@ def period_of(parsed: Namespace) -> "tuple[Utc | None, Utc | None]":
 
 
 class SpacecraftName(str):
-    """The name of a spacecraft whose mission file was given in its place."""
+    """Name of a spacecraft that was given by its mission file, with the path of that file."""
 
     file: Path
 
 
 def name_spacecraft(parsed: Namespace) -> None:
-    """Replace the mission file of an option that takes a spacecraft by the spacecraft's name.
+    """Replace a mission file given for a spacecraft by the spacecraft's name.
 
-    `settings_of` then offers the mission of that file beside the others.  Raises
-    `BadConfiguration` for a file with an error.
+    `settings_of` then adds the mission of that file to the others.  Raises `BadConfiguration` for a
+    file with an error.
     """
     from service.missions.mission import read_mission
 
@@ -453,14 +452,14 @@ def name_spacecraft(parsed: Namespace) -> None:
 
 
 def mission_and_catalog(name: str) -> "tuple[Mission, Catalog]":
-    """The mission of that name and the star catalog that the environment chooses."""
+    """Mission with a name, and the star catalog chosen in the environment."""
     from service.sky.catalog.star_catalog import open_catalog
 
     return mission_and_file(name)[0], open_catalog(Settings.from_environment().catalog)
 
 
 def mission_and_file(text: str) -> "tuple[Mission, Path]":
-    """The mission of a file whose name ends in `.toml`, else of a spacecraft's name; its file."""
+    """Mission and its file, from a path that ends in `.toml` or a spacecraft's name."""
     from service.missions.mission import mission_files, mission_named, read_mission
 
     if isinstance(text, SpacecraftName) or text.endswith(".toml"):
@@ -473,19 +472,19 @@ def mission_and_file(text: str) -> "tuple[Mission, Path]":
 
 
 def mission_of_file_or_name(text: str) -> "Mission":
-    """The mission of a file whose name ends in `.toml`, else that of a spacecraft's name."""
+    """Mission from a path that ends in `.toml`, or from a spacecraft's name."""
     return mission_and_file(text)[0]
 
 
 class Progress:
-    """The progress of a command, as a bar on a terminal; calling it moves the bar."""
+    """Progress of a command, shown as a bar on a terminal; calling it updates the bar."""
 
     def __init__(self, bar: Any) -> None:
         self._bar = bar
         self.done = 0
 
     def __call__(self, done: int, total: int | None = None) -> None:
-        """Show how many are done and, where it is known, of how many."""
+        """Show the number done and, if known, the total."""
         self._bar.total = total
         self._bar.update(done - self.done)
         self.done = done
@@ -495,7 +494,7 @@ class Progress:
 def progress_bar(
     unit: str, title: str, quiet: bool = False, leave: bool = False
 ) -> Iterator[Progress]:
-    """A progress bar, which stays at the end if `leave` says so; none without a terminal."""
+    """Context manager of a progress bar, shown only on a terminal; with `leave` it stays."""
     from tqdm import tqdm
 
     disable = True if quiet else None

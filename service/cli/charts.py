@@ -1,4 +1,4 @@
-"""The zones of a mission file as SVG."""
+"""SVG map of the zones of a mission file."""
 
 from typing import TYPE_CHECKING
 
@@ -13,11 +13,11 @@ if TYPE_CHECKING:
 
 PICTURE_WIDTH, MAP_HEIGHT, MAP_HEAD, MAP_FOOT = 960, 480, 34, 46
 COLORS = ((68, 1, 84), (59, 82, 139), (33, 145, 140), (94, 201, 98), (253, 231, 37))
-"""Viridis: darker is less, also for eyes that do not tell red from green."""
+"""Colour scale Viridis, dark for small values; also readable with colour blindness."""
 
 
 def zones_picture(report: "MissionReport") -> str:
-    """The zones as SVG: pairs by axis over the whole sky, the richest zone with its stars."""
+    """Draw zones as SVG: pairs by zone axis over the sky, and the richest zone with its stars."""
     height = len(report.zones) * (MAP_HEAD + MAP_HEIGHT + MAP_FOOT)
     parts = [
         (
@@ -67,7 +67,7 @@ def _panel(report: "MissionReport", zone: ZoneCensus) -> list[str]:
 
 
 def _richest(report: "MissionReport", zone: ZoneCensus) -> list[str]:
-    """The outline of the zone with the most pairs, and its stars."""
+    """SVG outline of the zone with the most pairs, and its stars."""
     axis = from_ra_dec(*zone.richest_deg())
     parts = []
     turn = np.radians(np.linspace(0.0, 360.0, 721))
@@ -95,7 +95,7 @@ def _richest(report: "MissionReport", zone: ZoneCensus) -> list[str]:
 
 
 def _projected(ra_deg: Vector, dec_deg: Vector) -> Vector:
-    """Places (n, 2) on the equal-area map of Hammer, right ascension 180 deg in its middle."""
+    """Points (n, 2) on Hammer's equal-area map of the sky, centred on right ascension 180 deg."""
     # A hair inside the edge: 0 and 360 deg are its two sides.
     longitude = np.radians(np.clip(180.0 - ra_deg % 360.01, -179.99, 179.99)) / 2.0
     latitude = np.radians(dec_deg)

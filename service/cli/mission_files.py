@@ -1,4 +1,4 @@
-"""Mission files as text: a whole mission with the origin of each value, and a new short file."""
+"""Text of mission files: a complete one with the origin of every value, and a short new one."""
 
 import json
 import sys
@@ -18,7 +18,7 @@ ORIGIN_COLUMN = 52
 
 
 def whole_text(mission: "Mission", path: Path) -> str:
-    """The mission of a file as a TOML file that states every value, with its origin beside it."""
+    """Complete TOML text of a mission, with the origin of each value as a comment."""
     given = tomllib.loads(path.read_text(encoding="utf-8-sig"))
     origins = _Origins(given, completed(given).origins)
     tables = mission.model_dump(mode="json") | {
@@ -32,13 +32,13 @@ def whole_text(mission: "Mission", path: Path) -> str:
 
 
 class _Origins:
-    """The origins of the values of a mission."""
+    """Finds the origin of each value of a mission: given, derived or default."""
 
     def __init__(self, given: Mapping[str, Any], derived: Mapping[str, str]) -> None:
         self._given, self._derived = given, derived
 
     def of(self, key: str) -> str:
-        """The origin of the value with a dotted key, as a comment."""
+        """Origin of the value with a dotted key, as text of a comment."""
         if self._is_given(key):
             return "given"
         if key in self._derived:
@@ -77,7 +77,7 @@ def _table(name: str, table: Mapping[str, Any], origins: _Origins, prefix: str =
 
 
 def _value(value: Any) -> str:
-    """A value in TOML's notation, which is JSON's for numbers, texts and lists of both."""
+    """Value in TOML notation, equal to JSON for numbers, texts and lists."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_value(each)}" for key, each in value.items()) + " }"
     if isinstance(value, list | tuple):
@@ -87,7 +87,7 @@ def _value(value: Any) -> str:
 
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 ACROSS = {"x": "y", "y": "z", "z": "x"}
-"""The body axis that becomes the tracker's X axis for a boresight along each body axis."""
+"""Body axis used as the tracker's X axis for a boresight along another body axis."""
 QUESTIONS = (
     ("name", "Name of the spacecraft", "MYCUBE"),
     ("field", "Field of view of the tracker in degrees: WIDTHxHEIGHT, or the radius", "8x8"),
@@ -101,13 +101,13 @@ QUESTIONS = (
     ),
     ("sun_axis", "Body axis on the Sun, if only the Sun's direction is known; else nothing", ""),
 )
-"""The options of `acquire mission new`, each with its question and an example."""
+"""Options of `acquire mission new` with their questions and examples."""
 
 
 def asked(parsed: Namespace) -> Namespace:
-    """The options of a new mission, with what is missing asked for on the terminal.
+    """Complete the options of a new mission by asking for missing ones on the terminal.
 
-    Questions go to the standard error, so that the file can be redirected.
+    Questions go to standard error, so that the file can be redirected.
     """
     for name, question, example in QUESTIONS:
         if getattr(parsed, name) is None:
@@ -120,7 +120,7 @@ def asked(parsed: Namespace) -> Namespace:
 
 
 def new_text(parsed: Namespace) -> str:
-    """The file of a new mission, with comments; raises `BadInput` naming the option."""
+    """Text of a new mission file with comments; raises `BadInput` naming the option at fault."""
     for name in ("name", "field", "sigma", "limit"):
         if not getattr(parsed, name):
             option = "NAME" if name == "name" else f"--{name}"
@@ -161,7 +161,7 @@ def _tracker(parsed: Namespace, place: int) -> list[str]:
 
 
 def _of_tracker(values: list[str], place: int) -> str:
-    """The value of a tracker; the last one holds for the trackers after it."""
+    """Value of an option for one tracker; the last value applies to all further trackers."""
     return str(values[min(place, len(values) - 1)])
 
 
@@ -175,7 +175,7 @@ def _field(text: str) -> str:
 
 
 def _axis(option: str, text: str, across: list[float] | None = None) -> list[float]:
-    """The body axis that a text names: x, -x, ..., or three numbers; or one across another."""
+    """Unit vector of a body axis from text: x, -x, ..., or three numbers; or one perpendicular."""
     name = text.lstrip("+-").lower()
     if name in AXES:
         sign = -1.0 if text.startswith("-") else 1.0
@@ -192,7 +192,7 @@ def _axis(option: str, text: str, across: list[float] | None = None) -> list[flo
 
 
 def _perpendicular(axis: list[float]) -> list[float]:
-    """The unit vector across an axis that lies nearest to the body axis farthest from it."""
+    """Unit vector perpendicular to an axis, nearest to the body axis most nearly across it."""
     k = min(range(3), key=lambda place: abs(axis[place]))
     aside = [(1.0 if place == k else 0.0) - axis[k] * axis[place] for place in range(3)]
     norm = sum(each**2 for each in aside) ** 0.5

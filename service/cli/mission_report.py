@@ -1,4 +1,4 @@
-"""The check of a mission file for a terminal, as JSON and as a picture."""
+"""Report of a mission check, as text for a terminal and as JSON."""
 
 import sys
 import textwrap
@@ -30,12 +30,12 @@ if TYPE_CHECKING:
 WIDTH = 96
 SHADES = " .:-=+*#%@"
 FAINTEST_SHARE = 99.0
-"""The percentile of magnitudes that is called the end of a star catalog."""
+"""Percentile of magnitudes taken as the faint limit of a star catalog."""
 
 
 @dataclass(frozen=True)
 class MissionReport:
-    """A mission with all that the check found."""
+    """Results of checking a mission file."""
 
     mission: "Mission"
     run_catalog: RunCatalog
@@ -46,7 +46,7 @@ class MissionReport:
 
 
 def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> MissionReport:
-    """Check a mission with the run catalog of an epoch in years, by default this year's."""
+    """Check a mission with the run catalog of an epoch in years, by default the present year."""
     year = mission.catalog.epoch_of(epoch_of(epoch))
     run_catalog = build_run_catalog(catalog, mission.run_catalog_settings, year)
     wrong = [each for each in axis_findings(mission) if each.level == "wrong"]
@@ -61,7 +61,7 @@ def examined(mission: "Mission", catalog: "Catalog", epoch: float | None) -> Mis
 
 
 def with_expectation(report: MissionReport, catalog: "Catalog", seconds: float) -> MissionReport:
-    """The report with outcomes of views simulated for that long; as it is where it is wrong."""
+    """Add outcomes of views simulated for `seconds`; unchanged if no zones were checked."""
     from service.acquire.kernel_build import KernelBuild
     from service.simulate.expected import expected_outcomes
     from service.sky.cache import LruCache
@@ -78,7 +78,7 @@ def with_expectation(report: MissionReport, catalog: "Catalog", seconds: float) 
 
 
 def epoch_of(epoch: float | None) -> float:
-    """The year of `--epoch`, by default now; raises `BadInput` for one that no batch could have."""
+    """Year of `--epoch`, by default now; raises `BadInput` outside of the supported years."""
     year = utc_now().julian_year if epoch is None else epoch
     if not FIRST_YEAR <= year <= LAST_YEAR + 1:
         message = f"must be from {FIRST_YEAR} to {LAST_YEAR + 1}, as the time of a batch"
@@ -87,7 +87,7 @@ def epoch_of(epoch: float | None) -> float:
 
 
 def refusals(error: Exception, file: Path) -> list[dict[str, str]]:
-    """The faults of a file that cannot be read as a mission, by key."""
+    """Faults of an unreadable mission file, by key."""
     found = []
     for line in str(error).splitlines():
         key, _, text = line.removeprefix(f"{file}: ").partition(": ")
@@ -96,7 +96,7 @@ def refusals(error: Exception, file: Path) -> list[dict[str, str]]:
 
 
 def report_json(report: MissionReport) -> dict[str, Any]:
-    """The report as plain values."""
+    """Report of a mission check as plain values, for JSON."""
     ra_deg, dec_deg = axes_deg()
     return {
         "mission": report.mission.name,
@@ -127,7 +127,7 @@ def report_json(report: MissionReport) -> dict[str, Any]:
 
 
 def report_text(report: MissionReport) -> str:
-    """The report as lines of text, with a map of the pairs of each shape of zone."""
+    """Report of a mission check as text, with a map of pairs for each shape of zone."""
     mission, stars = report.mission, len(report.run_catalog)
     lines = [
         (
@@ -159,7 +159,7 @@ def report_text(report: MissionReport) -> str:
 
 
 def _sentences(report: MissionReport) -> list[str]:
-    """What the mission can do, in sentences."""
+    """Capabilities of a mission, in sentences."""
     mission, zone = report.mission, report.mission.zone
     lines = [
         f"{view.tracker} sees {FEW_STARS} stars or more in {100.0 * (1.0 - view.few_share):.0f} % "
@@ -192,7 +192,7 @@ def _sentences(report: MissionReport) -> list[str]:
 
 
 def _share(expected: "Expected", outcome: str) -> str:
-    """A share of the stars; its interval counts views, whose stars are not independent."""
+    """Share of stars in percent with its interval; views count, as their stars are correlated."""
     found = wilson(expected.share(outcome), expected.views)
     low, high = (f"{100.0 * each:.1f}" for each in (found.low, found.high))
     return f"{100.0 * found.value:.1f} % ({low} to {high})"
@@ -206,7 +206,7 @@ def _row(title: str, of: Any) -> str:
 
 
 def _map(zone: ZoneCensus) -> list[str]:
-    """Pairs by the direction of the zone's axis, a character each."""
+    """Map of pairs by the direction of the zone's axis, one character per direction."""
     _, dec_deg = axes_deg()
     most = max(1, zone.spread["pairs"].most)
     shade = np.minimum(zone.pairs * len(SHADES) // most, len(SHADES) - 1).astype(int)

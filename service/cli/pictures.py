@@ -1,4 +1,4 @@
-"""`acquire frame` without a spacecraft: pictures from any camera, solved in this process."""
+"""Solution of pictures from any camera in this process, for `acquire frame`."""
 
 import json
 import sys
@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 FEW_NAMES = 12
 LEAST_MEGAPIXELS = 64
-"""A picture on this computer may be larger than what a service accepts from a client."""
+"""Least limit in megapixels for pictures on this computer, higher than for uploads."""
 
 
 def solve_pictures(parsed: Namespace, settings: Settings) -> int:
-    """Solve every file and print its result; 1 where one was refused or has no attitude."""
+    """Solve each picture file and print its result; returns 1 if any fails, otherwise 0."""
     from service.acquire.picture import blind_sky, solve_picture
     from service.contract.pictures import picture_of
     from service.sky.catalog.star_catalog import open_catalog
@@ -58,7 +58,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
 def picture_reader(
     dark_file: Path | None, settings: Settings, image: str | None = None
 ) -> "Callable[[Path, tuple[int, int] | None], Frame]":
-    """A function that reads a picture, of a shape if one is given, less the dark frame."""
+    """Create a function that reads a picture, checks its shape and subtracts the dark frame."""
     from service.imaging.detection.points import without_dark
     from service.imaging.frames.files import read_frame
     from service.imaging.frames.frame import FrameLimits
@@ -79,7 +79,7 @@ def picture_reader(
 
 
 def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | None:
-    """The rough focal length that the options tell, None without any."""
+    """Approximate focal length in pixels from the options; None without any."""
     from service.identify.blind.solver import focal_px_of
 
     if parsed.focal_px is not None:

@@ -1,10 +1,10 @@
-"""Tables as text."""
+"""Tables in Markdown."""
 
 from collections.abc import Iterable, Sequence
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table with aligned columns, the first to the left and the others to the right."""
+    """Markdown table with aligned columns, the first left-aligned and the others right-aligned."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[k]) for row in table) for k in range(len(header))]
     rule = ["-" * widths[0], *("-" * (width - 1) + ":" for width in widths[1:])]

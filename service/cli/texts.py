@@ -1,4 +1,4 @@
-"""Compared runs and the progress of one as text for a terminal."""
+"""Text for a terminal about reprocessed runs and their comparison."""
 
 from service.contract.runs import RunComparison, RunTransition
 from service.ingest.reprocess import ReprocessProgress
@@ -10,7 +10,7 @@ WORDS = {"good": "attitudes good", "suspect": "attitudes suspect", "none": "no a
 
 
 def progress_text(progress: ReprocessProgress) -> str:
-    """The number of processed batches."""
+    """Number of processed batches, as text for a terminal."""
     done = (
         f"{progress.recorded} recorded, {progress.before} there already, {progress.refused} refused"
     )
@@ -18,7 +18,7 @@ def progress_text(progress: ReprocessProgress) -> str:
 
 
 def comparison_text(compared: RunComparison) -> str:
-    """The stars and attitudes of both runs."""
+    """Stars and attitudes of two compared runs, as text for a terminal."""
     stars, attitudes = compared.stars, compared.attitudes
     observed = stars.observed or 1
     lines = [

@@ -1,4 +1,4 @@
-"""`acquire token`: in the database itself, or through the service that writes to its file."""
+"""Token commands, in the database or through a service that writes to its SQLite file."""
 
 import getpass
 import sys
@@ -29,21 +29,21 @@ TIMEOUT_S = 30.0
 
 
 class Refused(errors.AcquisitionError):
-    """The service refused the request; the message is its own."""
+    """Raised if the service refuses a request about tokens, with the message of the service."""
 
 
 class TokenService(Protocol):
-    """Makes and revokes tokens."""
+    """Interface to create and revoke access tokens."""
 
     def add(self, name: str, scopes: Collection[str], **more: Any) -> NewToken:
-        """Make a token; `more` are the keywords of `Tokens.add`."""
+        """Create an access token; `more` are keywords of `Tokens.add`."""
 
     def revoke(self, name: str) -> Token:
-        """End a token."""
+        """Revoke an access token."""
 
 
 def create_token(parsed: Namespace) -> int:
-    """Make a token and print it; the way to use it goes to the standard error output."""
+    """Create an access token and print it; instructions go to standard error."""
     days, spacecraft = parsed.days, parsed.spacecraft
     if days > MAX_DAYS:
         raise errors.BadInput(
@@ -64,7 +64,7 @@ def create_token(parsed: Namespace) -> int:
 
 
 def print_tokens(settings: Settings, as_json: bool) -> int:
-    """Print every token without its secret."""
+    """Print all access tokens without their secrets."""
     with closing(Readers(settings.database)) as readers:
         rows = Tokens(_Direct(readers, None), {}).all()
     if as_json:
@@ -84,7 +84,7 @@ def print_tokens(settings: Settings, as_json: bool) -> int:
 
 @contextmanager
 def opened_tokens(settings: Settings, url: str, create: bool = False) -> Iterator[TokenService]:
-    """The tokens of the database, or of the service that alone writes to its file."""
+    """Open the tokens of the database, or of a running service that owns its SQLite file."""
     file = database_file(database_url(settings.database))
     if file is not None and file.path.exists() and is_written(file):
         with http_client(settings, url, TIMEOUT_S) as client:
@@ -95,14 +95,14 @@ def opened_tokens(settings: Settings, url: str, create: bool = False) -> Iterato
 
 
 class _Direct:
-    """The database for `Tokens`; changes are signed by the user of this machine."""
+    """Database access for `Tokens` by a command; changes are attributed to the local user."""
 
     def __init__(self, readers: Readers, store: Store | None) -> None:
         self.reading = readers.reading
         self._store = store
 
     def change_audited(self, change: Callable[[Connection], Any], entry: Entry | None) -> Any:
-        """Change the database in one transaction, with an entry in the audit list."""
+        """Change the database in one transaction, with an audit entry."""
         assert self._store is not None
 
         def audited(connection: Connection) -> Any:

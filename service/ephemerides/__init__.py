@@ -1,1 +1,1 @@
-"""Attitudes and orbits as other programs give them: AEM, ACM, C-kernels, CSV; OEM, OMM, TLE."""
+"""Readers of attitude files (AEM, ACM, C-kernels, CSV) and orbit files (OEM, OMM, TLE)."""

@@ -1,7 +1,7 @@
-"""Reads ACM version 2 (CCSDS 504.0-B-2), KVN and XML: the attitude states of a spacecraft's body.
+"""Reader of ACM version 2 (CCSDS 504.0-B-2), KVN and XML: attitude states of a spacecraft body.
 
 Blocks of states are read as Orekit reads them.  Orbits, physical properties, covariances,
-manoeuvres and the description of the determination are passed over.
+manoeuvres and descriptions of attitude determination are skipped.
 """
 
 import math
@@ -39,9 +39,9 @@ _RATES: dict[str, AttitudeType] = {
 _FIRST_NS = ccsds.epoch_ns(f"{FIRST_YEAR}-01-01T00:00:00", "TAI")
 _LAST_NS = ccsds.epoch_ns(f"{LAST_YEAR}-12-31T23:59:59", "TAI")
 _NO_RATES = {"": 0, "NONE": 0, "GYRO_BIAS": 3}
-"""Numbers that a state has in place of a rate."""
+"""Number of values in a state for each RATE_TYPE that is not a rate."""
 TRUE_BASES = ("", "DETERMINED_GND", "DETERMINED_OBC", "SIMULATED")
-"""The values of ATT_BASIS whose attitudes are no prediction; empty where the block says nothing."""
+"""Values of ATT_BASIS for attitudes that are not predicted; empty if the file gives none."""
 _BLOCKS = ("ORB", "PHYS", "COV", "MAN", "AD", "SENSOR", "USER")
 _HEADER = ("CLASSIFICATION", "CREATION_DATE", "ORIGINATOR", "MESSAGE_ID")
 _METADATA = (
@@ -69,7 +69,7 @@ _FORM = ccsds.MessageForm(
 
 
 def read_acm(name: str, file: IO[bytes]) -> KnownAttitudes:
-    """The attitudes of a message; raises `BadFile` naming file, line and field."""
+    """Read the attitudes of an ACM message; raises `BadFile` naming file, line and field."""
     return _Reader(ccsds.Source(name)).read(file)
 
 
@@ -117,7 +117,7 @@ class _Reader(ccsds.MessageReader):
     def _segment(
         self, metadata: ccsds.Metadata, tokens: Iterator[ccsds.Token], line: int
     ) -> Segment:
-        """The states of a block, to ATT_STOP."""
+        """Read the states of an attitude block, up to ATT_STOP."""
         block = ccsds.Metadata(self._source, line)
         times: list[int] = []
         states: list[list[float]] = []
@@ -159,7 +159,7 @@ class _Reader(ccsds.MessageReader):
             raise self._source.bad(token.line, "matrix", message, state[:9])
 
     def _size(self, block: ccsds.Metadata) -> int:
-        """The numbers of a state after its time."""
+        """Number of values in a state, without its time."""
         block.require(("REF_FRAME_A", "REF_FRAME_B", "ATT_TYPE"))
         block.one_of("ATT_TYPE", tuple(_TYPES))
         rate = block.values.get("RATE_TYPE", "").upper()
@@ -174,7 +174,7 @@ class _Reader(ccsds.MessageReader):
         return size
 
     def _time_ns(self, metadata: ccsds.Metadata, token: ccsds.Token) -> int:
-        """The time of a state, which is absolute, or in seconds after EPOCH_TZERO."""
+        """Time of a state, given as UTC or in seconds after EPOCH_TZERO."""
         time_system = metadata.time_system()
         word = token.words[0]
         if "T" in word.upper():

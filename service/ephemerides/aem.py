@@ -1,10 +1,10 @@
-"""Reads AEM versions 1 and 2 (CCSDS 504.0-B), KVN and XML: attitudes of a spacecraft's body.
+"""Reader of AEM versions 1 and 2 (CCSDS 504.0-B), KVN and XML: attitudes of a spacecraft body.
 
 Quaternions, Euler angles and spin, with their rates: see `attitude_types`.
 
-Version 1 says by ATTITUDE_DIR and QUATERNION_TYPE which way a quaternion transforms and where
-its scalar stands; in version 2 it transforms from REF_FRAME_A to REF_FRAME_B and has the scalar
-last, and a file that has either keyword is refused.
+In version 1 ATTITUDE_DIR and QUATERNION_TYPE give the direction of a quaternion and the place of
+its scalar; in version 2 quaternions are from REF_FRAME_A to REF_FRAME_B with the scalar last, and a
+file with either keyword is refused.
 """
 
 import math
@@ -37,8 +37,9 @@ _TYPES = {
     "SPIN/NUTATION": AttitudeType("spin", "nutation"),
     "SPIN/NUTATION_MOM": AttitudeType("spin", "momentum"),
 }
-"""The types of attitudes, which files of either version mix: /RATE is of version 1, /DERIVATIVE of
-Euler angles, /ANGVEL and /NUTATION_MOM are of version 2."""
+"""Attitude types of AEM, which files of either version mix: /RATE is of version 1, /DERIVATIVE of
+Euler angles, /ANGVEL and /NUTATION_MOM are of version 2.
+"""
 _UNITS = {
     "EPOCH": "",
     "RATE": "deg/s",
@@ -47,7 +48,7 @@ _UNITS = {
     "DOT": "deg/s",
     "PER": "s",
 }
-"""The unit of an XML element by a part of its name; all others are in degrees."""
+"""Unit of an XML element, by a part of its name; all others are in degrees."""
 _RATE_FRAMES = ("RATE_FRAME", "ANGVEL_FRAME")
 _HEADER = ("CREATION_DATE", "ORIGINATOR", "MESSAGE_ID", "CLASSIFICATION")
 _REQUIRED = (
@@ -75,7 +76,7 @@ _METADATA = (
 
 @dataclass(frozen=True)
 class _Form:
-    """How the states of a segment are read."""
+    """Layout of a segment's states: time system, attitude type, frames, place of the scalar."""
 
     line: int
     time_system: str
@@ -86,7 +87,7 @@ class _Form:
 
 
 def read_aem(name: str, file: IO[bytes]) -> KnownAttitudes:
-    """The attitudes of a message; raises `BadFile` naming file, line and field."""
+    """Read the attitudes of an AEM message; raises `BadFile` naming file, line and field."""
     return _Reader(ccsds.Source(name)).read(file)
 
 
@@ -173,13 +174,13 @@ class _Reader(ccsds.MessageReader):
         )
 
     def _sequence(self, metadata: ccsds.Metadata, type: AttitudeType) -> str:
-        """The axes of Euler angles, such as ZXZ; empty where the type has none."""
+        """Axes of the Euler angles, such as ZXZ; empty for a type without Euler angles."""
         if type.attitude != "euler" and "EULER_ROT_SEQ" not in metadata.values:
             return ""
         return ccsds.euler_sequence(metadata) if "euler" in (type.attitude, type.rates) else ""
 
     def _rate_in_body(self, metadata: ccsds.Metadata, from_body: bool) -> bool:
-        """True if components of an angular velocity are about the axes of the body."""
+        """True if the angular velocity has components about the body axes."""
         name = next((each for each in _RATE_FRAMES if each in metadata.values), None)
         if name is None:
             return True
@@ -215,7 +216,7 @@ class _Reader(ccsds.MessageReader):
         return time_ns, tuple(numbers)
 
     def _named(self, token: ccsds.Token, form: _Form) -> tuple[str, ...]:
-        """The words of an XML state, in the order of those of a text state."""
+        """Values of an XML state, in the order of a KVN state."""
         assert token.names is not None
         wanted = [("EPOCH",), *form.type.names(form.frames.sequence)]
         for name in set(token.names):
@@ -245,14 +246,14 @@ class _Reader(ccsds.MessageReader):
 
 
 def _unit_of(name: str) -> str:
-    """The unit of an XML element."""
+    """Unit of an XML element of a state."""
     if name.startswith("Q"):
         return "1/s" if name.endswith("_DOT") else ""
     return next((unit for end, unit in _UNITS.items() if end in name.split("_")), "deg")
 
 
 def _scalar_last(numbers: list[float]) -> list[float]:
-    """The quaternion, and its derivative where there is one, with the scalar last."""
+    """Move the scalar of a quaternion, and of its derivative if given, to the end."""
     parts = [numbers[first : first + 4] for first in range(0, len(numbers) - 3, 4)]
     turned = [each for part in parts for each in (*part[1:], part[0])]
     return turned + numbers[len(turned) :]

@@ -1,9 +1,9 @@
-"""Reads attitudes as comma-separated values, such as the service exports them.
+"""Reader of attitudes as comma-separated values, such as the service exports.
 
-A row is a time of UTC and the quaternion q1, q2, q3, qc from inertial to body, its scalar last.
-Rates of the body in deg/s and the number of the unbroken stretch are read where there are columns
-for them, rows of another status than good are left out, and other columns are passed over.
-Without that number a step of more than ten minutes ends a stretch.
+A row has UTC and the quaternion q1, q2, q3, qc from inertial to body, scalar last.  Body rates in
+deg/s and the number of the unbroken interval are read from columns if present; rows with another
+status than good and other columns are skipped.  Without interval numbers a step of more than ten
+minutes ends an interval.
 """
 
 import csv
@@ -33,12 +33,12 @@ _Row = tuple[int, str, list[float], list[float]]
 
 
 def is_attitude_csv(start: bytes) -> bool:
-    """True if a file that begins so has a column of quaternions."""
+    """True if the beginning of a file is a CSV header with columns of a quaternion."""
     return _HEADER.search(start) is not None
 
 
 def read_attitude_csv(name: str, file: IO[bytes]) -> KnownAttitudes:
-    """The attitudes of a file; raises `BadFile` naming file, line and column."""
+    """Read attitudes from a CSV file; raises `BadFile` naming file, line and column."""
     source = Source(name)
     segments: list[Segment] = []
     rows: list[_Row] = []
@@ -74,7 +74,7 @@ def _segment(line: int, rows: list[_Row]) -> Segment:
 def _rows(
     source: Source, file: IO[bytes]
 ) -> Iterator[tuple[int, str, int, list[float], list[float]]]:
-    """The line, stretch, time, quaternion and rates (NaN: none) of each good row."""
+    """Line, interval, time, quaternion and rates (NaN if missing) of each good row."""
     names: list[str] = []
     for line, cells in _cells(source, file):
         if not names:
@@ -111,7 +111,7 @@ def _number(source: Source, line: int, row: dict[str, str], column: str) -> floa
 
 
 def _cells(source: Source, file: IO[bytes]) -> Iterator[tuple[int, list[str]]]:
-    """The cells of the lines that are not empty, with their numbers."""
+    """Cells of all lines that are not empty, with line numbers."""
     number = 0
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1

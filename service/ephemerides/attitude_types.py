@@ -1,8 +1,8 @@
-"""The types in which CCSDS messages give attitudes, as quaternions and rates of the body.
+"""Conversion of CCSDS attitude types to quaternions and body rates.
 
-A state transforms from frame A to frame B, of which one is the body.  Euler angles turn the axes
-one after the other, in the order of their sequence; spin types give the direction of the body's
-Z axis and the phase about it.  Read as Orekit reads them.
+A state transforms from frame A to frame B, one of which is the body.  Euler angles rotate the axes
+in the order of their sequence; spin types give the direction of the body's Z axis and the phase
+about it.  Types are interpreted as in Orekit.
 """
 
 import itertools
@@ -26,7 +26,7 @@ SEQUENCES = tuple(
     for axes in itertools.product("XYZ", repeat=3)
     if len(set(axes[:2])) == len(set(axes[1:])) == 2
 )
-"""Axes of three turns of which no two in a row are about the same."""
+"""Valid Euler sequences: three axes, no two consecutive ones the same."""
 _SIZES = {"quaternion": 4, "euler": 3, "spin": 3, "dcm": 9}
 _RATE_SIZES = {"none": 0, "q_dot": 4, "euler": 3, "angvel": 3, "spin": 1, "nutation": 4}
 _RATE_SIZES["momentum"] = 4
@@ -35,18 +35,18 @@ _AXES = np.eye(3)
 
 @dataclass(frozen=True)
 class AttitudeType:
-    """The numbers of a state: those of the attitude, then those of the rate."""
+    """Representation of a state: the values of the attitude, followed by those of the rate."""
 
     attitude: Attitude
     rates: Rates = "none"
 
     @property
     def size(self) -> int:
-        """How many numbers a state has."""
+        """Number of values in a state."""
         return _SIZES[self.attitude] + _RATE_SIZES[self.rates]
 
     def names(self, sequence: str) -> list[tuple[str, ...]]:
-        """The elements of an XML state, in the order of the numbers of a text state.
+        """Names of the XML elements of a state, in the order of a KVN state.
 
         Version 2 numbers Euler angles, version 1 names them after the axes of the `sequence`.
         """
@@ -71,11 +71,11 @@ class AttitudeType:
 
 @dataclass(frozen=True)
 class Frames:
-    """How states relate the body to inertial axes.
+    """Relation between body and inertial axes in the states of a file.
 
     `sequence` are the axes of Euler angles.  `from_body` is true if frame A is the body, and
-    `is_inverse` if a state transforms from body to inertial.  `rate_in_body`: the components of
-    an angular velocity are about the body's axes, else about inertial ones.
+    `is_inverse` if a state transforms from body to inertial.  `rate_in_body`: angular velocities
+    have components about the body's axes, otherwise about inertial ones.
     """
 
     sequence: str = ""
@@ -87,10 +87,10 @@ class Frames:
 def body_attitudes(
     type: AttitudeType, numbers: Vector, frames: Frames
 ) -> tuple[Vector, Vector | None]:
-    """The attitudes (n, 4), inertial to body, and rates (n, 3) of states (n, `type.size`).
+    """Attitudes (n, 4), inertial to body, and rates (n, 3) from states (n, `type.size`).
 
-    The quaternions of states have the scalar last.  Rates are of the body relative to inertial
-    in body axes, rad/s; None where the type has none.
+    Quaternions of states have the scalar last.  Rates are of the body relative to inertial in body
+    axes, rad/s; None if the type has none.
     """
     size = _SIZES[type.attitude]
     given, more = numbers[:, :size], numbers[:, size:]
@@ -107,7 +107,7 @@ def body_attitudes(
 
 
 def _components(q: Vector, vectors: Vector) -> Vector:
-    """The components (n, 3) after the transforms (n, 4) of those before."""
+    """Components (n, 3) of vectors after transforms by quaternions (n, 4)."""
     return np.asarray(np.einsum("nij,nj->ni", attitude_matrices(q), vectors))
 
 
@@ -148,7 +148,7 @@ _TRANSFORMS = {
 
 
 def _rates(type: AttitudeType, q: Vector, more: Vector, given: Vector, sequence: str) -> Vector:
-    """The angular velocity (n, 3) of frame B relative to A, about the axes of B."""
+    """Angular velocity (n, 3) of frame B relative to A, about the axes of B, in rad/s."""
     if type.rates == "q_dot":
         norm = np.linalg.norm(given, axis=1)[:, None]
         return _of_derivative(q, more / norm)
@@ -186,7 +186,7 @@ def _euler_angles(q: Vector, sequence: str) -> Vector:
 
 
 def _of_euler_rates(angles_rad: Vector, rates_rad_s: Vector, sequence: str) -> Vector:
-    """Each turn's rate about its axis, carried through the turns that follow."""
+    """Angular velocity from Euler angle rates: each about its axis, rotated by later angles."""
     total = np.zeros_like(rates_rad_s)
     for place, letter in enumerate(sequence):
         axis = _AXES["XYZ".index(letter)]

@@ -1,9 +1,9 @@
-"""Reads C-kernels of types 1 and 3 through CSPICE, in a child process: CSPICE is global.
+"""Reader of C-kernels of types 1 and 3 through CSPICE, in a child process: CSPICE is global.
 
-SPICE's quaternion is scalar-first and the conjugate of ours.  Each interpolation interval is a
-segment, of type 1 each segment, of which only the records are known.  Where intervals overlap,
-that of the later segment of the file has priority, as SPICE has it.  Leap seconds come from
-ERFA's table unless a kernel of them is given.
+SPICE's quaternion is scalar-first and the conjugate of ours.  Each interpolation interval becomes a
+segment; for type 1 each segment, known at its records only.  Where intervals overlap, a later
+segment of the file has priority, as in SPICE.  Leap seconds come from ERFA's table unless a
+leap-second kernel is given.
 """
 
 import json
@@ -24,22 +24,22 @@ from service.table_files.spool import PIECE_BYTES, folder
 from service.vectors import attitude_matrices
 
 CHILD_S = 600.0
-"""The longest that the child may take."""
+"""Time limit of the child process in seconds."""
 MAX_UNPACKED_BYTES = 1 << 30
 _CHILD = Path(__file__).with_name("ck_reader_child.py")
 _UNPACKING = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError),
     *(EOFError, OSError, RuntimeError, UnicodeDecodeError),
 )
-"""The errors that a damaged zip file raises: a name that is no UTF-8 is among its causes."""
+"""Exceptions raised for a damaged zip file, for example by a name that is not UTF-8."""
 _KERNELS = (".tsc", ".tls")
-"""Clocks and leap seconds, the kernels that reading takes."""
+"""Suffixes of clock and leap-second kernels, needed to read a C-kernel."""
 
 
 def read_ck(file: Path, field: str = "file") -> known.KnownAttitudes:
-    """The attitudes of a C-kernel with its clock beside it, or of a zip file with both.
+    """Read a C-kernel with its clock kernel next to it, or a zip file with both.
 
-    Raises `BadFile` naming the file, and `NotAvailable` where spiceypy is missing.
+    Raises `BadFile` naming the file, and `NotAvailable` without spiceypy.
     """
     require_extra("spice", "spiceypy", field, file.name)
     with folder() as temporary:
@@ -55,7 +55,7 @@ def read_ck(file: Path, field: str = "file") -> known.KnownAttitudes:
 
 
 def _linked(file: Path, place: Path) -> tuple[str, list[str]]:
-    """The names of the kernel and of those beside it: SPICE takes only short paths."""
+    """Link a C-kernel and its neighbours under short names, since SPICE limits path lengths."""
     beside = sorted(each for each in file.parent.iterdir() if each.suffix.lower() in _KERNELS)
     names = [f"k{number}{each.suffix.lower()}" for number, each in enumerate(beside)]
     for name, each in zip(["attitude.bc", *names], [file, *beside], strict=True):
@@ -64,7 +64,7 @@ def _linked(file: Path, place: Path) -> tuple[str, list[str]]:
 
 
 def _unpacked(file: Path, place: Path) -> tuple[str, list[str]]:
-    """The names of the kernels of a zip file, unpacked under names of our own."""
+    """Unpack the kernels of a zip file under generated names."""
     found: dict[str, list[str]] = {suffix: [] for suffix in (".bc", *_KERNELS)}
     room = MAX_UNPACKED_BYTES
     try:

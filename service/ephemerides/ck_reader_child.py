@@ -1,4 +1,4 @@
-"""Reads C-kernels of types 1 and 3; run as a program of its own, because CSPICE is global.
+"""Program that reads C-kernels of types 1 and 3, run as a child process.
 
     python ck_reader_child.py OUT MOST CK KERNEL...
 
@@ -19,14 +19,14 @@ import spiceypy as spice
 
 Floats = np.ndarray[Any, np.dtype[np.float64]]
 DISCRETE, CONTINUOUS = 1, 3
-"""The types that are read."""
+"""Types of C-kernel segments that are read."""
 J2000 = 1
 INERTIAL = range(1, 22)
-"""SPICE's inertial frames, each at a fixed rotation from J2000."""
+"""Ids of SPICE's inertial frames, which have fixed rotations from J2000."""
 
 
 class Refused(Exception):
-    """A kernel that cannot be read, in words."""
+    """Raised for a kernel that cannot be read, with the reason."""
 
 
 def segments(handle: int) -> list[list[int]]:
@@ -39,7 +39,7 @@ def segments(handle: int) -> list[list[int]]:
 
 
 def records_of(handle: int, kind: int, begin: int, end: int, rates: int) -> "tuple[Floats, Floats]":
-    """Records (n, 8) of a segment, clock first, and the clock at the start of its intervals."""
+    """Records (n, 8) of a segment, clock first, and the clock times at which intervals start."""
     # The layouts of types 1 and 3 ("CK Required Reading"): packets, times, directory of times,
     # of type 3 starts of intervals, directory of starts, number of intervals; number of packets.
     size = 7 if rates else 4
@@ -60,7 +60,7 @@ def records_of(handle: int, kind: int, begin: int, end: int, rates: int) -> "tup
 
 
 def from_j2000(frame: int, records: Floats) -> Floats:
-    """The records with quaternions and rates of another inertial frame from J2000."""
+    """Convert quaternions and rates of records from another inertial frame to J2000."""
     if frame == J2000:
         return records
     matrix = np.array(spice.pxform("J2000", spice.frmnam(frame), 0.0))
@@ -71,7 +71,7 @@ def from_j2000(frame: int, records: Floats) -> Floats:
 
 
 def main() -> None:
-    """Read the kernel and write what it holds."""
+    """Read the kernel given as argument and write its records and intervals."""
     out, most, ck, *kernels = sys.argv[1:]
     for each in (*kernels, ck):
         spice.furnsh(each)

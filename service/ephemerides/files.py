@@ -1,4 +1,4 @@
-"""Attitudes, or positions and velocities, of a file, whatever its format."""
+"""Reader of attitude and orbit files in any supported format, recognised by content."""
 
 import gzip
 import re
@@ -38,14 +38,14 @@ READ = (
     "AEM or ACM (CCSDS 504.0-B, KVN or XML), C-kernel (.bc with its clock beside it, or .zip), CSV "
     "as `acquire export` writes, or the truth that `acquire simulate telemetry` writes (NDJSON)"
 )
-"""The formats that are read, for people."""
+"""Names of the attitude formats that can be read, for messages."""
 
 
 def read_attitudes(file: Path, field: str) -> KnownAttitudes:
-    """The attitudes of a file, recognised by its first bytes; it may be packed with gzip.
+    """Read attitudes from a file in any format, also packed with gzip.
 
-    Raises `BadInput` naming `field` where it cannot be opened, and `BadFile` naming file, line
-    and field where it is not as its format has it.
+    Raises `BadInput` naming `field` if the file cannot be opened, and `BadFile` naming file, line
+    and field if the content is invalid.
     """
     with _opened(file, field) as opened:
         start = _start(opened)
@@ -62,7 +62,7 @@ def read_attitudes(file: Path, field: str) -> KnownAttitudes:
 
 @contextmanager
 def _opened(file: Path, field: str) -> Iterator[IO[bytes]]:
-    """A file as it is, or unpacked where it begins as gzip does."""
+    """Open a file, unpacking it if packed with gzip."""
     try:
         with file.open("rb") as opened:
             is_packed = opened.read(3) == b"\x1f\x8b\x08"
@@ -79,14 +79,14 @@ def _opened(file: Path, field: str) -> Iterator[IO[bytes]]:
 
 
 def _require_text(file: Path, start: bytes, marks: tuple[bytes, ...], read: str) -> None:
-    """Raise `BadFile` where a file does not begin with one of the marks, if there are some."""
+    """Raise `BadFile` for binary content, or a file that does not begin with one of the marks."""
     if b"\0" in start or start.startswith(b"SIMPLE  =") or (marks and not start.startswith(marks)):
         message = f"is of no format that is read here; there are {read}"
         raise BadFile(Fault(f"{file.name}, line 1", message, shown_value(start[:40])))
 
 
 class _Truth(msgspec.Struct):
-    """The fields of a line of simulated truth that are read."""
+    """Fields of a line of simulated truth that are read."""
 
     spacecraft: str
     time: str
@@ -94,7 +94,7 @@ class _Truth(msgspec.Struct):
 
 
 def _read_truth(file: str, opened: IO[bytes]) -> KnownAttitudes:
-    """The attitudes of a simulated pass, whose lines are in order of time."""
+    """Read the true attitudes of a simulated pass, whose lines are in order of time."""
     decoder = msgspec.json.Decoder(_Truth)
     read: list[_Truth] = []
     while line := opened.readline(MAX_LINE_BYTES + 1):
@@ -116,17 +116,17 @@ def _read_truth(file: str, opened: IO[bytes]) -> KnownAttitudes:
 
 
 def _start(file: IO[bytes]) -> bytes:
-    """The beginning of a file, of which the whole is left to read, without what stands before."""
+    """First bytes of a file without leading blanks and comments; the file is rewound."""
     start = file.read(_LOOKED_AT_BYTES).lstrip(b"\xef\xbb\xbf \t\r\n")
     file.seek(0)
     return _COMMENTS.sub(b"", start)
 
 
 def read_ephemeris(file: Path, field: str) -> Ephemeris:
-    """The ephemeris of a file: an OEM (KVN or XML), an OMM, else two-line element sets.
+    """Read an ephemeris: an OEM (KVN or XML), an OMM, otherwise two-line element sets.
 
-    Raises `BadInput` naming `field` where it cannot be opened, and `BadFile` naming file, line
-    and field where it is not as its format has it.
+    Raises `BadInput` naming `field` if the file cannot be opened, and `BadFile` naming file, line
+    and field if the content is invalid.
     """
     with _opened(file, field) as opened:
         start = _start(opened)

@@ -1,4 +1,4 @@
-"""Attitudes or orbital states that a file gives in spans of time, and the one at a moment."""
+"""Attitudes or orbital states from a file, interpolated at a given time."""
 
 from bisect import bisect_left
 from collections.abc import Sequence
@@ -15,20 +15,20 @@ from service.times import Utc
 from service.vectors import Vector, rotation_vectors
 
 MOST_RECORDS = 5_000_000
-"""Attitudes that are held in memory, 40 bytes each, or 64 with rates."""
+"""Greatest number of attitudes held in memory, 40 bytes each, or 64 with rates."""
 
 CLOCK_NS = 200
-"""A time that went through a kernel's clock and ET comes back this near."""
+"""Rounding error in nanoseconds of a time converted through a kernel's clock and ET."""
 DISCRETE_NS = 1_000_000
-"""A moment this near to a record is that of the record, where nothing is known between."""
+"""Nanoseconds from a record within which it applies, if nothing is known between records."""
 
 STILL_RAD = 1e-5
-"""Rates of zeros are none where the body turns by more from one record to the next."""
+"""Rotation in radians between records above which rates of zero count as missing."""
 
 
 @dataclass(frozen=True)
 class Span:
-    """Records that are valid from one time to another, `Utc.tai_ns`; some may lie beyond both.
+    """Records valid in a span of time, `Utc.tai_ns`; some records may lie outside.
 
     `place` names the span in messages.  The times of the records ascend.
     """
@@ -41,11 +41,11 @@ class Span:
 
 @dataclass(frozen=True)
 class Segment(Span):
-    """Attitudes, quaternions (n, 4) of norm 1, between which it may be interpolated.
+    """Attitudes of a span, quaternions (n, 4) of norm 1, to interpolate between.
 
-    `rate_rad_s` (n, 3) are the rates of the body relative to inertial, in body axes; None where
-    the file gives none.  Of a `discrete` segment nothing is known between two records.  `basis`
-    is how the file says that the attitudes came about, such as PREDICTED.
+    `rate_rad_s` (n, 3) are the rates of the body relative to inertial, in body axes; None if the
+    file gives none.  A `discrete` segment is known at its records only.  `basis` is the origin of
+    the attitudes as the file names it, such as PREDICTED.
     """
 
     quaternion: Vector
@@ -54,11 +54,11 @@ class Segment(Span):
     basis: str = ""
 
     def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
-        """The attitudes (n, 4) at moments (n,); NaN outside the segment and where none is known.
+        """Attitudes (n, 4) at times (n,); NaN outside of the segment and where unknown.
 
-        See `interpolation` for what is known between two records.  Rates (n, 3) about
-        the body axes, of another source, count for moments between records that have none, if the
-        body makes more than a quarter turn at them.
+        Interpolation between records is described in `interpolation`.  Rates (n, 3) about the body
+        axes from another source are used between records without rates, if the body makes more than
+        a quarter turn at them.
         """
         # A kernel's clock may put a record some nanoseconds off its moment.
         moment = time_ns.clip(self.first_ns, self.last_ns)
@@ -81,7 +81,7 @@ class Segment(Span):
         q[~steps.is_known] = np.nan
         if self.discrete:
             q[:] = np.nan
-        # Where a record is, it is given as it stands.
+        # At the time of a record, return that record unchanged.
         for place in (before, after):
             apart_ns = np.abs(self.time_ns[place] - moment)
             is_there = apart_ns <= (DISCRETE_NS if self.discrete else CLOCK_NS)
@@ -92,7 +92,7 @@ class Segment(Span):
 
 @dataclass(frozen=True)
 class KnownAttitudes:
-    """The attitudes of one object in a file: segments in order of time that do not overlap."""
+    """Attitudes of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[Segment]
@@ -101,11 +101,11 @@ class KnownAttitudes:
         return sum(len(each.time_ns) for each in self.segments)
 
     def of_basis(self, bases: Sequence[str]) -> Self:
-        """The segments of these bases."""
+        """Segments whose basis is one of `bases`."""
         return replace(self, segments=[each for each in self.segments if each.basis in bases])
 
     def at(self, time_ns: Integers, rate_rad_s: Vector | None = None) -> Vector:
-        """The attitudes (n, 4) at moments (n,); NaN where none is known; see `Segment.at`."""
+        """Attitudes (n, 4) at times (n,); NaN where unknown; see `Segment.at`."""
         starts = np.array([each.first_ns for each in self.segments], dtype=np.int64)
         place = np.searchsorted(starts, time_ns + SAME_MOMENT_NS, side="right") - 1
         found = np.full((len(time_ns), 4), np.nan)
@@ -117,7 +117,7 @@ class KnownAttitudes:
 
 
 def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
-    """The rates (n, 3) of attitudes (n, 4); None where all are zero although the body turns."""
+    """Rates (n, 3) of attitudes (n, 4); None if all are zero although the body turns."""
     if rate_rad_s is None or rate_rad_s.any() or len(quaternion) < 2:
         return rate_rad_s
     turned = np.linalg.norm(rotation_vectors(quaternion[:-1], quaternion[1:]), axis=1)
@@ -125,7 +125,7 @@ def told_rates(quaternion: Vector, rate_rad_s: Vector | None) -> Vector | None:
 
 
 def known_attitudes(file: str, object_name: str, segments: Sequence[Segment]) -> KnownAttitudes:
-    """The attitudes of a file in order of time; see `in_order`."""
+    """Attitudes of a file with segments in order of time; see `in_order`."""
     if not segments:
         raise BadFile(Fault(file, "has no attitude"))
     return KnownAttitudes(object_name, in_order(file, segments))
@@ -135,9 +135,9 @@ S = TypeVar("S", bound=Span)
 
 
 def in_order(file: str, segments: Sequence[S]) -> list[S]:
-    """The segments of a file in order of time.
+    """Sort the segments of a file by time.
 
-    Raises `BadFile` where one has no useable time, and where two overlap.
+    Raises `BadFile` for a segment without useable time, and if two overlap.
     """
     for each in segments:
         if each.first_ns > each.last_ns:
@@ -151,9 +151,9 @@ def in_order(file: str, segments: Sequence[S]) -> list[S]:
 
 
 def by_priority(segments: Sequence[Segment]) -> list[Segment]:
-    """Segments of which none overlap: a time belongs to the last one that has it.
+    """Resolve overlaps of segments: at any time the last segment in the file has priority.
 
-    Between the records of a discrete segment nothing is known, and those before it hold.
+    A discrete segment is unknown between its records, where earlier segments stay valid.
     """
     firsts: list[int] = []
     lasts: list[int] = []
@@ -183,22 +183,22 @@ Interpolation = Literal["HERMITE", "LAGRANGE"]
 
 
 class Ephemeris(Protocol):
-    """The motion of one object, as a file describes it."""
+    """Interface of an orbit ephemeris read from a file."""
 
     @property
     def object_name(self) -> str:
-        """The object."""
+        """Name of the object whose orbit is described."""
 
     def at(self, moment: Utc) -> Vector | None:
-        """The geocentric state (6,) in EME2000, km and km/s; None where the file has none."""
+        """Geocentric state (6,) in EME2000, km and km/s, at a time; None outside of the file."""
 
 
 @dataclass(frozen=True)
 class StateSegment(Span):
-    """States (n, 6), in km and km/s, between which it may be interpolated.
+    """Orbital states (n, 6) of a span, in km and km/s, to interpolate between.
 
-    The polynomial goes through `points` states: HERMITE through their positions and velocities,
-    with the velocity as its derivative, LAGRANGE through positions and velocities apart.
+    The polynomial passes through `points` states: HERMITE through positions with velocities as
+    derivatives, LAGRANGE through positions and velocities separately.
     """
 
     state: Vector
@@ -206,7 +206,7 @@ class StateSegment(Span):
     points: int
 
     def at(self, time_ns: int) -> Vector | None:
-        """The state (6,) at a moment; None outside the segment."""
+        """State (6,) interpolated at a time; None outside of the segment."""
         if not self.first_ns <= time_ns <= self.last_ns:
             return None
         after = int(np.searchsorted(self.time_ns, time_ns))
@@ -226,10 +226,10 @@ class StateSegment(Span):
         return np.concatenate([position, velocity / unit_s])
 
     def _window(self, after: int, time_ns: int) -> slice:
-        """The states that the polynomial goes through: as many before the moment as after it.
+        """Slice of the states that the polynomial passes through, centred on the time.
 
-        Of an odd number the nearest state is in the middle; at the ends of the segment the
-        window ends there too.
+        With an odd number the nearest state is in the middle; at the ends of the segment the window
+        ends there too.
         """
         first = after - self.points // 2
         nearer_after = 2 * time_ns > self.time_ns[after - 1] + self.time_ns[after]
@@ -241,13 +241,13 @@ class StateSegment(Span):
 
 @dataclass(frozen=True)
 class KnownStates:
-    """The states of one object in a file: segments in order of time that do not overlap."""
+    """Orbital states of one object in a file: segments in order of time that do not overlap."""
 
     object_name: str
     segments: Sequence[StateSegment]
 
     def at(self, moment: Utc) -> Vector | None:
-        """The geocentric state (6,) in EME2000, km and km/s; None outside every segment."""
+        """Geocentric state (6,) in EME2000, km and km/s; None outside of all segments."""
         for each in reversed(self.segments):
             if each.first_ns <= moment.tai_ns:
                 return each.at(moment.tai_ns)
@@ -255,7 +255,7 @@ class KnownStates:
 
 
 def known_states(file: str, object_name: str, segments: Sequence[StateSegment]) -> KnownStates:
-    """The states of a file in order of time; see `in_order`."""
+    """Orbital states of a file with segments in order of time; see `in_order`."""
     if not segments:
         raise BadFile(Fault(file, "has no state"))
     return KnownStates(object_name, in_order(file, segments))

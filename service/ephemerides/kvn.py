@@ -1,16 +1,16 @@
-"""Keyword-value notation (KVN), the text form of CCSDS messages."""
+"""Writer of keyword-value notation (KVN), the text form of CCSDS messages."""
 
 from collections.abc import Sequence
 
 Pairs = Sequence[tuple[str, str]]
-"""Keywords with their values, in order; the keyword `COMMENT` may be repeated."""
+"""Pairs of keyword and value, in order; the keyword `COMMENT` may be repeated."""
 
 ORIGINATOR = "ATTITUDE-ACQUISITION"
 TIME_SYSTEM = "UTC"
 
 
 def kvn(pairs: Pairs) -> str:
-    """Lines of KVN, a pair a line."""
+    """Format pairs as KVN, one line each."""
     width = max((len(key) for key, _ in pairs if key != "COMMENT"), default=0)
     return "".join(
         f"COMMENT {value}\n" if key == "COMMENT" else f"{key:{width}} = {value}\n"
@@ -19,10 +19,10 @@ def kvn(pairs: Pairs) -> str:
 
 
 def time_text(utc: str) -> str:
-    """A time as messages have it: without the Z, for the time system is a keyword."""
+    """Time in a message: UTC without the Z, since a keyword names the time system."""
     return utc.removesuffix("Z")
 
 
 def one_line(text: str) -> str:
-    """A text as a value: printable ASCII, without line breaks."""
+    """Replace characters other than printable ASCII, so that a text fits on one line."""
     return "".join(each if " " <= each <= "~" else "?" for each in text)

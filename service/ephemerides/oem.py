@@ -1,6 +1,6 @@
-"""Reads OEM versions 1 to 3 (CCSDS 502.0-B), KVN and XML: positions and velocities of a spacecraft.
+"""Reader of OEM versions 1 to 3 (CCSDS 502.0-B), KVN and XML: states of a spacecraft.
 
-States are geocentric, in km and km/s.  Accelerations and covariances are passed over.
+States are geocentric, in km and km/s.  Accelerations and covariances are skipped.
 """
 
 import math
@@ -43,21 +43,21 @@ _METHODS: dict[str, Interpolation] = {
     "LINEAR": "LAGRANGE",
 }
 MOST_DEGREE = 19
-"""Polynomials of higher degree follow the rounding of the states."""
+"""Greatest degree of interpolation; higher ones follow the rounding errors of states."""
 DEFAULT_DEGREE = 7
-"""The degree of Hermite's interpolation, where the file names none."""
+"""Degree of Hermite interpolation if the file names none."""
 EARTH_GM_KM3_PER_S2 = 398600.4418
 LONGEST_STEP_OF_PERIOD = 1 / 12
-"""The longest step between states if no interpolation is named: a longer one costs kilometres."""
+"""Longest step between states, in orbital periods, for a file that names no interpolation."""
 SHORT_NS = 10**9
-"""The states must reach START_TIME and STOP_TIME this near, else the file was cut short."""
+"""Nanoseconds by which states may miss START_TIME and STOP_TIME; more is a cut file."""
 MAX_KM, MAX_KM_PER_S = 1e9, 100.0
 _NAMES = ("EPOCH", "X", "Y", "Z", "X_DOT", "Y_DOT", "Z_DOT")
 
 
 @dataclass
 class _Form:
-    """The form of a segment's states by its metadata, and the states read so far."""
+    """Layout of a segment's states from its metadata, with the states read so far."""
 
     line: int
     time_system: str
@@ -66,13 +66,13 @@ class _Form:
     method: Interpolation
     degree: int | None
     has_ended: bool = False
-    """Covariances follow the states and end them."""
+    """True once covariances have begun, which follow the states."""
     times: list[int] = field(default_factory=list)
     states: list[list[float]] = field(default_factory=list)
 
 
 def read_oem(name: str, file: IO[bytes]) -> KnownStates:
-    """The states of a message; raises `BadFile` naming file, line and field."""
+    """Read the states of an OEM message; raises `BadFile` naming file, line and field."""
     return _Reader(ccsds.Source(name)).read(file)
 
 
@@ -129,7 +129,7 @@ class _Reader(ccsds.MessageReader):
         )
 
     def _interpolation(self, metadata: ccsds.Metadata) -> tuple[Interpolation, int | None]:
-        """The method, and the degree where one is given."""
+        """Interpolation method of a segment, and its degree if named."""
         if "INTERPOLATION" not in metadata.values:
             return "HERMITE", None
         name = metadata.one_of("INTERPOLATION", tuple(_METHODS))
@@ -158,7 +158,7 @@ class _Reader(ccsds.MessageReader):
         form.states.append(state)
 
     def _made(self, form: _Form, line: int) -> StateSegment:
-        """The segment, whose last token is in a line or before it."""
+        """Segment from the states read; `line` is that of its last token."""
         if not form.times:
             raise self._source.bad(form.line, "META_STOP", "begins a segment of no state")
         if form.times[0] > form.span_ns[0] + SHORT_NS:
@@ -180,7 +180,7 @@ class _Reader(ccsds.MessageReader):
         )
 
     def _check_steps(self, form: _Form) -> None:
-        """Refuse states too far apart, measured by the period of a circular orbit at the lower."""
+        """Refuse states too far apart, measured by the period of a circular orbit there."""
         step_s = np.diff(np.array(form.times)) * 1e-9
         radius_km = np.linalg.norm(np.array(form.states)[:, :3], axis=1)
         lower_km = np.minimum(radius_km[:-1], radius_km[1:])
@@ -194,7 +194,7 @@ class _Reader(ccsds.MessageReader):
             )
 
     def _points(self, form: _Form, count: int) -> int:
-        """Through how many states the polynomial goes."""
+        """Number of states that the interpolating polynomial passes through."""
         degree = DEFAULT_DEGREE if form.degree is None else form.degree
         # A state gives Hermite's polynomial two conditions, its position and its velocity; through
         # one alone would be a line that ends at the next.

@@ -1,6 +1,6 @@
-"""Reads mean elements of an orbit (OMM, CCSDS 502.0-B): KVN, XML, and JSON and CSV of catalogs.
+"""Reader of mean orbital elements (OMM, CCSDS 502.0-B): KVN, XML, and JSON and CSV of catalogs.
 
-They are the numbers of a two-line element set without its limits on the object's number, and
+The elements are those of a two-line element set without its limit on object numbers, and are
 propagated by the same SGP4: see `tle`.
 """
 
@@ -36,7 +36,7 @@ _NUMBERS: dict[str, tuple[float, float, float | None]] = {
     "MEAN_MOTION_DOT": (-10.0, 10.0, 0.0),
     "MEAN_MOTION_DDOT": (-10.0, 10.0, 0.0),
 }
-"""Least and most of each number, revolutions a day or degrees, and its default; None: required."""
+"""Range of each element, in revolutions per day or degrees, and its default; None: required."""
 _FIXED = {
     "CENTER_NAME": ("EARTH",),
     "REF_FRAME": ("TEME",),
@@ -44,23 +44,24 @@ _FIXED = {
     "MEAN_ELEMENT_THEORY": ("SGP4", "SGP/SGP4", "SGP", "TLE"),
     "EPHEMERIS_TYPE": ("0", "2"),
 }
-"""The values that are read of keywords that say what the elements mean; a catalog's JSON and CSV
-leave most of them out."""
+"""Accepted values of the keywords that define the meaning of the elements; JSON and CSV catalogs
+omit most of these keywords.
+"""
 _JD_OF_1950 = 2433281.5
-"""The Julian date of the day 0 of 1950, from which SGP4 counts days."""
+"""Julian date of day 0 of 1950, from which SGP4 counts days."""
 _BEYOND_NS = re.compile(r"(\.\d{9})\d+")
 Fields = tuple[int, Mapping[str, str]]
 
 
 def is_omm(start: bytes) -> bool:
-    """True if a file that begins so holds mean elements in any of the forms."""
+    """True if the beginning of a file is an OMM in any of its notations."""
     return _IS_OMM.search(start) is not None
 
 
 def read_omm(name: str, file: IO[bytes], field: str) -> TleEphemeris:
-    """The sets of a file, which are of one object.
+    """Read the element sets of a file about one object.
 
-    Raises `BadFile` naming file, line and field, and `NotAvailable` where sgp4 is missing.
+    Raises `BadFile` naming file, line and field, and `NotAvailable` without sgp4.
     """
     require_extra("tle", "sgp4", field, name)
     source = ccsds.Source(name)
@@ -82,7 +83,7 @@ def read_omm(name: str, file: IO[bytes], field: str) -> TleEphemeris:
 
 
 def _sets_of_fields(source: ccsds.Source, file: IO[bytes]) -> Iterator[Fields]:
-    """The keywords of each set with their values, and the line at which it begins or ends."""
+    """Keywords and values of each element set, with a line number."""
     start = file.read(256).lstrip(codecs.BOM_UTF8 + b" \t\r\n")
     file.seek(0)
     if start.startswith((b"<", b"CCSDS_")):

@@ -1,4 +1,4 @@
-"""Attitudes of batches or of a filter by columns, in order of time."""
+"""Table of attitudes of batches or of a filter, in order of time."""
 
 from dataclasses import dataclass, fields, replace
 from typing import Any, Self
@@ -12,20 +12,19 @@ Integers = npt.NDArray[np.int64]
 Texts = npt.NDArray[np.object_]
 
 SAME_MOMENT_NS = 1_000
-"""The last of attitudes closer than this counts: clocks of kernels have 1 us."""
+"""Nanoseconds within which two attitudes count as simultaneous: kernels' clocks have 1 us."""
 
 
 @dataclass(frozen=True)
 class AttitudeRows:
-    """Results of batches in order of time, a row each, as they are recorded.
+    """Attitude results in order of time as columns, one row per batch or sample.
 
-    `status` is None and the numbers are NaN where a batch has no attitude; `rate_deg_per_s`
-    is NaN where the batch came without one.  `time_ns` is `Utc.tai_ns`.
+    `status` is None and the numbers are NaN for a batch without attitude; `rate_deg_per_s` is NaN
+    for a batch without rates.  `time_ns` is `Utc.tai_ns`.
 
-    Of filtered and smoothed attitudes a row is a sample: `id` is that of its day's revision,
-    `batch` and the residuals there are none, and `stars` are zero.  They alone have a `model`,
-    a `revision`, and the bias of the gyro with its sigma, (n, 3); of others these are None, 0 and
-    NaN.
+    For filtered and smoothed attitudes a row is a sample: `id` is that of its day's revision,
+    `batch` and the residuals are missing, and `stars` are zero.  Only these rows have a `model`, a
+    `revision`, and the gyro's bias with its sigma, (n, 3); otherwise None, 0 and NaN.
     """
 
     time_ns: Integers
@@ -36,7 +35,7 @@ class AttitudeRows:
     method: Texts
     quaternion: Vector
     covariance_arcsec2: Vector
-    """Covariances (n, 6): 11, 12, 13, 22, 23, 33."""
+    """Upper triangles of the covariances (n, 6): 11, 12, 13, 22, 23, 33."""
     rate_deg_per_s: Vector
     residual_rms_arcsec: Vector
     predicted_rms_arcsec: Vector
@@ -51,10 +50,10 @@ class AttitudeRows:
         return len(self.time_ns)
 
     def taken(self, places: Any) -> Self:
-        """The rows at some places, or where a mask is true."""
+        """Rows selected by indices or a mask."""
         return replace(self, **{f.name: getattr(self, f.name)[places] for f in fields(self)})
 
     def followed_by(self, other: Self) -> Self:
-        """These rows and then others."""
+        """Concatenate with the rows of another table."""
         pairs = {f.name: (getattr(self, f.name), getattr(other, f.name)) for f in fields(self)}
         return replace(self, **{name: np.concatenate(pair) for name, pair in pairs.items()})

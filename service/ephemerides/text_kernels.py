@@ -1,4 +1,4 @@
-"""Text kernels of SPICE: their form, and the leap seconds."""
+"""Writer of SPICE text kernels, among them the leap-second kernel."""
 
 import erfa
 
@@ -6,7 +6,7 @@ _MONTHS = {1: "JAN", 7: "JUL"}
 
 
 def leap_second_kernel() -> str:
-    """LSK: leap seconds by ERFA's table, with the constants of NAIF's own kernels."""
+    """Text of a leap-second kernel (LSK) with ERFA's table and NAIF's constants."""
     steps = [
         f"  {int(count)}, @{year}-{_MONTHS[int(month)]}-1"
         for year, month, count in erfa.leap_seconds.get().tolist()
@@ -26,6 +26,6 @@ def leap_second_kernel() -> str:
 
 
 def text_kernel(kind: str, about: str, *lines: str) -> str:
-    """A text kernel of a kind, such as `LSK`, with a line about it and its data."""
+    """Text kernel of a kind, such as `LSK`, with a comment line and its data."""
     body = "\n".join(lines)
     return f"KPL/{kind}\n\n{about}\n\n\\begindata\n\n{body}\n\n\\begintext\n"

@@ -1,7 +1,8 @@
-"""Reads two-line element sets (TLE), and propagates them with SGP4 by the package `sgp4`.
+"""Reader of two-line element sets (TLE), propagated with SGP4 by the package `sgp4`.
 
-SGP4 gives states in the true equator and mean equinox of date (TEME).  ERFA's precession of 1976
-and nutation of 1980, which belong to it, lead to the mean equator and equinox of J2000.
+SGP4 gives states in the true equator and mean equinox of date (TEME).  They are rotated to the mean
+equator and equinox of J2000 with the matching models of ERFA: precession of 1976 and nutation of
+1980.
 """
 
 import codecs
@@ -21,7 +22,7 @@ from service.vectors import Matrix, Vector
 
 LENGTH = 69
 MAX_AGE_D = 7.0
-"""Days from its epoch in which a set is used: its error grows by 1 to 3 km a day."""
+"""Greatest age in days of an element set: its error grows by 1 to 3 km per day."""
 MOST_SETS = 100_000
 MAX_LINE_BYTES = 200
 _FIRST_CENTURY_YEAR = 57
@@ -51,14 +52,14 @@ _FIELDS: dict[int, tuple[tuple[str, int, int, str], ...]] = {
         ("revolution number", 63, 68, r" *\d*"),
     ),
 }
-"""Name, first column, column after the last, and form, columns counted from 0."""
+"""Fields of a TLE line: name, first column, end column (both from 0), and pattern."""
 _SPACES = {1: (1, 8, 17, 32, 43, 52, 61, 63), 2: (1, 7, 16, 25, 33, 42, 51)}
-"""The columns between the fields."""
+"""Columns of blanks between the fields of a TLE line."""
 
 
 @dataclass(frozen=True)
 class ElementSet:
-    """A set of elements with its epoch, `Utc.tai_ns`."""
+    """An orbital element set with its epoch, `Utc.tai_ns`."""
 
     epoch_ns: int
     elements: Any
@@ -66,15 +67,15 @@ class ElementSet:
 
 @dataclass(frozen=True)
 class TleEphemeris:
-    """Sets of elements of one object, in order of their epochs."""
+    """Element sets of one object, in order of their epochs."""
 
     object_name: str
     sets: list[ElementSet]
 
     def at(self, moment: Utc) -> Vector | None:
-        """The geocentric state (6,) in EME2000, km and km/s, by the set with the nearest epoch.
+        """Geocentric state (6,) in EME2000, km and km/s, from the set with the nearest epoch.
 
-        None more than `MAX_AGE_D` from every epoch, and where SGP4 finds that the object decayed.
+        None more than `MAX_AGE_D` from every epoch, and if SGP4 finds that the object decayed.
         """
         nearest = min(self.sets, key=lambda each: abs(each.epoch_ns - moment.tai_ns))
         since_s = (moment.tai_ns - nearest.epoch_ns) * 1e-9
@@ -88,7 +89,7 @@ class TleEphemeris:
 
 
 def eme2000_from_teme(moment: Utc) -> Matrix:
-    """The rotation (3, 3) from TEME components at a moment to EME2000 (J2000) components."""
+    """Rotation matrix (3, 3) from TEME at a time to EME2000 (J2000)."""
     tt = moment.tt
     nutation_in_longitude, _ = ufunc.nut80(*tt)
     equinoxes = float(nutation_in_longitude) * math.cos(float(ufunc.obl80(*tt)))
@@ -98,9 +99,9 @@ def eme2000_from_teme(moment: Utc) -> Matrix:
 
 
 def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
-    """The sets of a file, with or without lines of names.
+    """Read the two-line element sets of a file, with or without lines of names.
 
-    Raises `BadFile` naming file, line and field, and `NotAvailable` where sgp4 is missing.
+    Raises `BadFile` naming file, line and field, and `NotAvailable` without sgp4.
     """
     require_extra("tle", "sgp4", field, name)
     source = Source(name)
@@ -135,7 +136,7 @@ def read_tle(name: str, file: IO[bytes], field: str) -> TleEphemeris:
 
 
 def _lines(source: Source, file: IO[bytes]) -> Any:
-    """The lines that are not empty, with their numbers."""
+    """Lines that are not empty, with their numbers."""
     number = 0
     while data := file.readline(MAX_LINE_BYTES + 1):
         number += 1
@@ -154,7 +155,7 @@ def _lines(source: Source, file: IO[bytes]) -> Any:
 
 
 def _check(source: Source, line: int, text: str, which: int) -> None:
-    """Raise `BadFile` for a line that is not the first, or second, of a set."""
+    """Raise `BadFile` unless a text is a valid first or second line of a set."""
     if not text.startswith(f"{which} "):
         raise source.bad(line, f"line {which}", f"must begin with {which} and a space", text)
     if len(text) != LENGTH:

@@ -1,7 +1,7 @@
-"""CCSDS messages of attitudes or orbits, KVN or XML: tokens, epochs, metadata of segments.
+"""Parser of CCSDS messages on attitudes or orbits, KVN or XML: tokens, epochs, metadata.
 
-A message is read as keywords with their values, starts and ends of its parts, and states, each
-with its line; the reader of a kind of message need not know which form it has.
+A message is read as keywords with values, marks at the start and end of its parts, and states, each
+with its line; readers of a kind of message need not know its notation.
 """
 
 import math
@@ -28,10 +28,10 @@ _UNIT = re.compile(r"\s*\[[^\]]*\]$")
 
 @dataclass(frozen=True)
 class Token:
-    """A keyword, a mark or a state, with its line.
+    """Token of a CCSDS message: a keyword, a mark or a state, with its line.
 
-    `words` of a state are its epoch and numbers; in XML with the `names` of its elements, and the
-    `units` that they name.
+    `words` of a state are its epoch and numbers; in XML with the `names` of its elements, and their
+    `units`.
     """
 
     line: int
@@ -45,11 +45,11 @@ class Token:
 
 @dataclass(frozen=True)
 class MessageForm:
-    """How a kind of message is written.
+    """Notation of a kind of CCSDS message.
 
     In KVN `marks` stand alone in their lines, and lines without keyword are states after one of
-    `before_states`.  In XML the elements `parts` stand for the marks of their start and end, and
-    `state` is the element of a state.
+    `before_states`.  In XML the elements `parts` replace the marks of start and end, and `state` is
+    the element of a state.
     """
 
     kind: str
@@ -80,28 +80,28 @@ OEM = MessageForm(
 
 @dataclass(frozen=True)
 class Source:
-    """A file by its name in messages."""
+    """An input file, identified by its name in messages."""
 
     name: str
 
     def bad(self, line: int, field: str, message: str, value: object = None) -> BadFile:
-        """The error that names file, line and field."""
+        """Error that names file, line and field."""
         shown = None if value is None else shown_value(value)
         return BadFile(Fault(f"{self.name}, line {line}: {field}", message, shown))
 
     def bad_token(self, token: Token, message: str) -> BadFile:
-        """The error that names a token and its line."""
+        """Error that names a token and its line."""
         return self.bad(token.line, token.name, message, token.value or None)
 
     def epoch_ns(self, token: Token, word: str, time_system: str) -> int:
-        """The epoch of a state as `Utc.tai_ns`; raises `BadFile` for any other word."""
+        """Epoch of a state as `Utc.tai_ns`; raises `BadFile` for an invalid one."""
         try:
             return epoch_ns(word, time_system)
         except ValueError as error:
             raise self.bad(token.line, "EPOCH", str(error), word) from None
 
     def number(self, token: Token, word: str) -> float:
-        """A number of a state; raises `BadFile` for any other word."""
+        """Number in a state; raises `BadFile` for an invalid one."""
         try:
             # Fortran writes the exponents of double precision with D.
             number = float(word.translate(_D_TO_E))
@@ -112,7 +112,7 @@ class Source:
         return number
 
     def named(self, token: Token, names: tuple[str, ...]) -> tuple[str, ...]:
-        """The words of an XML state by the names of their elements, each there once."""
+        """Values of an XML state by element names, each required once."""
         assert token.names is not None
         for name in names:
             if token.names.count(name) != 1:
@@ -122,9 +122,9 @@ class Source:
 
 
 def tokens_of(source: Source, file: IO[bytes], form: MessageForm) -> Iterator[Token]:
-    """The tokens of a message, KVN or XML as the file has it.
+    """Tokens of a CCSDS message in KVN or XML, recognised by its first bytes.
 
-    The first is the version.  Raises `BadFile` where the form itself is broken.
+    The first token is the version.  Raises `BadFile` for invalid notation.
     """
     start = file.read(256)
     file.seek(0)
@@ -173,7 +173,7 @@ def _xml(source: Source, file: IO[bytes], form: MessageForm) -> Iterator[Token]:
 
 
 class _XmlReader:
-    """Collects tokens while the parser calls it.  No entity is expanded, nothing is fetched."""
+    """Collects tokens of an XML message; expands no entity and fetches nothing."""
 
     def __init__(self, source: Source, form: MessageForm) -> None:
         self._source, self._form = source, form
@@ -193,14 +193,14 @@ class _XmlReader:
         self._attributes: dict[str, str] = {}
 
     def feed(self, piece: bytes) -> None:
-        """Read on; a piece without bytes is the end."""
+        """Parse the next piece; an empty one marks the end."""
         try:
             self._parser.Parse(piece, not piece)
         except expat.ExpatError as error:
             raise self._source.bad(error.lineno, "XML", expat.ErrorString(error.code)) from None
 
     def taken(self) -> list[Token]:
-        """The tokens since the last call."""
+        """Tokens completed since the last call."""
         tokens, self._tokens = self._tokens, []
         return tokens
 
@@ -274,14 +274,14 @@ class _XmlReader:
 
 
 _LESS_TAI_NS = {"TAI": 0, "GPS": -19 * 10**9, "TT": 32_184_000_000}
-"""Uniform time systems, by what they are ahead of TAI."""
+"""Offsets of uniform time systems from TAI, in nanoseconds."""
 TIME_SYSTEMS = ("UTC", *_LESS_TAI_NS)
 _J2000 = datetime(2000, 1, 1, 12)
 _DECIMALS = re.compile(r"(.*T\d\d:\d\d:\d\d)(\.\d+)?Z?", re.ASCII)
 
 
 def epoch_ns(text: str, time_system: str) -> int:
-    """An epoch as `Utc.tai_ns`; raises `ValueError` with what is expected.
+    """Convert an epoch to `Utc.tai_ns`; raises `ValueError` with the expected form.
 
     Digits beyond the nanosecond are cut off.
     """
@@ -307,12 +307,12 @@ def epoch_ns(text: str, time_system: str) -> int:
 
 
 INERTIAL = ("EME2000", "J2000", "ICRF", "GCRF")
-"""One frame for the service, which lets 23 mas between EME2000 and ICRF be."""
+"""Names of inertial frames that are treated as equal; EME2000 and ICRF differ by 23 mas."""
 
 
 @dataclass
 class Metadata:
-    """Keywords with their values; `line` is that of the end of the metadata."""
+    """Metadata of a message segment: keywords with values; `line` is where they end."""
 
     source: Source
     line: int
@@ -326,18 +326,18 @@ class Metadata:
                 raise self.source.bad(self.line, name, "is missing in the metadata")
 
     def one_of(self, name: str, known: tuple[str, ...]) -> str:
-        """The value of a keyword in capital letters, which must be a known one."""
+        """Upper-case value of a keyword; raises `BadFile` unless it is a known one."""
         value = self.values[name].upper()
         if value not in known:
             raise self.fault(name, f"must be one of {', '.join(known)}")
         return value
 
     def time_system(self) -> str:
-        """The time system, which must be a known one."""
+        """Time system of the segment; raises `BadFile` unless it is a known one."""
         return self.one_of("TIME_SYSTEM", TIME_SYSTEMS)
 
     def moment(self, name: str, time_system: str) -> int | None:
-        """A time as `Utc.tai_ns`; None where the keyword is not there."""
+        """Time of a keyword as `Utc.tai_ns`; None if the keyword is missing."""
         if name not in self.values:
             return None
         try:
@@ -346,7 +346,7 @@ class Metadata:
             raise self.fault(name, str(error)) from None
 
     def span(self, time_system: str) -> tuple[int, int]:
-        """START_TIME and STOP_TIME, which are required and in order."""
+        """START_TIME and STOP_TIME as `Utc.tai_ns`; both are required and must be in order."""
         first, last = (self.moment(name, time_system) for name in ("START_TIME", "STOP_TIME"))
         assert first is not None
         assert last is not None
@@ -355,13 +355,13 @@ class Metadata:
         return first, last
 
     def useable(self, time_system: str) -> tuple[int | None, int | None]:
-        """USEABLE_START_TIME and USEABLE_STOP_TIME, None where they are not there."""
+        """USEABLE_START_TIME and USEABLE_STOP_TIME as `Utc.tai_ns`, None if missing."""
         names = ("USEABLE_START_TIME", "USEABLE_STOP_TIME")
         first, last = (self.moment(name, time_system) for name in names)
         return first, last
 
     def fault(self, name: str, message: str) -> BadFile:
-        """The error that names a keyword with its line and value."""
+        """Error that names a keyword with its line and value."""
         return self.source.bad(self.lines[name], name, message, self.values[name])
 
 
@@ -369,7 +369,7 @@ _BODY = re.compile(r"(SC_BODY|SPACECRAFT_BODY|SC_BODY_\w+)")
 
 
 def from_body(metadata: Metadata) -> bool:
-    """True if REF_FRAME_A is the body; the other frame must be inertial."""
+    """True if REF_FRAME_A is the body; raises `BadFile` unless the other frame is inertial."""
     frames = {name: metadata.values[name].upper() for name in ("REF_FRAME_A", "REF_FRAME_B")}
     is_body = {name: bool(_BODY.fullmatch(frame)) for name, frame in frames.items()}
     for name, frame in frames.items():
@@ -383,7 +383,7 @@ def from_body(metadata: Metadata) -> bool:
 
 
 def euler_sequence(metadata: Metadata) -> str:
-    """The axes of Euler angles, such as ZXZ, from the required EULER_ROT_SEQ."""
+    """Axes of Euler angles, such as ZXZ, from the required keyword EULER_ROT_SEQ."""
     metadata.require(("EULER_ROT_SEQ",))
     sequence = metadata.values["EULER_ROT_SEQ"].upper().translate(str.maketrans("123", "XYZ"))
     if sequence not in SEQUENCES:
@@ -395,9 +395,9 @@ def euler_sequence(metadata: Metadata) -> str:
 def read_metadata(
     source: Source, tokens: Iterator[Token], line: int, known: tuple[str, ...], form: MessageForm
 ) -> Metadata:
-    """The metadata that begins before the next token, to META_STOP.
+    """Read metadata from the next token up to META_STOP.
 
-    Raises `BadFile` for a keyword that is not `known` in this form of message or comes twice.
+    Raises `BadFile` for a keyword that is not `known` in this kind of message or occurs twice.
     """
     found = Metadata(source, line)
     for token in tokens:
@@ -416,7 +416,7 @@ def read_metadata(
 def read_version(
     source: Source, token: Token | None, form: MessageForm, versions: tuple[str, ...]
 ) -> str:
-    """The version, one of `versions`, from the first token of a message."""
+    """Version of a message from its first token; raises `BadFile` unless one of `versions`."""
     name = f"CCSDS_{form.kind}_VERS"
     if token is None or token.name != name:
         line = 1 if token is None else token.line
@@ -430,7 +430,7 @@ def read_version(
 
 
 class MessageReader:
-    """The checks that the readers of messages share: of one object, of order, of the amount."""
+    """Checks shared by readers of messages: one object, ascending times, number of states."""
 
     def __init__(self, source: Source) -> None:
         self._source = source
@@ -443,14 +443,14 @@ class MessageReader:
         return self._object[0]
 
     def _check_object(self, metadata: Metadata) -> None:
-        """Raise `BadFile` where a segment is of another object than those before."""
+        """Raise `BadFile` for a segment about another object than the previous ones."""
         about = (metadata.values["OBJECT_NAME"], metadata.values["OBJECT_ID"])
         if self._object not in (None, about):
             raise metadata.fault("OBJECT_ID", "must be the same in every segment")
         self._object = about
 
     def _count_state(self, token: Token, epoch: str, time_ns: int, before: list[int]) -> None:
-        """Raise `BadFile` for a state not later than those before, or one too many."""
+        """Raise `BadFile` for a state not later than the previous ones, or beyond the limit."""
         if before and time_ns <= before[-1]:
             message = "must be later than that of the state before"
             raise self._source.bad(token.line, "EPOCH", message, epoch)
@@ -461,7 +461,7 @@ class MessageReader:
 
 
 def useable_span(times: list[int], useable_ns: tuple[int | None, int | None]) -> tuple[int, int]:
-    """The first and last time of a segment: of its states, or of the useable ones."""
+    """First and last valid time of a segment: its states, limited to the useable span."""
     first, last = useable_ns
     return (
         times[0] if first is None else max(first, times[0]),

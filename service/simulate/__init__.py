@@ -1,1 +1,1 @@
-"""Simulation: telemetry and frames with known truth, drawn from the real sky."""
+"""Simulation of telemetry and frames with known truth, drawn from the real sky."""

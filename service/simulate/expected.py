@@ -1,6 +1,6 @@
-"""What a mission can expect of its identification, from simulated views all over the sky.
+"""Expected identification results of a mission, from simulated views all over the sky.
 
-The views are drawn as telemetry is: with the mission's own noise and a priori errors.  Each is of
+The views are drawn like telemetry: with the mission's noise and a priori errors.  Every view has
 another pointing; those of a Sun-pointed mission are spread over the days of a year.
 """
 
@@ -24,13 +24,13 @@ from service.vectors import from_ra_dec, matrix_from_quaternion
 
 GALACTIC_POLE = from_ra_dec(192.85948, 27.12825)
 CLEAR_LATITUDE_DEG, DENSE_LATITUDE_DEG = 30.0, 10.0
-"""A view farther from the galactic plane counts as clear sky, a nearer one as dense."""
+"""Galactic latitudes in degrees above which sky counts as clear, and below which as dense."""
 VIEWS, AT_ONCE = 400, 20
 
 
 @dataclass
 class Expected:
-    """Outcomes of the simulated views of one kind of sky."""
+    """Outcomes of simulated views in one kind of sky, clear or dense."""
 
     sky: str
     views: int = 0
@@ -42,7 +42,7 @@ class Expected:
     )
 
     def share(self, outcome: str) -> float:
-        """The share of all observed stars, from 0 to 1; NaN without stars."""
+        """Share of the observed stars with an outcome, from 0 to 1; NaN without stars."""
         observed = self.stars["observed"]
         return self.stars[outcome] / observed if observed else float("nan")
 
@@ -50,9 +50,9 @@ class Expected:
 def expected_outcomes(
     mission: Mission, sky: SkyModel, moment: Utc, seconds: float, seed: int = 1
 ) -> list[Expected]:
-    """Outcomes in clear and in dense sky of up to `VIEWS` views, or as many as the time allows.
+    """Simulate up to `VIEWS` views, as time allows; returns outcomes in clear and in dense sky.
 
-    `seconds` are of this process's processor time, after the first views: these may compile.
+    `seconds` are of this process's CPU time, after the first views, which may compile kernels.
     """
     found = {"clear": Expected("clear"), "dense": Expected("dense")}
     until = math.inf

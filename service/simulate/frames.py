@@ -1,10 +1,9 @@
-"""Frames of a star tracker with known truth: the real sky through a camera, with all its noise.
+"""Simulation of star tracker frames with known truth: the real sky, a camera, and all its noise.
 
-Every star of the catalog shines, not only those that a run catalog keeps, each at its
-own place and time, so that blends and faint neighbours are in the frames.  In the
-order of nature: light through the image of a point, drawn out by the body's rates;
-the response of each pixel; photon noise of light, sky and dark current; hot pixels and
-cosmic rays; the noise of reading; full pixels; whole counts.
+Every star of the catalog shines, not only those of the run catalog, each at its own place and time,
+so that blends and faint neighbours are included.  In physical order: light through the image of a
+point, smeared by the body's rates; the response of each pixel; photon noise of light, sky and dark
+current; hot pixels and cosmic rays; read noise; saturation; rounding to counts.
 """
 
 import io
@@ -35,36 +34,37 @@ from service.vectors import Matrix, Vector, quaternion_from_matrix
 DEFAULT_START = "2026-03-01T00:00:00.000Z"
 CADENCE_S = 60.0
 FAINTEST_RENDERED_MAG = 9.0
-"""The limit of the embedded catalog."""
+"""Magnitude of the faintest simulated stars, the limit of the embedded catalog."""
 FAINTEST_TOLD_MAG = 8.0
 MARGIN_PX = 10
-"""Pixels beyond the frame's edge where stars shine in; more where their images reach farther."""
+"""Width in pixels of the margin around a frame from which stars shine in; more for wide images."""
 FAINT_REACHES = ((2e3, 16), (3e4, 48))
-"""Below so many electrons, the image of an aperture is drawn no farther than so many pixels: a
-pixel beyond holds a tenth of an electron."""
+"""Electrons of a star below which the image of an aperture is drawn to a radius in pixels only; a
+pixel outside holds a tenth of an electron.
+"""
 DRAWN_BV_MAG = (-0.4, -0.2, 0.0, 0.3, 0.6, 1.0, 1.4, 1.8, 2.4, 3.2)
-"""The colour indices of images that are computed; that of another star lies between two of them."""
+"""Colour indices for which star images are computed; others are interpolated."""
 TYPICAL_BV_MAG = 0.65
-"""The colour of a star for which the catalog has none: the median to V 9."""
+"""Colour index of a star without one in the catalog: the median down to V 9."""
 FULL_SCALE = 65535
 
 
 @dataclass(frozen=True)
 class FrameSettings:
-    """The settings of the frames that are drawn; the same settings always give the same frames."""
+    """Settings of simulated frames; equal settings always give equal frames."""
 
     frames: int
     seed: int = 1
     tracker: str | None = None
     start: str = DEFAULT_START
     psf: PsfKind | None = None
-    """The image of a star, where it is not the one that the mission's camera has."""
+    """Kind of star image; None: as the mission's camera describes."""
     a_priori_error_deg: float | None = 1.0
-    """The largest error of the a priori attitude; None: there is none, lost in space."""
+    """Largest error of the a priori attitude in degrees; None: no a priori attitude."""
     rates_deg_per_s: float = 0.02
-    """The largest rate about any axis."""
+    """Largest simulated body rate about any axis, in deg/s."""
     response_sigma: float = 0.005
-    """Scatter of the pixels' response to light, one standard deviation."""
+    """Standard deviation of the pixels' response to light, as a fraction."""
     sky_e_per_s: float = 100.0
     hot_pixels: int = 200
     cosmic_rays: int = 5
@@ -89,9 +89,9 @@ class FrameSettings:
 
 @dataclass(frozen=True)
 class DrawnFrame:
-    """One frame, what a client would know of it, and what is true of it.
+    """A simulated frame with its metadata for the service, and its truth.
 
-    `known` is what goes with the frame to the service; `truth` never does.
+    `known` is sent to the service with the frame; `truth` is not.
     """
 
     counts: CountArray
@@ -103,7 +103,7 @@ class DrawnFrame:
 
 @dataclass(frozen=True)
 class _Chip:
-    """The constants from frame to frame: the pixels' response, and which are hot."""
+    """Properties of a detector that all frames share: pixel response and hot pixels."""
 
     response: CountArray
     hot: CountArray
@@ -112,7 +112,7 @@ class _Chip:
 
 @dataclass(frozen=True)
 class _FrameStars:
-    """The stars on one frame, brightest first, at mid exposure."""
+    """Stars on one frame at mid exposure, brightest first."""
 
     row: Any
     u_px: Vector
@@ -126,7 +126,7 @@ class _FrameStars:
 def draw_frames(
     mission: Mission, sky: SkyModel, wanted: FrameSettings, numbers: Iterable[int] | None = None
 ) -> Iterator[DrawnFrame]:
-    """The frames of one tracker, or some of them by number; each with a generator of its own."""
+    """Simulate the frames of one tracker, or some by number; each has its own random generator."""
     tracker, camera = mission.camera_tracker(wanted.tracker, "tracker")
     start = parse_utc(wanted.start, "start")
     root = (wanted.seed, *mission.name.encode(), *tracker.name.encode())
@@ -177,7 +177,7 @@ def draw_frames(
 
 
 def whole_sky(sky: SkyModel, mission: Mission, time: Utc) -> RealSky:
-    """Every star of the catalog as it shines by itself, in the mission's instrument."""
+    """All stars of the catalog, blends not merged, in magnitudes of the mission's instrument."""
     settings = RunCatalogSettings(
         magnitude_limit_mag=FAINTEST_RENDERED_MAG,
         epoch_step_years=mission.catalog.epoch_step_years,
@@ -231,7 +231,7 @@ def _exposed(
     wanted: FrameSettings,
     rng: np.random.Generator,
 ) -> tuple[CountArray, int]:
-    """The counts of one exposure, and how many cosmic rays hit."""
+    """Simulated counts of one exposure, and the number of cosmic rays."""
     light_e = np.full(camera.shape, wanted.sky_e_per_s * camera.exposure_s)
     flux_e = camera.flux_counts(stars.magnitude_mag, camera.exposure_s) * camera.gain_e_per_count
     half = star_images.reach_px(camera)
@@ -257,7 +257,7 @@ def _exposed(
 
 
 def _psfs(camera: Camera, bv_mag: Vector) -> list[Psf]:
-    """The still image of each star; in a band, of its own colour."""
+    """Image of each star without motion; with a passband, for the star's colour."""
     if camera.psf == "gaussian" or camera.band_nm is None:
         return [star_images.still_psf(camera)] * len(bv_mag)
     images, known = star_images.psfs_of_colours(camera, DRAWN_BV_MAG), np.array(DRAWN_BV_MAG)
@@ -278,7 +278,7 @@ def add_star(
     flux: float,
     half_px: int,
 ) -> None:
-    """Add a star's image to an array of light, where it falls on it."""
+    """Add a star's image to an array of light, as far as it falls inside."""
     rows, columns = light.shape
     half_u = half_px + math.ceil(abs(psf.trail_u_px) / 2.0)
     half_v = half_px + math.ceil(abs(psf.trail_v_px) / 2.0)
@@ -291,7 +291,7 @@ def add_star(
 
 
 def _add_cosmic_ray(electrons: CountArray, rng: np.random.Generator) -> None:
-    """A straight track of uneven charge: most are a few pixels long."""
+    """Add a straight track of uneven charge to a frame; most are a few pixels long."""
     rows, columns = electrons.shape
     length, angle = rng.exponential(4.0), rng.uniform(0.0, math.tau)
     along = np.arange(0.0, max(length, 0.5), 0.25)
@@ -332,7 +332,7 @@ TRUTH = "truth.ndjson"
 def write_frames(
     drawn: Iterable[DrawnFrame], folder: Path, file_format: FrameFormat = "fits"
 ) -> int:
-    """Write frame-BATCH.FORMAT and frame-BATCH.json of each, and truth.ndjson; how many."""
+    """Write an image and a JSON file for each frame, and truth.ndjson; returns their number."""
     count = 0
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -350,7 +350,7 @@ def write_frames(
 
 
 def frame_bytes(drawn: DrawnFrame, file_format: FrameFormat = "fits") -> bytes:
-    """The frame as a file."""
+    """Encode a simulated frame as a file in a format."""
     file = io.BytesIO()
     _WRITERS[file_format](drawn, file)
     return file.getvalue()

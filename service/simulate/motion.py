@@ -1,7 +1,7 @@
-"""How sample spacecraft turn (pointings held, slews between them), and their orbits.
+"""Simulated motion of spacecraft: fixed pointings, slews between them, and orbits.
 
-Body rates are constant from one batch to the next and the attitude follows
-from them, so that rates, attitudes and the stars' own times agree.
+Body rates are constant between batches and determine the attitudes, so that rates, attitudes and
+star times agree.
 """
 
 import math
@@ -20,15 +20,14 @@ SLEW_DEG_PER_S = 0.1
 CAP_JITTER_DEG_PER_S = 5e-4
 BAND_JITTER_DEG_PER_S = 2e-5
 CAP_HELD, BAND_HELD = (4, 13), (2, 5)
-"""Number of batches between two slews (from, below), for a cap and for a band's steps of roll."""
+"""Range of the number of batches between slews (from, below), for cap and band missions."""
 
 
 def body_rates_deg_per_s(mission: Mission, batches: int, rng: np.random.Generator) -> Vector:
-    """Rates (batches, 3) of the body relative to inertial, in body axes.
+    """Simulated body rates (batches, 3), relative to inertial, in body axes.
 
-    A mission with a cap slews about any axis; one with a band rolls about the
-    axis that it keeps on its pole, in steps that lead all along the band, as
-    in a roll calibration.
+    A mission with a cap slews about any axis; one with a band rolls about the axis that it keeps on
+    its pole, in steps that lead all along the band, as in a roll calibration.
     """
     rolls = isinstance(mission.zone, Band)
     jitter = BAND_JITTER_DEG_PER_S if rolls else CAP_JITTER_DEG_PER_S
@@ -46,7 +45,7 @@ def body_rates_deg_per_s(mission: Mission, batches: int, rng: np.random.Generato
 
 
 def slewing_attitudes(rates_deg_per_s: Vector, cadence_s: float, first: Matrix) -> Iterator[Matrix]:
-    """Attitude matrices, inertial to body, one a batch."""
+    """Attitude matrices, inertial to body, one per batch, integrated from body rates."""
     attitude = first
     for rates in rates_deg_per_s:
         yield attitude
@@ -57,30 +56,30 @@ def slewing_attitudes(rates_deg_per_s: Vector, cadence_s: float, first: Matrix) 
 
 
 def turned_by(attitude: Matrix, rotation_vector_rad: Vector) -> Matrix:
-    """The attitude after the body has turned by a rotation vector in body axes."""
+    """Attitude after a rotation of the body by a rotation vector in body axes."""
     return rotate_about(-rotation_vector_rad, attitude.T).T
 
 
 def pointed(axis_body: Vector, direction: Vector, roll_rad: float) -> Matrix:
-    """The attitude that has a body axis along an inertial direction, turned about it by a roll."""
+    """Attitude with a body axis along an inertial direction, and a given roll about it."""
     body, inertial = (np.stack([each, *across(each)]) for each in (axis_body, direction))
     return turned_by(body.T @ inertial, axis_body * roll_rad)
 
 
 def across(direction: Vector) -> tuple[Vector, Vector]:
-    """Two directions at right angles to each unit vector (..., 3) and to each other."""
+    """Two directions perpendicular to each unit vector (..., 3) and to each other."""
     # The coordinate axis that it leans to least is never along it.
     aside = unit(np.cross(direction, np.eye(3)[np.argmin(np.abs(direction), axis=-1)]))
     return aside, np.cross(direction, aside)
 
 
 def random_axis(rng: np.random.Generator) -> Vector:
-    """A direction (3,) drawn evenly over the sphere."""
+    """Random unit vector (3,), uniform over the sphere."""
     return unit(rng.normal(size=3))
 
 
 def tilted(direction: Vector, angle_rad: float, rng: np.random.Generator) -> Vector:
-    """A direction moved by an angle to a side drawn at random."""
+    """Direction tilted by an angle towards a random side."""
     aside, above = across(direction)
     bearing = rng.uniform(0.0, math.tau)
     about = math.cos(bearing) * aside + math.sin(bearing) * above
@@ -100,23 +99,23 @@ _EPOCH = parse_utc("2000-01-01T12:00:00Z")
 
 
 class Orbit(Protocol):
-    """Something that has a position and a velocity at any time."""
+    """Interface of an orbit: position and velocity at any time."""
 
     def state(self, time: Utc) -> tuple[Vector, Vector]:
-        """Position (3,) in km and velocity (3,) in km/s."""
+        """Geocentric position (3,) in km and velocity (3,) in km/s at a time, in ICRS axes."""
         ...
 
 
 @dataclass(frozen=True)
 class LowOrbit:
-    """A circular orbit about Earth whose node stands still."""
+    """Circular orbit about Earth with a fixed node."""
 
     altitude_km: float
     inclination_deg: float
     node_deg: float = 0.0
 
     def state(self, time: Utc) -> tuple[Vector, Vector]:
-        """Position (3,) in km and velocity (3,) in km/s."""
+        """Geocentric position (3,) in km and velocity (3,) in km/s at a time, in ICRS axes."""
         radius_km = EARTH_RADIUS_KM + self.altitude_km
         rate = math.sqrt(EARTH_GM_KM3_PER_S2 / radius_km**3)
         angle = math.fmod(rate * _seconds(time), math.tau)
@@ -128,7 +127,7 @@ class LowOrbit:
 
 @dataclass(frozen=True)
 class HaloOrbit:
-    """A halo about L1, between Earth and the Sun; the sizes are SOHO's."""
+    """Halo orbit about L1, between Earth and Sun, with SOHO's dimensions."""
 
     distance_km: float = 1.48e6
     toward_sun_km: float = 206_448.0
@@ -137,7 +136,7 @@ class HaloOrbit:
     period_days: float = 177.7
 
     def state(self, time: Utc) -> tuple[Vector, Vector]:
-        """Position (3,) in km and velocity (3,) in km/s."""
+        """Geocentric position (3,) in km and velocity (3,) in km/s at a time, in ICRS axes."""
         # The halo turns with Earth's way about the Sun: differences see both motions.
         before, after = (self._position(shifted(time, step)) for step in (-600.0, 600.0))
         return self._position(time), (after - before) / 1200.0
@@ -162,7 +161,7 @@ ORBITS: Mapping[str, Orbit] = {
 
 
 def orbit_of(mission: Mission) -> Orbit:
-    """The mission's own orbit; for a site's mission, about L1 with a band and low with a cap."""
+    """Orbit of a known mission; otherwise about L1 for a band, and a low orbit for a cap."""
     other = HaloOrbit() if isinstance(mission.zone, Band) else LowOrbit(600.0, 51.6)
     return ORBITS.get(mission.name, other)
 

@@ -1,9 +1,8 @@
-"""Scenes for lost-in-space identification: what a star camera sees at a random attitude.
+"""Simulated scenes for lost-in-space identification: stars of a camera at a random attitude.
 
-The camera of Zhou & Ye 2015, Table 4: 1,024 pixels over 10 degrees.  A star is
-detected where its magnitude with noise is within the limit, so that noise both
-loses stars and adds fainter ones.  Every scene carries its truth, and scene k
-of a seed is the same however many are drawn.
+The camera of Zhou & Ye 2015, Table 4: 1,024 pixels over 10 degrees.  A star is detected if its
+magnitude with noise is within the limit, so that noise both loses stars and adds fainter ones.
+Every scene carries its truth, and scene k of a seed is the same however many are drawn.
 """
 
 import math
@@ -22,60 +21,60 @@ from service.vectors import Matrix, Vector, matrix_from_quaternion, read_only, u
 
 EPOCH_YEAR = 2000.0
 MERGE_WITHIN_ARCSEC = 60.0
-"""Separation under which two stars are drawn as one: below two pixels of the camera."""
+"""Separation in arcsec below which two stars are drawn as one, less than two camera pixels."""
 FAINTEST_SIGMA = 4.5
-"""Stars fainter than the limit by more than this many sigmas of magnitude are never seen."""
+"""Sigmas of magnitude beyond the limit above which a fainter star is never detected."""
 MAX_TRIES = 10_000
 
 
 @dataclass(frozen=True)
 class PinholeCamera:
-    """A square detector behind a pinhole: +Z is the boresight, x and y count from the centre."""
+    """Pinhole camera with a square detector: +Z is the boresight, pixels count from the centre."""
 
     side_px: int = 1024
     focal_px: float = 5852.0
 
     @property
     def pixel_rad(self) -> float:
-        """The angle of one pixel at the centre: 35.25 arcsec."""
+        """Angle of one pixel at the centre, in radians (35.25 arcsec by default)."""
         return 1.0 / self.focal_px
 
     @property
     def field_deg(self) -> float:
-        """The full angle between two opposite edges."""
+        """Full angle between opposite edges of the detector, in degrees."""
         return 2.0 * math.degrees(math.atan(0.5 * self.side_px / self.focal_px))
 
     def pixels(self, direction: Vector) -> Vector:
-        """Places (n, 2) from the centre, in pixels, of directions (n, 3) before the camera."""
+        """Pixel coordinates (n, 2) from the centre for directions (n, 3) in camera axes."""
         return np.asarray(direction[:, :2] / direction[:, 2:] * self.focal_px)
 
     def directions(self, pixels: Vector) -> Vector:
-        """Unit vectors (n, 3) in camera axes of places (n, 2) from the centre."""
+        """Unit vectors (n, 3) in camera axes from pixel coordinates (n, 2)."""
         return unit(np.column_stack([pixels, np.full(len(pixels), self.focal_px)]))
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions under which a scene is drawn: noise, limits and numbers of stars."""
+    """Conditions of a simulated scene: noise, limits and numbers of stars."""
 
     position_px: float = 1.0
-    """One standard deviation per axis of the detector."""
+    """Standard deviation of star positions per detector axis, in pixels."""
     magnitude_sigma_mag: float = 0.5
     limit_mag: float = 6.0
     radius_deg: float | None = None
-    """A circle about the boresight, in place of the whole square."""
+    """Radius of a circular field about the boresight; None: the square detector."""
     brightest: int | None = None
-    """Keep so many stars at most, those that are brightest in truth."""
+    """Greatest number of stars kept, those truly brightest; None: all."""
     fewest: int = 0
-    """Attitudes are drawn until so many stars are detected."""
+    """Least number of detected stars; attitudes are drawn again until reached."""
     spurious: int = 0
-    """Points that are no stars, anywhere in the field, as bright as detected stars are."""
+    """Number of false points anywhere in the field, as bright as detected stars."""
     camera: PinholeCamera = PinholeCamera()
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """The detected points of one image, brightest first, with the truth.
+    """Simulated image: detected points, brightest first, with the truth.
 
     `direction` (n, 3) are unit vectors in camera axes, +Z the boresight;
     `sigma_rad` (n,) one standard deviation per tangent axis; `star` (n,) rows
@@ -91,17 +90,17 @@ class Scene:
     complete: bool = True
 
     def mirrored(self) -> "Scene":
-        """The scene as a mirror shows it: no rotation takes the sky to it."""
+        """Mirror image of the scene, which no rotation of the sky reproduces."""
         return replace(self, direction=read_only(self.direction * np.array([-1.0, 1.0, 1.0])))
 
     def with_focal_error(self, share: float) -> "Scene":
-        """The scene as a camera measures it that takes its focal length for `share` too long."""
+        """Scene of a camera whose assumed focal length is too long by the fraction `share`."""
         return replace(
             self, direction=read_only(unit(self.direction * np.array([1.0, 1.0, 1.0 + share])))
         )
 
     def off_from(self, attitude: Matrix) -> tuple[float, float]:
-        """Degrees by which another attitude is off: of its boresight, and in total rotation."""
+        """Errors of another attitude in degrees: of its boresight, and of the whole rotation."""
         turn = attitude @ self.attitude.T
         return (
             math.degrees(math.atan2(math.hypot(turn[0, 2], turn[1, 2]), turn[2, 2])),
@@ -120,13 +119,13 @@ class Scene:
 
 @dataclass(frozen=True)
 class SceneSky:
-    """The stars that scenes are drawn from, brightest first."""
+    """Stars that scenes are drawn from, brightest first."""
 
     run_catalog: RunCatalog
 
     @classmethod
     def to_magnitude(cls, limit_mag: float, catalog: Catalog | None = None) -> "SceneSky":
-        """The sky to a limit; that to a brighter limit has the same rows, only fewer."""
+        """Stars down to a magnitude limit; a brighter limit gives the same rows, only fewer."""
         settings = RunCatalogSettings(
             magnitude_limit_mag=limit_mag, merge_within_arcsec=MERGE_WITHIN_ARCSEC
         )
@@ -134,7 +133,7 @@ class SceneSky:
 
     @classmethod
     def for_conditions(cls, conditions: Conditions) -> "SceneSky":
-        """A sky deep enough that noise may add every star that it can."""
+        """Stars down to the faintest magnitude that noise can bring within the limit."""
         return cls.to_magnitude(
             conditions.limit_mag + FAINTEST_SIGMA * conditions.magnitude_sigma_mag
         )
@@ -154,16 +153,16 @@ class SceneSky:
 def draw_scenes(
     sky: SceneSky, conditions: Conditions, count: int, seed: int, first: int = 0
 ) -> Iterator[Scene]:
-    """Scenes `first` to `first + count` of a seed, at attitudes spread evenly over all rotations.
+    """Draw scenes `first` to `first + count` of a seed, at uniformly random attitudes.
 
-    Raises `ValueError` where no field of the sky holds as many stars as are asked for.
+    Raises `ValueError` if no field of the sky has the requested number of stars.
     """
     for number in range(first, first + count):
         yield draw_scene(sky, conditions, np.random.default_rng([seed, number]))
 
 
 def draw_scene(sky: SceneSky, conditions: Conditions, rng: np.random.Generator) -> Scene:
-    """One scene; see `draw_scenes`."""
+    """Draw one scene at a random attitude; see `draw_scenes`."""
     for _ in range(MAX_TRIES):
         attitude = matrix_from_quaternion(unit(rng.normal(size=4)))
         row, direction, magnitude = _detected(sky, conditions, attitude, rng)
@@ -189,7 +188,7 @@ def draw_scene(sky: SceneSky, conditions: Conditions, rng: np.random.Generator) 
 def draw_random_points(
     sky: SceneSky, conditions: Conditions, points: int, rng: np.random.Generator
 ) -> Scene:
-    """A field of points that are no stars, as bright as stars are."""
+    """Draw a scene of false points only, as bright as stars."""
     return _scene(
         conditions.camera,
         _anywhere(conditions, points, rng),
@@ -204,7 +203,7 @@ def draw_random_points(
 def _detected(
     sky: SceneSky, conditions: Conditions, attitude: Matrix, rng: np.random.Generator
 ) -> tuple[npt.NDArray[np.int64], Vector, Vector]:
-    """Rows, directions in camera axes and measured magnitudes of the stars that are seen."""
+    """Rows, directions in camera axes and measured magnitudes of the detected stars."""
     camera = conditions.camera
     half = 0.5 * camera.side_px / camera.focal_px
     radius_deg = conditions.radius_deg
@@ -220,7 +219,7 @@ def _detected(
 
 
 def _anywhere(conditions: Conditions, count: int, rng: np.random.Generator) -> Vector:
-    """Places (count, 2) in pixels, spread evenly over the field."""
+    """Random points (count, 2) in pixels, uniform over the field."""
     camera = conditions.camera
     if conditions.radius_deg is None:
         return rng.uniform(-0.5, 0.5, (count, 2)) * camera.side_px
@@ -232,7 +231,7 @@ def _anywhere(conditions: Conditions, count: int, rng: np.random.Generator) -> V
 def _as_bright(
     sky: SceneSky, conditions: Conditions, count: int, rng: np.random.Generator
 ) -> Vector:
-    """Magnitudes drawn from those of the sky's stars within the limit."""
+    """Random magnitudes from those of the sky's stars within the limit."""
     magnitude = sky.run_catalog.magnitude_mag
     return rng.choice(magnitude[: np.searchsorted(magnitude, conditions.limit_mag)], count)
 

@@ -1,4 +1,4 @@
-"""How answers compare with the truth: stars right and wrong, attitude errors beside their sigma."""
+"""Comparison of answers with the truth: right and wrong stars, attitude errors and sigmas."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -12,26 +12,26 @@ from service.vectors import attitude_error_arcsec, matrix_from_quaternion
 CHI_SQUARE_997 = 14.16
 """The 99.73 % point of chi-square with three degrees of freedom."""
 GAUSSIAN_MEDIAN = 0.6745
-"""The median of |x| for x of sigma one: a median over this is a sigma that outliers cannot move."""
+"""Median of |x| for a Gaussian x with sigma one, to estimate sigma robustly by a median."""
 
 
 @dataclass
 class Score:
-    """The result of the batches of one kind of stretch."""
+    """Accumulated comparison of answers with the truth, for batches with one kind of error."""
 
     batches: int = 0
     refused: int = 0
     stars: Counter[str] = field(default_factory=Counter)
-    """Counts by outcome, `observed` for all, and `wrong`: unique, but not the true star."""
+    """Numbers of stars by outcome, `observed` for all, and `wrong`: unique, but a false star."""
     worst_axis_arcsec: list[float] = field(default_factory=list)
     predicted_arcsec: list[float] = field(default_factory=list)
     chi_square: list[float] = field(default_factory=list)
-    """e^T P^-1 e of each attitude, e being its error and P its covariance."""
+    """Normalised error e^T P^-1 e of each attitude, with its error e and covariance P."""
     solving_us: list[float] = field(default_factory=list)
     whole_us: list[float] = field(default_factory=list)
 
     def add(self, answer: Mapping[str, Any], truth: Mapping[str, Any]) -> None:
-        """Count one answer; its truth is of the same batch."""
+        """Count one answer, compared with the truth of its batch."""
         self.batches += 1
         true_of = {each["tracker"]: each["stars"] for each in truth["observations"]}
         for tracker in answer["observations"]:
@@ -57,13 +57,13 @@ class Score:
         self.chi_square.append(float(error @ np.linalg.solve(covariance, error)))
 
     def percent(self, outcome: str) -> float:
-        """The share of all observed stars, NaN where there were none."""
+        """Percentage of the observed stars with an outcome, NaN without stars."""
         observed = self.stars["observed"]
         return 100.0 * self.stars[outcome] / observed if observed else float("nan")
 
     @property
     def attitudes(self) -> int:
-        """Batches that gave an attitude."""
+        """Number of batches with an attitude."""
         return len(self.chi_square)
 
     @property
@@ -73,30 +73,30 @@ class Score:
 
     @property
     def predicted_sigma_arcsec(self) -> float:
-        """The same as the covariances predict it."""
+        """Error about the worst axis of each attitude as predicted by covariances, in arcsec."""
         return _median(self.predicted_arcsec)
 
     @property
     def within_percent(self) -> float:
-        """The share of attitudes inside the ellipsoid that should hold 99.73 % of them."""
+        """Percentage of attitudes within the 99.73 % error ellipsoid."""
         inside = sum(each <= CHI_SQUARE_997 for each in self.chi_square)
         return 100.0 * inside / self.attitudes if self.attitudes else float("nan")
 
     @property
     def median_solving_us(self) -> float:
-        """Identification and solution together."""
+        """Median time of identification and solution together, in microseconds."""
         return _median(self.solving_us)
 
     @property
     def median_whole_us(self) -> float:
-        """Every step that the answer tells the time of, recording included."""
+        """Median time of all steps of an answer, recording included, in microseconds."""
         return _median(self.whole_us)
 
 
 def score(
     results: Iterable[Mapping[str, Any]], truths: Iterable[Mapping[str, Any]]
 ) -> dict[str, Score]:
-    """The scores by stretch, `nominal` among them, of results and truths in the same order.
+    """Score results against truths in the same order; one score per kind of interval.
 
     A refused batch is counted as such and has no stars.
     """
@@ -111,7 +111,7 @@ def score(
 
 
 def together(scores: Iterable[Score]) -> Score:
-    """Several scores as one."""
+    """Sum of several scores."""
     whole = Score()
     for each in scores:
         whole.batches += each.batches
@@ -128,7 +128,7 @@ def _median(values: list[float]) -> float:
 
 
 def score_table(scores: dict[str, dict[str, Score]]) -> str:
-    """A table with a line of nominal stretches and one of those with errors for each mission."""
+    """Table of scores, with a row each for nominal intervals and for errors of every mission."""
     head = (
         f"{'':<15}{'batches':>8}{'stars':>7}{'unique':>9}{'ambig.':>8}{'unmatch.':>9}{'wrong':>8}"
         f"{'attitudes':>11}{'error':>8}{'sigma':>7}{'within':>8}{'solve':>8}{'whole':>8}"

@@ -1,8 +1,8 @@
-"""The sky as the trackers of a turning, moving spacecraft see it, and their measurements.
+"""Simulated star measurements of the trackers on a rotating, moving spacecraft.
 
-Each star is where it appears from the moving spacecraft while the body turns
-with constant rates, measured at its own time: carried to the batch's epoch, it
-lies where the attitude of the epoch puts it.
+Each star is at its apparent place for the moving spacecraft while the body turns with constant
+rates, measured at its own time: carried to the batch's epoch, it lies where the attitude at the
+epoch puts it.
 """
 
 import math
@@ -35,19 +35,19 @@ from service.vectors import ARCSEC_PER_RADIAN, Matrix, Vector, rotate_about, uni
 
 TIME_OFFSET_S = 0.5
 MAGNITUDE_CUT_SIGMA = 6.0
-"""0.6 mag for a tracker with 0.1: the paper's RCMAG."""
+"""Sigmas at which magnitude errors are cut: 0.6 mag for a sigma of 0.1, the paper's RCMAG."""
 
 
 @dataclass(frozen=True)
 class Seen:
-    """Stars of one tracker: true directions in tracker axes, each at its own time."""
+    """Stars in one tracker's field: true directions in tracker axes, each at its own time."""
 
     tracker: Tracker
     direction: Vector
     offset_s: Vector
     magnitude: Vector
     star: npt.NDArray[np.intp]
-    """Rows of the run catalog, -1 for a spurious star."""
+    """Rows of the run catalog, -1 for a false star."""
 
 
 # The sky as it is at one time and place, whatever a run catalog says of it.
@@ -63,27 +63,27 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class RealSky:
-    """The stars of a run catalog with the real ones behind each: one, or those seen as a blend.
+    """Stars of a run catalog with the catalog stars that each consists of, one or a blend.
 
-    A tracker cannot separate what the mission merges: it sees one star, in the
-    components' centre of light and as bright as all of them.
+    A tracker cannot separate stars that the mission merges: it sees one star, at the components'
+    centre of light and with their total brightness.
     """
 
     catalog: Catalog
     run: RunCatalog
     component: Rows
-    """Rows of the catalog, those of one star beside each other, in the run catalog's order."""
+    """Catalog rows of the components, grouped by star in the order of the run catalog."""
     first: Rows
-    """First row of each star's components, and the end of the last star's."""
+    """Index of each star's first component, and the end of the last star's."""
     light: Vector
-    """The light of each component, in the mission's instrument."""
+    """Light of each component in the mission's instrument."""
     magnitude_mag: Vector
-    """The magnitude of each star, all its components together."""
+    """Total magnitude of each star's components."""
 
     def directions(self, star: Rows, time: Utc, position_km: Vector) -> Vector:
-        """Unit vectors (n, 3), ICRS, from a spacecraft at a geocentric position to some stars.
+        """Unit vectors (n, 3), ICRS, from a spacecraft at a geocentric position to given stars.
 
-        Proper motion to the very time, and parallax; aberration is not in them.
+        Includes proper motion up to the given time, and parallax, but no aberration.
         """
         count = self.first[star + 1] - self.first[star]
         start = np.cumsum(count) - count
@@ -104,7 +104,7 @@ class RealSky:
 
 @lru_cache(maxsize=4)
 def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) -> RealSky:
-    """The sky behind the stars of a run catalog that was made with these settings."""
+    """Group the catalog stars behind each star of a run catalog made with these settings."""
     alone = instrument_magnitude(catalog, settings.color_polynomial_mag)
     then = moved(
         catalog.ra_deg,
@@ -127,14 +127,14 @@ def real_sky(catalog: Catalog, settings: RunCatalogSettings, run: RunCatalog) ->
 
 
 def observer_position_au(time: Utc, position_km: Vector) -> Vector:
-    """Position (3,) from the solar system's barycentre of a spacecraft at a geocentric position."""
+    """Barycentric position (3,) in au of a spacecraft at a geocentric position."""
     _, barycentric, _ = ufunc.epv00(*time.tt)
     return np.asarray(barycentric["p"] + position_km / KM_PER_AU)
 
 
 @dataclass(frozen=True)
 class BatchScene:
-    """The sky about one batch, and what befalls its stars."""
+    """Conditions of one simulated batch: sky, time, motion, noise and errors."""
 
     mission: Mission
     sky: RealSky
@@ -150,9 +150,9 @@ class BatchScene:
     missing_share: float = 0.0
 
     def look(self, attitude: Matrix, most: int) -> tuple[Matrix, list[Seen]]:
-        """Up to `most` stars a tracker; where no tracker sees any, from an attitude nearby.
+        """Up to `most` stars per tracker; the attitude is moved until some tracker has a star.
 
-        A spacecraft that keeps its pole only rolls for it.
+        A spacecraft with a fixed pole only rolls for that.
         """
         keeps_pole = isinstance(self.mission.zone, Band)
         while True:
@@ -195,7 +195,7 @@ class BatchScene:
         return np.asarray(self.sky.magnitude_mag[row] <= tracker.limit_mag)
 
     def measured(self, seen: Seen, as_angles: bool) -> list[dict[str, Any]]:
-        """The stars as they are sent, with noise; a scanning tracker's has that of its scan."""
+        """Star measurements with noise in the form sent to the service, as the tracker scans."""
         kind, size = self.stretch.kind, self.stretch.size
         own_arcsec = seen.tracker.sigma_arcsec if self.noise_arcsec is None else self.noise_arcsec
         sigma_arcsec = size if kind == "position_error" else own_arcsec
@@ -227,7 +227,7 @@ class BatchScene:
 
 
 def in_field(tracker: Tracker, direction: Vector) -> npt.NDArray[np.bool_]:
-    """True for each direction (n, 3), in tracker axes, within the tracker's field of view."""
+    """Mask of directions (n, 3), in tracker axes, within the tracker's field of view."""
     inside = direction[:, 2] >= tracker.least_cosine
     if tracker.field_of_view_deg is not None:
         tangent = np.tan(np.radians(tracker.field_of_view_deg) / 2.0)
@@ -236,7 +236,7 @@ def in_field(tracker: Tracker, direction: Vector) -> npt.NDArray[np.bool_]:
 
 
 def anywhere_in_field(tracker: Tracker, count: int, rng: np.random.Generator) -> Vector:
-    """Directions (count, 3) drawn evenly over a tracker's field of view, in its axes."""
+    """Random directions (count, 3), uniform over a tracker's field of view, in its axes."""
     radius_rad = math.radians(tracker.field_of_view_radius_deg)
     direction = anywhere(radius_rad, count, rng)
     while (outside := ~in_field(tracker, direction)).any():
@@ -245,7 +245,7 @@ def anywhere_in_field(tracker: Tracker, count: int, rng: np.random.Generator) ->
 
 
 def anywhere(radius_rad: float, count: int, rng: np.random.Generator) -> Vector:
-    """Directions (count, 3) drawn evenly over a circle about +Z."""
+    """Random directions (count, 3), uniform over a circle about +Z."""
     z = rng.uniform(math.cos(radius_rad), 1.0, count)
     angle = rng.uniform(0.0, math.tau, count)
     across = np.sqrt(1.0 - z * z)
@@ -253,7 +253,7 @@ def anywhere(radius_rad: float, count: int, rng: np.random.Generator) -> Vector:
 
 
 def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vector:
-    """Directions (n, 3) with Gaussian noise of one sigma on each of two tangent axes."""
+    """Add Gaussian noise of one sigma per tangent axis to directions (n, 3)."""
     aside, above = across(direction)
     noise = rng.normal(0.0, sigma_rad, (len(direction), 2))
     return unit(direction + noise[:, :1] * aside + noise[:, 1:] * above)
@@ -261,7 +261,7 @@ def shaken(direction: Vector, sigma_rad: float, rng: np.random.Generator) -> Vec
 
 IMAGE_SIGMA_SAMPLES = 1.2
 LIGHT_OVER_NOISE = 300.0
-"""The light of a star of `LIGHT_AT_MAG`: the sum of its samples over the noise of one."""
+"""Ratio of the summed samples of a `LIGHT_AT_MAG` star to the noise of one sample."""
 LIGHT_AT_MAG, FAINTEST_MAG = 5.0, 7.5
 FULL_SHARE = 0.8
 MOST_STEPS_OFF = 2.0
@@ -275,11 +275,11 @@ def readings(
     magnitude_mag: float,
     rng: np.random.Generator,
 ) -> dict[str, Any] | None:
-    """The fields of a star that the tracker's scan gives, with their noise.
+    """Simulated readings of a scanning tracker for one star, with noise.
 
-    `direction` (3,) is in tracker axes, at the star's time; a sweep begins then, and the body
-    turns on with `rates_rad_per_s` (3,), about the tracker's axes.  None where the scan does not
-    reach the star, and for a raster, which has no stars by themselves.
+    `direction` (3,) is in tracker axes, at the star's time; a sweep begins then, and the body turns
+    on with `rates_rad_per_s` (3,), about the tracker's axes.  None if the scan does not reach the
+    star, and for a raster, which does not report single stars.
     """
     if isinstance(tracker.scan, CrossScan):
         return _counts(tracker, tracker.scan, direction, magnitude_mag, rng)

@@ -1,4 +1,4 @@
-"""The description of a pass: its length, its stars, and the stretches where things go wrong."""
+"""Description of a simulated pass: length, stars, and periods with errors."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
@@ -12,17 +12,18 @@ PriorKind = Literal["quaternion", "direction", "mixed", "none"]
 Kind = Literal["nominal", "attitude_error", "spurious", "magnitude_error", "position_error"]
 
 DEFAULT_START = "1999-03-01T00:00:00.000Z"
-"""A day on which XTE and SWAS were both at work."""
+"""Default start of a pass with a cap, when XTE and SWAS were both operating."""
 BAND_START = "1996-04-16T00:00:00.000Z"
-"""The end of SOHO's commissioning.  In mid January and mid July its band crosses Carina, where
-stars stand closest and a few in ten thousand are taken for another."""
+"""Default start of a pass with a band, at the end of SOHO's commissioning.  In mid January and mid
+July its band crosses Carina, where stars are densest and a few in ten thousand are confused.
+"""
 CAP_CADENCE_S, BAND_CADENCE_S = 30.0, 300.0
 CAP_ATTITUDE_ERROR_DEG, BAND_ATTITUDE_ERROR_DEG = 10.0, 5.0
 
 
 @dataclass(frozen=True)
 class Trouble:
-    """A kind of error: the share of the pass that has it, and its size in the kind's own unit."""
+    """A simulated error: its share of the pass, and its size in a unit of its own."""
 
     share: float = 0.0
     size: float | None = None
@@ -30,13 +31,12 @@ class Trouble:
 
 @dataclass(frozen=True)
 class Troubles:
-    """The stretches of a pass, one of each kind in this order; a share of zero leaves one out.
+    """Simulated errors of a pass, one period per kind in this order; none for a share of zero.
 
-    `attitude_error` grows through its stretch up to its size: about each axis
-    in a cap, of the pole in a band (degrees).  `spurious` puts that many false
-    stars in the place of real ones.  The sizes of `magnitude_error` (mag) and
-    `position_error` (arcsec per tangent axis) are standard deviations that
-    take the place of the tracker's own.
+    `attitude_error` grows through its period up to its size: about each axis in a cap, of the pole
+    in a band (degrees).  `spurious` replaces that many real stars by false ones.  The sizes of
+    `magnitude_error` (mag) and `position_error` (arcsec per tangent axis) are standard deviations
+    that replace the tracker's own.
     """
 
     attitude_error: Trouble = Trouble(0.1)
@@ -57,7 +57,7 @@ NO_TROUBLES = Troubles(Trouble(), Trouble(), Trouble(), Trouble())
 
 @dataclass(frozen=True)
 class Stretch:
-    """The conditions of one batch: the kind of trouble, its size, and how far into it (0 to 1)."""
+    """Simulated error of one batch: its kind, its size, and the progress through it (0 to 1)."""
 
     kind: Kind = "nominal"
     size: float = 0.0
@@ -65,18 +65,18 @@ class Stretch:
 
 
 USUAL_STARS = 5
-"""The most stars of a tracker that sends no frames, as in the paper."""
+"""Greatest number of stars of a tracker that sends no frames, as in the paper."""
 
 
 def usual_stars(mission: Mission) -> int:
-    """The most stars that a tracker of the mission reports: of a camera as many as it sends."""
+    """Greatest number of stars that a mission's tracker reports; for a camera its own limit."""
     cameras = [each.camera for each in mission.trackers if each.camera is not None]
     return max((each.most_stars for each in cameras), default=USUAL_STARS)
 
 
 @dataclass(frozen=True)
 class Pass:
-    """Everything that decides what telemetry is drawn; the same pass is always drawn the same."""
+    """All parameters of simulated telemetry; equal parameters give equal telemetry."""
 
     batches: int
     seed: int = 1
@@ -85,16 +85,17 @@ class Pass:
     stars: int = USUAL_STARS
     prior: PriorKind = "quaternion"
     angles_share: float = 0.25
-    """The share of batches whose stars come as `h_deg`, `v_deg`; the others come as vectors."""
+    """Share of batches with stars as angles `h_deg`, `v_deg`; the others have vectors."""
     aberration: Mapping[Aberration, float] = field(default_factory=lambda: {"to_correct": 1.0})
     troubles: Troubles = Troubles()
     a_priori_error_deg: float | None = None
-    """Largest error of the a priori attitude about each axis, in bands of the pole; None: the
-    mission's own."""
+    """Largest error of the a priori attitude about each axis, in bands of the pole, in degrees;
+    None: the mission's own.
+    """
     noise_arcsec: float | None = None
-    """Sigma of positions along each tangent axis; None: that of each tracker."""
+    """Sigma of star positions along each tangent axis, in arcsec; None: that of each tracker."""
     false_stars: int = 0
-    """Random points in place of real stars, in every batch."""
+    """Number of random points that replace real stars, in every batch."""
     missing_share: float = 0.0
     """Share of the stars in the field of view that the trackers do not report."""
 
@@ -136,13 +137,13 @@ class Pass:
         _require(total <= 1, "shares", "the stretches must not be more than the pass", total)
 
     def error_deg_of(self, mission: Mission) -> float:
-        """Largest error of the a priori attitude about each axis, in bands of the pole."""
+        """Largest error of the a priori attitude per axis, in bands of the pole, in degrees."""
         if self.a_priori_error_deg is None:
             return mission.presumed_error_deg
         return self.a_priori_error_deg
 
     def start_of(self, mission: Mission) -> str:
-        """The time of the first batch."""
+        """Time of the first batch of the pass."""
         default = BAND_START if isinstance(mission.zone, Band) else DEFAULT_START
         return default if self.start is None else self.start
 
@@ -152,7 +153,7 @@ class Pass:
         return default if self.cadence_s is None else self.cadence_s
 
     def stretches(self, mission: Mission) -> list[Stretch]:
-        """Nominal or faulty stretch of each batch; nominal ones lie evenly about the faults."""
+        """Simulated error of each batch, or nominal; nominal batches lie evenly around errors."""
         in_band = isinstance(mission.zone, Band)
         default = BAND_ATTITUDE_ERROR_DEG if in_band else CAP_ATTITUDE_ERROR_DEG
         wanted = [

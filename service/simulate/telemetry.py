@@ -1,15 +1,14 @@
-"""Sample telemetry: a pass drawn from the real sky, with its truth.
+"""Simulated telemetry: a pass drawn from the real sky, with its truth.
 
-The stars stand where they are at the batch's own time, seen from where the
-spacecraft is and with its speed; how the service knows them is another matter,
-and only their names are its own.  The truth is kept beside the batch and never
-enters it.
+Stars are at their places at the batch's own time, seen from the spacecraft's position and with its
+velocity; of the service's catalog only the names of stars are used.  The truth is kept next to the
+batch and never enters it.
 
-A gyro may stand beside a drawn pass: its samples, as blocks, with the errors that gyros have.
-Between two batches the body turns at a constant rate from one true attitude to the next.  The
-gyro integrates that rate about its axes: it has a bias that walks, noise, errors of scale and
-alignment (Farrenkopf's model), counts whole steps of angle, may fall silent, and its clock,
-which is also that of the trackers, may step.
+A pass may include a gyro: its samples in blocks, with realistic errors.  Between two batches the
+body turns at a constant rate from one true attitude to the next.  The gyro integrates that rate
+about its axes: it has a bias that walks, noise, errors of scale and alignment (Farrenkopf's model),
+counts whole steps of angle, may fall silent, and its clock, which is also that of the trackers, may
+step.
 """
 
 import json
@@ -41,7 +40,7 @@ from service.vectors import ARCSEC_PER_RADIAN, Vector, rotation_vectors
 
 @dataclass(frozen=True)
 class DrawnBatch:
-    """One batch as it is sent, and what is true of it; both ready for JSON.
+    """A simulated batch as sent to the service, and its truth; both ready for JSON.
 
     `gyro` are gyro blocks that are sent with it.
     """
@@ -52,11 +51,10 @@ class DrawnBatch:
 
 
 def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBatch]:
-    """The batches of a pass, in order of time.
+    """Simulate the batches of a pass, in order of time.
 
-    Every batch has a random generator of its own, so that a change of one
-    leaves the others as they were; the mission's name makes its pass another
-    than that of its sister with the same seed.
+    Every batch has its own random generator, so that changing one leaves the others unchanged; the
+    mission's name is part of the seed.
     """
     start, cadence_s = parse_utc(wanted.start_of(mission), "start"), wanted.cadence_of(mission)
     root = (wanted.seed, *mission.name.encode())
@@ -116,9 +114,9 @@ def draw_pass(mission: Mission, sky: SkyModel, wanted: Pass) -> Iterator[DrawnBa
 
 
 def outside_zone(mission: Mission, drawn: DrawnBatch) -> bool:
-    """True if a field of view of the batch reaches beyond the zone about the a priori attitude.
+    """True if a field of view of the batch extends beyond the zone about the a priori attitude.
 
-    Its stars at that edge are not in the zone, and so cannot be identified there.
+    Stars outside of the zone cannot be identified in it.
     """
     prior, zone = drawn.batch["a_priori"], mission.zone
     if prior is None:
@@ -144,7 +142,7 @@ def outside_zone(mission: Mission, drawn: DrawnBatch) -> bool:
 def _motion(
     mission: Mission, rates: vectors.Vector, cadence_s: float, rng: np.random.Generator
 ) -> Iterable[vectors.Matrix | float]:
-    """The motion of each batch by its rates: the attitude, or the roll about a pole on the Sun."""
+    """Attitude of each batch by its rates, or the roll of a mission with its pole on the Sun."""
     if isinstance(mission.zone, Band):
         steps_rad = np.radians(rates @ mission.axis_body) * cadence_s
         rolls_rad: list[float] = (
@@ -158,7 +156,7 @@ def _motion(
 def _on_the_sun(
     scene: BatchScene, sun: vectors.Vector, roll_rad: float, limit: float, most: int
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
-    """A pole close to the Sun; the a priori attitude has it on the Sun, with any roll."""
+    """Attitude with a pole near the Sun; a priori attitude with the pole on it and any roll."""
     rng, stretch, axis = scene.rng, scene.stretch, scene.mission.axis_body
     tilt_deg = rng.uniform(0.0, limit)
     if stretch.kind == "attitude_error":
@@ -175,7 +173,7 @@ def _on_the_sky(
     limit: float,
     most: int,
 ) -> tuple[vectors.Matrix, vectors.Matrix, list[Seen]]:
-    """Anywhere; the a priori attitude is off: attitude = R1(psi) R2(theta) R3(phi) a priori."""
+    """Any attitude and an erroneous a priori one: attitude = R1(psi) R2(theta) R3(phi) prior."""
     rng, stretch = scene.rng, scene.stretch
     attitude, seen = scene.look(attitude, most)
     angles = rng.uniform(-limit, limit, 3)
@@ -188,14 +186,14 @@ def _on_the_sky(
 
 
 def _as_sent(attitude: vectors.Matrix) -> vectors.Matrix:
-    """The attitude of the quaternion as it is written."""
+    """Attitude after rounding its quaternion as sent."""
     return vectors.matrix_from_quaternion(
         vectors.unit(np.round(vectors.quaternion_from_matrix(attitude), 10))
     )
 
 
 def _rounded(time: Utc) -> Utc:
-    """The time to the millisecond, as it is sent."""
+    """Time rounded to the millisecond, as sent."""
     nanoseconds = round(float(time.text[19:-1]) * 1e3) * 1_000_000
     whole = parse_utc(time.text[:19])
     return shifted(whole, nanoseconds * 1e-9) if nanoseconds else whole
@@ -243,15 +241,15 @@ def _truth(
 
 
 def truth_path(telemetry: Path) -> Path:
-    """The truth of a telemetry file: OUT.truth.ndjson beside OUT.ndjson."""
+    """Path of the truth of a telemetry file: OUT.truth.ndjson next to OUT.ndjson."""
     return telemetry.with_name(f"{telemetry.stem}.truth.ndjson")
 
 
 def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
-    """Write batches (NDJSON, or CSV by the name) and their truth; how many there were.
+    """Write simulated batches (NDJSON, or CSV by file name) and their truth; returns their number.
 
-    NDJSON also gets the gyro blocks, each after its batch.
-    Both files appear when they are whole: a pass cut short leaves the old ones.
+    NDJSON also gets the gyro blocks, each after its batch.  Both files appear when complete: an
+    interrupted pass leaves the old ones.
     """
     count = 0
 
@@ -278,7 +276,7 @@ def write_pass(drawn: Iterable[DrawnBatch], telemetry: Path) -> int:
 
 
 def read_objects(path: Path) -> Iterator[dict[str, Any]]:
-    """The JSON objects of a file of the service's own making, one a line."""
+    """JSON objects of a trusted NDJSON file, one per line."""
     with path.open("rb") as file:
         for line in file:
             yield json.loads(line)
@@ -303,9 +301,9 @@ def _appearing(path: Path) -> Iterator[TextIO]:
 
 SAMPLES_OF_A_BLOCK = 1_000
 GAP_AT, CLOCK_STEP_AT = 0.4, 0.7
-"""Shares of the pass at which a gap begins and the clock steps."""
+"""Shares of the pass at which a gyro gap begins and the clock steps."""
 _DIGITS = 12
-"""The digits of a rate in rad/s: far below the noise of any gyro."""
+"""Decimals of a rate in rad/s: far below the noise of any gyro."""
 
 
 @dataclass(frozen=True)
@@ -333,7 +331,8 @@ class GyroWanted:
 def with_gyro(
     drawn: Iterable[DrawnBatch], mission: Mission, wanted: GyroWanted, duration_s: float, seed: int
 ) -> Iterator[DrawnBatch]:
-    """The batches of a pass of a known duration, each with the gyro blocks that end by then.
+    """Add gyro blocks to the batches of a pass of a known duration, each with the blocks ended by
+    then.
 
     Raises `BadInput` for a mission that does not describe its gyro.
     """
@@ -355,7 +354,7 @@ def with_gyro(
 
 
 class _Gyro:
-    """A gyro at work: its errors, and the samples that are not in a block yet.
+    """Simulated gyro: its error state, and the samples that are not in a block yet.
 
     Times are seconds since the first batch, by a true clock.
     """
@@ -388,11 +387,11 @@ class _Gyro:
         self._blocks: list[dict[str, Any]] = []
 
     def begin(self, first: DrawnBatch) -> None:
-        """Begin with the time of the first batch."""
+        """Set the start of the simulation to the time of the first batch."""
         self._start = parse_utc(first.truth["time"])
 
     def turn(self, before: DrawnBatch, after: DrawnBatch) -> None:
-        """Sample the turn from a batch to the next."""
+        """Sample the rotation from one batch to the next."""
         quaternions = np.array([each.truth["quaternion"] for each in (before, after)])
         times = [parse_utc(each.truth["time"]).tai_ns for each in (before, after)]
         assert self._start is not None
@@ -408,7 +407,7 @@ class _Gyro:
         self._at_s = end_s
 
     def by_its_clock(self, batch: DrawnBatch) -> DrawnBatch:
-        """A batch with the time of the clock that has stepped."""
+        """Batch with its time by the spacecraft clock, which may have stepped."""
         assert self._start is not None
         true = parse_utc(batch.truth["time"])
         later_s = self._later_s((true.tai_ns - self._start.tai_ns) * 1e-9)
@@ -420,17 +419,17 @@ class _Gyro:
         )
 
     def full_blocks(self) -> list[dict[str, Any]]:
-        """The blocks that are finished, once."""
+        """Blocks finished since the last call."""
         blocks, self._blocks = self._blocks, []
         return blocks
 
     def rest(self) -> list[dict[str, Any]]:
-        """The last block."""
+        """Finish and return the last block."""
         self._end_block()
         return self.full_blocks()
 
     def _sample(self, at_s: float, turned: Vector) -> None:
-        """Take a sample of the turn (3,) since the one before, in radians about the body axes."""
+        """Add a sample of the rotation (3,) since the last one, in radians about the body axes."""
         step_s, settings = self._wanted.step_s, self._settings
         walk = self._rng.normal(0.0, settings.sigma_u_rad_s1_5 * step_s**0.5, 3)
         mean_bias = self._bias + 0.5 * walk
@@ -473,5 +472,5 @@ class _Gyro:
         self._block = []
 
     def _later_s(self, at_s: float) -> float:
-        """How much later than the true time the clock is."""
+        """Offset of the spacecraft clock from true time, in seconds."""
         return self._wanted.clock_step_s if at_s >= self._stepped_at else 0.0

@@ -1,4 +1,4 @@
-"""The commands of `acquire`, a module each: `add` declares its arguments and the function it runs.
+"""Commands of `acquire`, one module each: `add` declares arguments and the function to run.
 
-A new module here is a new command; nothing else names it.
+Every module in this package is a command; nothing else lists them.
 """

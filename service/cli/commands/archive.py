@@ -1,4 +1,4 @@
-"""`acquire archive`: old batches in Parquet files, verified before they leave the database."""
+"""Command `acquire archive`: move old batches to Parquet files, verified before deletion."""
 
 from argparse import Namespace
 from contextlib import closing
@@ -19,7 +19,7 @@ FOLDER = "the archive; default: ACQUIRE_ARCHIVE_FOLDER"
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `archive` with `verify` and `restore`."""
     parser = arguments.add_command(commands, "archive", archive)
     parser.add_argument("--before", metavar="UTC", help="archive batches before this batch time")
     parser.add_argument("--to", type=Path, metavar="FOLDER", help=FOLDER)
@@ -144,7 +144,7 @@ def _folder(path: Path | None, option: str) -> Path:
 
 
 def _parts(parsed: Namespace) -> dict[str, str]:
-    """The hashes of the parts that the database has batches in, by path."""
+    """Hashes of the archive files that the database refers to, by path."""
     from service.storage.archive.reading import archived_paths
     from service.storage.readers import Readers
 

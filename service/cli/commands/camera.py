@@ -1,4 +1,4 @@
-"""`acquire camera`: calibrate a camera from pictures of the sky."""
+"""Command `acquire camera`: calibrate a camera from pictures of the sky."""
 
 import sys
 from argparse import Namespace
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `camera` with `calibrate`."""
     group = add_group(
         commands,
         "camera",
@@ -74,7 +74,7 @@ def run(parsed: Namespace) -> int:
 def _solved(
     parsed: Namespace, settings: "Settings", sky: "BrightStars", solver: "BlindSolver"
 ) -> list["PictureResult"]:
-    """The pictures with an attitude; why the others have none is printed."""
+    """Pictures for which an attitude was found; for the others the reason is printed."""
     from service.acquire.picture import solve_picture
     from service.cli.pictures import focal_guess_px, picture_reader
 
@@ -106,14 +106,14 @@ def _solved(
 
 
 def _mission_name(parsed: Namespace) -> str:
-    """The given name, or one derived from the name of the output file."""
+    """Mission name from the option, or derived from the name of the output file."""
     stem: str = parsed.output.stem
     letters = "".join(each if each.isalnum() or each in "_-" else "_" for each in stem)
     return str(parsed.name or letters.lstrip("_-").upper() or "CAMERA")
 
 
 def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
-    """Write the mission file, once it is known to be one that can be read."""
+    """Write the mission file of a camera, after checking that it can be read."""
     from service.acquire.camera_calibration import mission_text
     from service.missions.mission import parse_mission
 
@@ -123,7 +123,7 @@ def _write_mission(output: Path, name: str, found: "CameraCalibration") -> None:
 
 
 def _write_maps(output: Path, found: "CameraCalibration") -> list[Path]:
-    """Write the residuals before and after as pictures beside the mission file."""
+    """Draw the residuals before and after calibration as PNG files next to the mission file."""
     from service.imaging.overlay import draw_residuals
 
     size, usual_px = (found.lens.width_px, found.lens.height_px), max(found.rms_px[1], 1e-3)

@@ -1,4 +1,4 @@
-"""`acquire catalog`: star catalogs."""
+"""Command `acquire catalog`: build, import and export star catalogs."""
 
 import sys
 from argparse import Namespace
@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `catalog` with its subcommands."""
     group = add_group(
         commands,
         "catalog",

@@ -1,4 +1,4 @@
-"""`acquire completion`: complete commands and options in a shell."""
+"""Command `acquire completion`: completion of commands and options in a shell."""
 
 import argparse
 from argparse import Namespace
@@ -16,7 +16,7 @@ To have it in every shell from now on:
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `completion`."""
     parser = add_command(commands, "completion", run, notes=NOTES)
     parser.add_argument("shell", choices=SHELLS)
 
@@ -38,7 +38,7 @@ def run(parsed: Namespace) -> int:
 
 
 def _complete_files(parser: argparse.ArgumentParser, files: object) -> None:
-    """Let every argument that is a path complete the names of files."""
+    """Complete file names for all arguments that are paths."""
     for action in parser._actions:
         if action.type is Path:
             # The attribute that shtab reads; argparse does not declare it.

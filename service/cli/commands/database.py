@@ -1,4 +1,4 @@
-"""`acquire database`: the records as a whole."""
+"""Command `acquire database`: maintenance of the whole database."""
 
 import getpass
 import json
@@ -31,7 +31,7 @@ UNKNOWN_TABLES = "tables that no installed code knows, as those of a feature tha
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `database` with its subcommands."""
     group = arguments.add_group(
         commands,
         "database",
@@ -217,7 +217,7 @@ def verify(parsed: Namespace) -> int:
 
 
 def _text_of(given: str) -> str:
-    """The text of a file, or what was given where it names none."""
+    """Content of a file, or the argument itself if it is not a file."""
     if not os.path.isfile(given):
         return given
     try:
@@ -340,7 +340,7 @@ def prune(parsed: Namespace) -> int:
 
 
 def _beside(gyro_blocks: int, graded_days: int) -> str:
-    """The words on gyro blocks and graded days beside batches, if there are any."""
+    """Text about deleted gyro blocks and filtered days, empty without any."""
     counts = [f"{gyro_blocks} gyro blocks"] if gyro_blocks else []
     counts += [f"{graded_days} days of filtered attitudes"] if graded_days else []
     return "".join(f" and {each}" for each in counts)
@@ -416,7 +416,7 @@ def _note(parsed: Namespace) -> Any:
 
 
 def note(connection: "Connection", action: str, about: str, asked: dict[str, Any]) -> None:
-    """Add an entry to the audit list: the user of this command did this."""
+    """Add an audit entry for a change made by the user of this command."""
     from service.access import Entry
     from service.storage.recording.ids import Ulids
     from service.times import utc_now

@@ -1,4 +1,4 @@
-"""`acquire demo`: the service with sample passes."""
+"""Command `acquire demo`: run the service with simulated passes."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -8,7 +8,7 @@ from service.cli.arguments import add_command, add_json, count, settings_of
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `demo`."""
     parser = add_command(commands, "demo", run)
     parser.add_argument("--host", help="loopback address; default 127.0.0.1")
     parser.add_argument("--port", type=int, help="default 8000")

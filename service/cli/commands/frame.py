@@ -1,4 +1,4 @@
-"""`acquire frame`: find the stars on frames, identify them, solve for the attitude."""
+"""Command `acquire frame`: detect stars on frames, identify them, and solve for the attitude."""
 
 import json
 import math
@@ -20,7 +20,7 @@ FILE.fits, as `acquire simulate frames` writes it: the fields of a batch except 
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `frame`."""
     parser = arguments.add_command(
         commands,
         "frame",
@@ -74,7 +74,7 @@ def add(commands: Any) -> None:
 
 
 def _add_lens(parser: ArgumentParser) -> None:
-    """Options for the lens of a picture without a spacecraft."""
+    """Add options on the lens of pictures from an unknown camera."""
     lens = parser.add_argument_group(
         "without a spacecraft",
         "known data of the camera; values of its lens may be wrong by a quarter",
@@ -138,7 +138,7 @@ def run(parsed: Namespace) -> int:
 
 
 def _known(parsed: Namespace, file: Path) -> dict[str, Any]:
-    """The fields of the JSON file beside a frame, overridden by the command's options."""
+    """Metadata of a frame: from the JSON file next to it, overridden by options."""
     known: dict[str, Any] = {}
     beside = file.with_suffix(".json")
     if beside.is_file():
@@ -197,22 +197,22 @@ TIMEOUT_S = 120.0
 
 
 class FrameSubmitter(Protocol):
-    """Takes frames: a running service, or this process."""
+    """Processor of frames: a running service, or this process."""
 
     def submit(self, spacecraft: str, known: dict[str, Any], file: Path) -> bytes:
-        """Submit a frame and return the answer's JSON; raises `BadInput` or `FrameRefused`."""
+        """Submit a frame; returns the answer as JSON.  Raises `BadInput` or `FrameRefused`."""
 
     def overlay(self, id: str) -> bytes:
-        """The overlay of a result as PNG."""
+        """Picture of a result with its identified stars marked, as PNG."""
 
 
 class FrameRefused(AcquisitionError):
-    """The service refused a frame; the message is its own."""
+    """Raised if the service refuses a frame, with the message of the service."""
 
 
 @contextmanager
 def frame_submitter(parsed: Namespace, settings: Settings) -> Iterator[FrameSubmitter]:
-    """The way that the arguments choose, open while the block runs."""
+    """Context manager of the frame processor chosen by the options."""
     if parsed.in_process:
         from service.app.factory import open_app
 

@@ -1,4 +1,4 @@
-"""`acquire history`: the quantities of recorded batches as a table."""
+"""Command `acquire history`: quantities of recorded batches as a table."""
 
 import json
 from argparse import Namespace
@@ -13,7 +13,7 @@ from service.table_files.table import Table
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `history`."""
     parser = arguments.add_command(commands, "history", run)
     parser.add_argument("--spacecraft", required=True, metavar="NAME", help=arguments.MISSION)
     arguments.add_period(parser, "the run that is read; default live")

@@ -1,4 +1,4 @@
-"""`acquire mission`: mission files, for their authors."""
+"""Command `acquire mission`: create, check and show mission files."""
 
 import time
 from argparse import Namespace
@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 SECONDS, LEAST_SECONDS = 7.0, 2.0
-"""How long a check takes with its simulated views, and the least time for these."""
+"""CPU time in seconds for a check with simulated views, and the least part for the simulation."""
 NOTES = """\
 The exit code is 1 if the file has an error. Unusual settings are allowed, but rarely intended.
 Stars and pairs are counted for zones all over the sky; the map shows the pairs."""
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `mission` with its subcommands."""
     group = arguments.add_group(
         commands,
         "mission",
@@ -174,7 +174,7 @@ Memory is that of the largest zone as the service caches it, grown by the zone's
 
 
 def add_estimate(group: Any) -> None:
-    """Declare the command."""
+    """Declare the command `mission estimate`."""
     parser = arguments.add_command(group, "estimate", estimate, notes=ESTIMATE_NOTES)
     parser.add_argument(
         "mission", metavar="MISSION", help="the name of a spacecraft, or a mission file (.toml)"
@@ -261,7 +261,7 @@ def estimate(parsed: Namespace) -> int:
 
 
 def _changed(mission: "Mission", table: str, key: str, value: float, option: str) -> "Mission":
-    """The mission with another value; raises `BadInput` naming the option where it is no value."""
+    """Mission with one changed setting; raises `BadInput` naming the option of a bad value."""
     from pydantic import ValidationError
 
     from service.missions.faults import plain_message

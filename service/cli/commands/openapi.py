@@ -1,4 +1,4 @@
-"""`acquire openapi`: print, write or check the API's description."""
+"""Command `acquire openapi`: print, write or check the OpenAPI description."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -8,7 +8,7 @@ from service.cli.arguments import add_command
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `openapi`."""
     parser = add_command(commands, "openapi", run)
     way = parser.add_mutually_exclusive_group()
     way.add_argument("--output", type=Path, metavar="FILE")

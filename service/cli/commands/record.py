@@ -1,4 +1,4 @@
-"""`acquire record`: heads of the record, and proofs that a result is in it."""
+"""Command `acquire record`: signed heads of the record, and proofs that it contains a result."""
 
 from argparse import Namespace
 from pathlib import Path
@@ -11,7 +11,7 @@ PUBLIC_KEY = "the public key (PEM) of the key that signs the heads"
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `record` with its subcommands."""
     group = arguments.add_group(
         commands,
         "record",

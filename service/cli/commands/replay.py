@@ -1,4 +1,4 @@
-"""`acquire replay`: send files of batches through the service."""
+"""Command `acquire replay`: send files of telemetry to the service."""
 
 from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Sequence
@@ -19,7 +19,7 @@ DEFAULT_CONCURRENCY = 4
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `replay`."""
     parser = arguments.add_command(
         commands, "replay", run, first="--run --url --in-process --results --formats"
     )
@@ -190,7 +190,7 @@ def _send_batches(
 
 
 def _formats_text(name: str) -> str:
-    """The list of input formats, or what one of them holds, with an example."""
+    """List of the input formats, or the description of one with an example."""
     from service.observations.input_formats import input_format, input_formats
 
     if name:
@@ -205,7 +205,7 @@ def _formats_text(name: str) -> str:
 
 
 def _next_step(parsed: Namespace, run: str) -> str:
-    """The address of the run's page in the console, and what has to run for it."""
+    """Next step after a replay: the address of the run in the console, and how to serve it."""
     page = f"{service_url(parsed)}/?run={run}"
     if not parsed.in_process:
         return page
@@ -238,7 +238,7 @@ def _sources(parsed: Namespace) -> list["FromFile"]:
 
 
 def _is_in_bulk(parsed: Namespace) -> bool:
-    """False where each batch needs an answer of its own, or is sent at its own time."""
+    """True if files can be uploaded whole, as no option requires answers or timing by batch."""
     return not (
         parsed.in_process
         or parsed.carry_attitude
@@ -251,9 +251,9 @@ def _is_in_bulk(parsed: Namespace) -> bool:
 
 
 def _other_files(parsed: Namespace) -> "OtherFiles | None":
-    """The files of another form than lines that the options name, if they do.
+    """Telemetry files in another format than lines, if options name any; otherwise None.
 
-    Raises `BadInput` unless there are files of one form.
+    Raises `BadInput` unless files of exactly one format are given.
     """
     from service.observations.input_formats import input_formats
 
@@ -268,7 +268,7 @@ def _other_files(parsed: Namespace) -> "OtherFiles | None":
 
 
 def _checked_files(parsed: Namespace, other: "OtherFiles | None") -> Sequence[Path]:
-    """The files to send; one that is missing or is no telemetry is refused before that."""
+    """Check the files to send; raises for a missing file and for one without telemetry."""
     from service.observations.telemetry import require_telemetry
 
     files: Sequence[Path] = parsed.files if other is None else other.files

@@ -1,4 +1,4 @@
-"""`acquire reprocess`: run recorded batches again into another run, and compare both."""
+"""Command `acquire reprocess`: process recorded batches again into another run, and compare."""
 
 import sys
 from argparse import Namespace
@@ -19,7 +19,7 @@ settings name, and tcp:// only in a network that you trust.  The extra `dask` ha
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `reprocess`."""
     parser = arguments.add_command(
         commands, "reprocess", run, notes=SCHEDULER, first="--spacecraft --source --run --mission"
     )
@@ -144,7 +144,7 @@ def run(parsed: Namespace) -> int:
 
 
 def _chosen(parsed: Namespace) -> "tuple[Mission | None, str | None]":
-    """The mission of `--mission`, and the spacecraft whose batches are asked for."""
+    """Mission of `--mission`, and the spacecraft whose batches are processed; None: any."""
     from service.missions.mission import read_mission
 
     spacecraft: str | None = parsed.spacecraft
@@ -160,7 +160,7 @@ def _chosen(parsed: Namespace) -> "tuple[Mission | None, str | None]":
 
 
 def _check_track(parsed: Namespace) -> None:
-    """Raise `BadInput` for what --track cannot be with."""
+    """Raise `BadInput` for options that contradict `--track`."""
     if not parsed.track:
         return
     if parsed.archive is not None:
@@ -175,7 +175,7 @@ def _check_track(parsed: Namespace) -> None:
 
 
 def _check_archive(parsed: Namespace) -> None:
-    """Raise `BadInput` or `BadConfiguration` for what --archive and --scheduler cannot be."""
+    """Raise `BadInput` or `BadConfiguration` for invalid use of `--archive` and `--scheduler`."""
     from service.extras import require_extra
 
     if parsed.scheduler is not None and parsed.archive is None:

@@ -1,4 +1,4 @@
-"""`acquire serve`, which serves until told to stop, and `acquire prepare`, what its start needs."""
+"""Commands `acquire serve`, which runs the service, and `acquire prepare`, which readies it."""
 
 import faulthandler
 import gc
@@ -14,7 +14,7 @@ if the files cannot be written: the service works without them, but each start t
 
 
 def add(commands: Any) -> None:
-    """Declare the commands."""
+    """Declare the commands `serve` and `prepare`."""
     parser = add_command(commands, "serve", run)
     parser.add_argument(
         "--host",

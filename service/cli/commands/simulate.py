@@ -1,4 +1,4 @@
-"""`acquire simulate`: skies whose truth is known."""
+"""Command `acquire simulate`: telemetry and frames with known truth."""
 
 import sys
 from argparse import Namespace
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def add(commands: Any) -> None:
-    """Declare the group with its commands."""
+    """Declare the command `simulate` with its subcommands."""
     group = arguments.add_group(
         commands,
         "simulate",
@@ -321,7 +321,7 @@ def _run_telemetry(parsed: Namespace) -> int:
 
 
 def _drawn_text(wanted: "Pass", mission: "Mission") -> str:
-    """The errors of a pass in one line."""
+    """Simulated errors of a pass, in one line of text."""
     if wanted.prior == "none":
         parts = ["no a priori attitude"]
     else:
@@ -359,7 +359,7 @@ def _gyro_of(parsed: Namespace) -> "GyroWanted | None":
 
 
 def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
-    """The pass that the arguments describe; raises `BadInput` for an impossible one."""
+    """Parameters of a simulated pass from the options; raises `BadInput` for impossible ones."""
     from service.simulate.stretches import Pass, Trouble, Troubles, usual_stars
 
     troubles = {}
@@ -389,7 +389,7 @@ def _pass_of(parsed: Namespace, mission: "Mission") -> "Pass":
 
 
 def _shares(text: str) -> "dict[Aberration, float]":
-    """Words with their shares, as in `to_correct=0.5,ignore=0.5`; a word alone has all."""
+    """Parse words with shares, as in `to_correct=0.5,ignore=0.5`; a single word has share 1."""
     shares: dict[str, float] = {}
     for part in text.split(","):
         word, _, share = part.partition("=")

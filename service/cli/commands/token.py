@@ -1,6 +1,6 @@
-"""`acquire token`: who may use the service.
+"""Command `acquire token`: access tokens of the service.
 
-The commands write into the database; where a service writes to its SQLite file, through that.
+Changes are made in the database, or through a running service that writes to its SQLite file.
 """
 
 from argparse import ArgumentParser, Namespace
@@ -10,7 +10,7 @@ from service.cli import arguments
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `token` with its subcommands."""
     group = arguments.add_group(
         commands,
         "token",
@@ -63,7 +63,7 @@ def add(commands: Any) -> None:
 
 
 def add_service(parser: ArgumentParser) -> None:
-    """Declare the database, and the service that may be writing to it."""
+    """Add options for the database, and for a service that may be writing to it."""
     parser.add_argument(
         "--url",
         help=f"{arguments.SERVICE}.  Where it writes to the SQLite file, it makes the change",

@@ -1,4 +1,4 @@
-"""`acquire version`."""
+"""Command `acquire version`: print the version."""
 
 from argparse import Namespace
 from typing import Any
@@ -8,7 +8,7 @@ from service.cli.arguments import add_command
 
 
 def add(commands: Any) -> None:
-    """Declare the command."""
+    """Declare the command `version`."""
     add_command(commands, "version", run)
 
 
