@@ -1,1 +1,1 @@
-"""Reproductions of three published documents; the service does not need them."""
+"""Reproductions of three published documents; the service does not use them."""

@@ -1,4 +1,4 @@
-"""The commands `acquire simulate mission`, `paper` and `imaging`, where this package is installed.
+"""Commands `acquire simulate mission`, `paper` and `imaging`, if this package is installed.
 
 The service finds `add` by the entry point of `pyproject.toml` in this folder.
 """
@@ -42,7 +42,7 @@ All settings see the same stars and draws. Nothing is searched outside the zone.
 
 
 def add(commands: Any) -> None:
-    """Add the commands to the group `simulate`."""
+    """Add the commands of the studies to the group `simulate`."""
     group = commands_of(commands, "simulate")
     _add_imaging(group)
     _add_mission(group)
@@ -381,7 +381,7 @@ def _run_ptp(parsed: Namespace) -> int:
 
 
 def _table(text: str) -> int | str:
-    """Parse the number of a table, or the name of one such as ptp-5."""
+    """Parse the number of a printed table, or a name such as ptp-5."""
     return count(text) if text.lstrip("-").isdigit() else text
 
 

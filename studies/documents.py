@@ -1,4 +1,4 @@
-"""Files that studies write: rows as JSON, pictures and links to them.
+"""Output files of studies: rows as JSON, pictures, and links to pictures.
 
 matplotlib is imported when a picture is drawn: it comes with the extra `plots`.
 """
@@ -17,31 +17,31 @@ if TYPE_CHECKING:
 
 
 def json_rows(rows: Iterable[Any]) -> str:
-    """Rows as a JSON array, one a line."""
+    """Format rows as a JSON array, one row per line."""
     lines = ",\n".join(json.dumps(row, ensure_ascii=False) for row in rows)
     return f"[\n{lines}\n]\n" if lines else "[]\n"
 
 
 def links(title: str, picture: Path, file: Path) -> list[str]:
-    """The link to a picture, as seen from the page `file`; none without the picture."""
+    """Markdown link to a picture, relative to the page `file`; empty without the picture."""
     return [f"![{title}]({os.path.relpath(picture, file.parent)})"] if picture.exists() else []
 
 
 class Folder:
-    """A folder for pictures, and those written to it."""
+    """A folder for pictures, with the list of pictures written to it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.written: list[Path] = []
 
     def figure(self, width_in: float, height_in: float) -> "Figure":
-        """A new picture of a size."""
+        """Create an empty matplotlib figure of a size in inches."""
         from matplotlib.figure import Figure
 
         return Figure(figsize=(width_in, height_in), layout="constrained")
 
     def save(self, figure: "Figure", name: str) -> None:
-        """Write it as SVG; the same numbers give the same file, whenever it is drawn."""
+        """Write a figure as SVG; equal data give an equal file, independent of the date."""
         path = self.path / f"{name}.svg"
         figure.savefig(path, metadata={"Date": None})
         self.written.append(path)
@@ -49,10 +49,9 @@ class Folder:
 
 @contextmanager
 def pictures_in(path: Path, salt: str) -> Iterator[Folder]:
-    """A folder, made where it is missing, and one look for what is drawn in it.
+    """Context manager of a folder for pictures with one style; the folder is created if missing.
 
-    `salt` names the parts of the files.  Raises `NotAvailable` where matplotlib
-    is not installed.
+    `salt` makes the ids in the files reproducible.  Raises `NotAvailable` without matplotlib.
     """
     require_extra("plots", "matplotlib", "pictures", str(path))
     import matplotlib as mpl

@@ -1,1 +1,1 @@
-"""The simulator of Fink & Shoup 1994 for any mission: rates of its settings under given errors."""
+"""Simulator of Fink & Shoup 1994 for any mission: identification rates under given errors."""

@@ -1,6 +1,6 @@
-"""The rates of a sweep as a table, as plain values, as a picture, and as a page of HTML.
+"""Reports of a sweep's identification rates: table, JSON, picture, and self-contained HTML page.
 
-Also the settings that meet a wanted rate.  The page needs nothing beside it.
+Also the settings that meet a required rate.
 """
 
 from collections.abc import Sequence
@@ -23,16 +23,16 @@ TITLES = {name: name.replace("_", " ") for name in OUTCOMES}
 
 
 def meeting(rates: Sequence[Rates], at_most_ambiguous: float) -> list[Rates]:
-    """The settings whose share of ambiguous stars is at most a share with 95 % confidence.
+    """Settings with at most a given share of ambiguous stars, with 95 % confidence.
 
-    Those with the most stars identified rightly come first.
+    The setting with the most rightly identified stars is first.
     """
     found = [each for each in rates if each.ambiguous.high <= at_most_ambiguous]
     return sorted(found, key=lambda each: -each.unique_right.value)
 
 
 def report_text(plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | None) -> str:
-    """The report for people."""
+    """Report of a sweep as text for a terminal."""
     lines = [*heading(plan), "", _table(rates)]
     if at_most_ambiguous is not None:
         lines += ["", *met(rates, at_most_ambiguous)]
@@ -40,7 +40,7 @@ def report_text(plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | N
 
 
 def heading(plan: Plan) -> list[str]:
-    """The description of the simulation, in lines."""
+    """Description of a simulation, as lines of text."""
     first = plan.settings[0]
     mission, errors = first.mission, first.errors
     where = "the whole sky"
@@ -87,7 +87,7 @@ def _percent(share: Interval) -> str:
 
 
 def met(rates: Sequence[Rates], at_most_ambiguous: float) -> list[str]:
-    """The settings that keep ambiguous stars below a share, in lines."""
+    """Settings that keep ambiguous stars below a share, as lines of text."""
     wanted = f"At most {100 * at_most_ambiguous:g} % ambiguous"
     found = meeting(rates, at_most_ambiguous)
     if found:
@@ -116,7 +116,7 @@ def _values(each: Rates) -> str:
 def report_json(
     plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | None
 ) -> dict[str, Any]:
-    """The report as plain values; rates are shares from 0 to 1 with 95 % intervals."""
+    """Report of a sweep as plain values; rates are shares from 0 to 1 with 95 % intervals."""
     first = plan.settings[0]
     mission = first.mission
     met = None if at_most_ambiguous is None else meeting(rates, at_most_ambiguous)
@@ -152,10 +152,10 @@ MOST_LINES = 8
 
 
 def draw(plan: Plan, rates: Sequence[Rates], file: Path) -> None:
-    """Draw the rates with their 95 % intervals as SVG, a panel an outcome.
+    """Draw identification rates with 95 % intervals as SVG, one panel per outcome.
 
     The last sweep with several values is the abscissa, each combination of the others a line.
-    Raises `BadInput` where there is none or too many lines, `NotAvailable` without matplotlib.
+    Raises `BadInput` without such a sweep or for too many lines, `NotAvailable` without matplotlib.
     """
     abscissa = checked_plot(plan, file)
     lines: dict[str, list[Rates]] = {}
@@ -185,9 +185,9 @@ def draw(plan: Plan, rates: Sequence[Rates], file: Path) -> None:
 
 
 def checked(plan: Plan, option: str, file: Path, suffix: str) -> str | None:
-    """The name of the setting that is the abscissa, if there is one.
+    """Name of the setting on the abscissa, None without any; checks the output file.
 
-    Raises `BadInput` naming the option where the file has another suffix, or for many lines.
+    Raises `BadInput` naming the option if the file has another suffix, or for too many lines.
     """
     if file.suffix != suffix:
         message = f"must be the name of an {suffix} file"
@@ -196,7 +196,7 @@ def checked(plan: Plan, option: str, file: Path, suffix: str) -> str | None:
 
 
 def checked_plot(plan: Plan, file: Path) -> str:
-    """The name of the setting that is the abscissa; raises `BadInput` where nothing is drawn."""
+    """Name of the setting on the abscissa; raises `BadInput` if there is nothing to draw."""
     abscissa = checked(plan, "--plot", file, ".svg")
     if abscissa is None:
         raise BadInput(Fault("--plot", "needs a --sweep with several values", str(file)))
@@ -204,7 +204,7 @@ def checked_plot(plan: Plan, file: Path) -> str:
 
 
 def abscissa_of(plan: Plan, option: str) -> str | None:
-    """The last setting with several values, if there is one; raises `BadInput` for many lines."""
+    """Last setting with several values, None without any; raises `BadInput` for too many lines."""
     varied = {
         name: len({setting.values[name] for setting in plan.settings})
         for name in plan.settings[0].values
@@ -222,9 +222,9 @@ def abscissa_of(plan: Plan, option: str) -> str | None:
 def write_page(
     plan: Plan, rates: Sequence[Rates], at_most_ambiguous: float | None, file: Path
 ) -> None:
-    """Write the rates, their picture where a setting has several values, and what meets a share.
+    """Write the HTML page of a sweep: rates, a picture, and the settings that meet a share.
 
-    Raises `NotAvailable` where there is a picture and matplotlib is not installed.
+    Raises `NotAvailable` if there is a picture and matplotlib is not installed.
     """
     # Text of mission files is escaped; a misspelt name is an error, not an empty string.
     environment = Environment(

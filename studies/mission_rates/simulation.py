@@ -1,10 +1,9 @@
-"""The settings that a sweep varies, and its views through the pipeline, zone by zone, on all cores.
+"""Parameter sweep: settings to vary, and simulated views for each, zone by zone on all cores.
 
 A setting of the mission (tolerances and zone) has the name of its key in the mission file; the
-others are the simulated errors.
-Every setting sees the same zones, views, stars and draws, as every run of the paper did: the
-difference between two settings is theirs, not that of the draw.  They depend on the seed and the
-zone's number alone, not on how the work is shared out.
+others are simulated errors.  All settings see the same zones, views, stars and random draws, as
+every run of the paper did: differences between settings are not due to the draws, which depend on
+the seed and the zone's number alone, not on the distribution of the work.
 """
 
 import itertools
@@ -36,21 +35,20 @@ from studies.workers import mapping, number_of
 
 MOST_SETTINGS = 400
 MOST_DIGITS = 12
-"""The digits of a value in a range: .3 + 3 * .2 is to be 0.9."""
+"""Decimals to which values of a range are rounded, so that .3 + 3 * .2 gives 0.9."""
 BOUND_SIGMAS = 6.0
-"""The bound of magnitude errors: RCMAG of the paper's Table 1 is six times its SIGMAG."""
+"""Bound of magnitude errors in sigmas: RCMAG is six times SIGMAG in the paper's Table 1."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """The errors that are simulated, with the paper's names.
+    """Simulated errors, with the paper's names.
 
-    `phi_deg`, `theta_deg`, `psi_deg` (LIBROT) turn the observed vectors about the body axes Z,
-    then Y, then X.  `off_axis_deg` (RCVIEW) bounds the angle from the zone's axis to the
-    boresight, of a band from the pole to the body axis that it is about.
-    `position_error_arcsec` is a standard deviation per tangent axis: SIGOBS, that of the paper's
-    radial error, is the root of two times it.  `magnitude_error_mag` is SIGMAG, and
-    `magnitude_bound_mag` RCMAG.
+    `phi_deg`, `theta_deg`, `psi_deg` (LIBROT) rotate the observed vectors about the body axes Z,
+    then Y, then X.  `off_axis_deg` (RCVIEW) bounds the angle from the zone's axis to the boresight,
+    for a band from the pole to the body axis of the band. `position_error_arcsec` is a standard
+    deviation per tangent axis: SIGOBS, the deviation of the paper's radial error, is sqrt(2) times
+    it.  `magnitude_error_mag` is SIGMAG, and `magnitude_bound_mag` RCMAG.
     """
 
     phi_deg: float
@@ -72,12 +70,12 @@ LIMITS = {
     "magnitude_bound_mag": (0.001, 100.0),
 }
 SIZES = ("radius_deg", "half_width_deg")
-"""The sizes of a cap and of a band, in the table `zone` of the mission file."""
+"""Keys for the size of a cap and of a band, in the table `zone` of a mission file."""
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One point of a sweep: the swept values by name, and what they make of mission and errors."""
+    """One point of a sweep: swept values by name, and the resulting mission and errors."""
 
     values: Mapping[str, float]
     mission: Mission
@@ -86,7 +84,7 @@ class Setting:
 
 @dataclass(frozen=True)
 class Sweep:
-    """The values that one setting takes in turn."""
+    """A swept setting with its values."""
 
     name: str
     values: tuple[float, ...]
@@ -95,7 +93,7 @@ class Sweep:
     def parsed(cls, text: str) -> Self:
         """Parse NAME=V1,V2,... or NAME=FIRST:LAST:STEP; raises `BadInput`.
 
-        The unit at the end of a name may be left out.
+        The unit at the end of a name may be omitted.
         """
         name, equals, written = text.partition("=")
         named = _full_name(name.strip())
@@ -141,10 +139,10 @@ def _values(text: str) -> list[float]:
 
 
 def one_tracker(mission: Mission, tracker: str | None) -> Mission:
-    """The mission with one tracker, by default its first, and with no search of the whole sky.
+    """Mission reduced to one tracker, by default its first, without search of the whole sky.
 
-    A cap lies about a tracker's boresight, so that the boresight becomes the zone's axis.
-    Raises `BadInput` for a tracker that the mission has not.
+    A cap is centred on the tracker's boresight, which becomes the zone's axis.  Raises `BadInput`
+    for a tracker that the mission does not have.
     """
     chosen = mission.trackers[0] if tracker is None else mission.tracker(tracker, "--tracker")
     zone = mission.zone
@@ -155,9 +153,9 @@ def one_tracker(mission: Mission, tracker: str | None) -> Mission:
 
 
 def usual_errors(mission: Mission) -> Errors:
-    """The errors that a mission of one tracker allows for, with a perfect a priori attitude.
+    """Errors that a mission with one tracker is designed for, with an exact a priori attitude.
 
-    The boresight is as far from the zone's axis as the field of view has room in the zone.
+    The boresight is as far from the zone's axis as the field of view fits in the zone.
     """
     tracker, zone = mission.trackers[0], mission.zone
     size_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
@@ -173,10 +171,10 @@ def usual_errors(mission: Mission) -> Errors:
 
 
 def settings_of(mission: Mission, sweeps: Sequence[Sweep]) -> list[Setting]:
-    """Every combination of the swept values; the last sweep varies fastest.
+    """All combinations of the swept values; the last sweep varies fastest.
 
-    A swept magnitude error takes its bound along, unless that is swept itself.  Raises
-    `BadInput` naming a value that the mission file could not have, or too many combinations.
+    The bound of a swept magnitude error changes with it, unless swept itself.  Raises `BadInput`
+    naming a value that a mission file may not have, or too many combinations.
     """
     names = [sweep.name for sweep in sweeps]
     for name in names:
@@ -210,7 +208,7 @@ def _setting(mission: Mission, errors: Errors, values: Mapping[str, float]) -> S
 
 
 def _with(mission: Mission, values: Mapping[str, float]) -> Mission:
-    """The mission with other tolerances or another size of its zone."""
+    """Mission with changed tolerances or zone size."""
     tables: dict[str, Any] = {
         "zone": mission.zone.model_dump(),
         "tolerances": mission.tolerances.model_dump(),
@@ -232,7 +230,7 @@ def _with(mission: Mission, values: Mapping[str, float]) -> Mission:
 
 
 def options_of_settings(sweeps: Sequence[Sweep], tests: Mapping[str, bool]) -> dict[str, str]:
-    """The tests and tolerances that are asked for, each with the option that does so."""
+    """Tests and tolerances to change, each with the option that requests it."""
     switches = {True: "--with", False: "--without"}
     options = {name: switches[is_on] for name, is_on in tests.items()}
     swept = [each.name for each in sweeps if each.name in Tolerances.model_fields]
@@ -240,7 +238,7 @@ def options_of_settings(sweeps: Sequence[Sweep], tests: Mapping[str, bool]) -> d
 
 
 def refuse_idle(options: Mapping[str, str], mission: Mission, identifier: str) -> None:
-    """Raise `BadInput` naming an option whose test or tolerance changes nothing."""
+    """Raise `BadInput` naming an option whose test or tolerance has no effect."""
     for name, option in options.items():
         reason = idle_reason(name, identifier, mission.tests, mission.zone)
         if reason is not None:
@@ -248,7 +246,7 @@ def refuse_idle(options: Mapping[str, str], mission: Mission, identifier: str) -
 
 
 def sigobs_arcsec(errors: Errors) -> float:
-    """SIGOBS, the standard deviation of the paper's radial error of position."""
+    """Standard deviation of the paper's radial position error (SIGOBS), in arcsec."""
     return float(np.sqrt(2.0)) * errors.position_error_arcsec
 
 
@@ -257,7 +255,7 @@ assert {each.name for each in fields(Errors)} == set(LIMITS)
 
 CACHE_BYTES = 64 << 20
 LEAST_SIGMA_MAG = 1e-9
-"""The sigma in place of no error at all, by which the bound could not be divided."""
+"""Sigma of magnitude used for zero error, so that the bound can be divided by it."""
 OUTCOMES = {
     "unique_right": tally.CORRECT,
     "ambiguous": tally.AMBIGUOUS,
@@ -268,10 +266,10 @@ OUTCOMES = {
 
 @dataclass(frozen=True)
 class Plan:
-    """The simulated cases: zones about axes drawn over the sky, or within an angle of a direction.
+    """Plan of a simulation: zones about random axes over the sky, or near a direction.
 
-    `within_deg` is RCCAT; `tests` are those switched on or off.  Each zone has `views` fields
-    of view with at most `most_stars` observed stars each.  All settings are of one tracker.
+    `within_deg` is RCCAT; `tests` are switched on or off.  Each zone has `views` fields of view
+    with at most `most_stars` observed stars each.  All settings are of one tracker.
     """
 
     settings: tuple[Setting, ...]
@@ -287,9 +285,9 @@ class Plan:
 
 @dataclass(frozen=True)
 class Rates:
-    """The shares of a setting's stars by outcome, with their 95 % intervals.
+    """Shares of a setting's stars by outcome, with 95 % intervals.
 
-    The stars of a zone are not independent: the intervals count zones.
+    Stars of a zone are not independent: the intervals are based on the number of zones.
     """
 
     setting: Setting
@@ -303,11 +301,10 @@ class Rates:
 def simulate(
     plan: Plan, catalog: Path | None = None, processes: int | None = None, quiet: bool = False
 ) -> list[Rates]:
-    """The rates of every setting.
+    """Simulate all settings of a plan, and return their rates.
 
-    `catalog` is the site's own star catalog.  `processes` is the number of workers, all cores
-    where it is None; 1 works in this process.  Raises `BadInput` where a zone would hold too
-    many pairs.
+    `catalog` is a star catalog of the site's own.  `processes` is the number of workers, all cores
+    if None; 1 works in this process.  Raises `BadInput` if a zone would have too many pairs.
     """
     count = min(number_of(processes), plan.zones)
     task = partial(_zone_counts, plan, catalog)
@@ -324,7 +321,7 @@ def simulate(
 
 
 def _rates(setting: Setting, counts: tally.Integers) -> Rates:
-    """The rates of counts (zones, 4)."""
+    """Rates with intervals from counts of stars (zones, 4)."""
     total = counts.sum(axis=1)
     zone = np.repeat(np.arange(len(total)), total)
     kind = np.concatenate([np.repeat(np.arange(4), row) for row in counts])
@@ -333,7 +330,7 @@ def _rates(setting: Setting, counts: tally.Integers) -> Rates:
 
 
 def zone_counts(plan: Plan, number: int, sky: SkyModel) -> tally.Integers:
-    """The outcome of one zone's stars: counts (settings, 4) in the order of `tally`."""
+    """Numbers of one zone's stars by outcome: (settings, 4) in the order of `tally`."""
     counts = np.zeros((len(plan.settings), 4), np.int64)
     for off_axis_deg in {setting.errors.off_axis_deg for setting in plan.settings}:
         views = list(_views(plan, number, off_axis_deg, sky))
@@ -374,7 +371,7 @@ def _axis(plan: Plan, rng: np.random.Generator) -> Vector:
 
 
 def _run(errors: Errors) -> Run:
-    """The errors as those of a run of which nothing is printed."""
+    """Run of the paper's simulator with given errors, without printed counts."""
     angles = (3600.0 * errors.phi_deg, 3600.0 * errors.theta_deg, 3600.0 * errors.psi_deg)
     return Run(
         table="",

@@ -1,1 +1,1 @@
-"""The simulator of Fink & Shoup 1994, and the paper's tables beside ours."""
+"""Simulator of Fink & Shoup 1994, and comparison with the paper's tables."""

@@ -1,4 +1,4 @@
-"""`acquire simulate paper`: every table of the paper, theirs beside ours."""
+"""Command `acquire simulate paper`: all tables of the paper compared with our results."""
 
 import sys
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ from studies.paper_1994.tally import AMBIGUOUS, CORRECT, MISIDENTIFIED, UNMATCHE
 ZONE_IDENTIFIERS: tuple[Identifier, ...] = tuple(
     name for name, entry in IDENTIFIERS.items() if entry.searches_zone
 )
-"""The identifiers that search a zone, as the paper's does."""
+"""Identifiers that search within a zone, like the paper's."""
 DEFAULT_STARS = 20_000
 
 PAPER_IDENTIFIER: Identifier = "starid"
@@ -39,12 +39,11 @@ def run_paper(
 ) -> list[Row]:
     """Print one table, or all, with the paper's numbers and ours, and return the rows.
 
-    Each run sees at least `stars` stars for each seed, in whole experiments of
-    the paper's size; several seeds are pooled.  Tables 11 to 14 use the
-    first seed.  `json_path` takes the rows: one per run and identifier, and those of
-    Tables 11 to 14; the folder `plots` the pictures, `report_path` the
-    document that shows them with every table, instead of printing the tables.
-    Raises `BadInput` for a table that the paper has not.
+    Each run has at least `stars` stars for each seed, in whole experiments of the paper's size;
+    several seeds are pooled.  Tables 11 to 14 use the first seed.  `json_path` receives the rows:
+    one per run and identifier, and those of Tables 11 to 14; the folder `plots` the pictures, and
+    `report_path` a document with them and every table, instead of printing.  Raises `BadInput` for
+    a table that the paper does not have.
     """
     wanted = _checked(table, stars, seeds, identifiers)
     out = out or sys.stdout
@@ -97,7 +96,7 @@ def _checked(
 
 
 def rows_of(tallies: Sequence[Tally]) -> list[Row]:
-    """One row per run and identifier, Tables 2 to 10."""
+    """Rows of results of Tables 2 to 10, one per run and identifier."""
     return [
         {
             "table": tally.run.table,
@@ -114,7 +113,7 @@ def rows_of(tallies: Sequence[Tally]) -> list[Row]:
 
 
 def measured(wanted: Sequence[int], seed: int, identifier: Identifier) -> list[Row]:
-    """The rows of Tables 11 to 14, measured here and now; those of 13 and 14 without times."""
+    """Measure the rows of Tables 11 to 14 on this computer; 13 and 14 have no times."""
     rows: list[Row] = []
     for number, shares in zip(TIMES, PROPORTIONS, strict=True):
         if not {number, shares} & set(wanted):
@@ -135,7 +134,7 @@ def report(
     wanted: Sequence[int],
     time_rows: Sequence[Row] = (),
 ) -> str:
-    """The tables of one identifier as Markdown; `time_rows` are those of `measured`."""
+    """Tables of one identifier as Markdown; `time_rows` are the result of `measured`."""
     mine = [tally for tally in tallies if tally.identifier == identifier]
     parts = [f"## Tables of Fink & Shoup 1994 by the identifier `{identifier}`"]
     is_paper = identifier == PAPER_IDENTIFIER
@@ -222,11 +221,11 @@ def document(
     plots: Path,
     file: Path,
 ) -> str:
-    """Markdown: how the paper was read, pictures of Tables 2 to 10, and what differs.
+    """Markdown document: interpretation of the paper, pictures of Tables 2 to 10, and differences.
 
-    The pictures are those that `plots.draw` made in the folder `plots`, linked
-    as seen from the document's own `file`.  `time_rows` are those of
-    Tables 11 to 14.  Of the identifiers beyond the paper's, Tables 2 to 10 follow.
+    The pictures are those of `plots.draw` in the folder `plots`, linked relative to the document
+    `file`.  `time_rows` are those of Tables 11 to 14.  Tables 2 to 10 of further identifiers
+    follow.
     """
     mine = [tally for tally in tallies if tally.identifier == PAPER_IDENTIFIER]
     if not mine:
@@ -254,7 +253,7 @@ def document(
 
 
 def _beyond(tallies: Sequence[Tally], seeds: Sequence[int]) -> str:
-    """The page of identifiers that the paper has not."""
+    """Markdown page of identifiers that the paper does not have."""
     names = _others(tallies)
     command = f"acquire simulate paper --identifier {' '.join(names)}"
     parts = [

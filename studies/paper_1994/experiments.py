@@ -1,7 +1,7 @@
-"""Experiments of the paper's size, each view through the pipeline, on all cores.
+"""Experiments of the paper's size: each view goes through the pipeline, on all cores.
 
-The zones, views and errors of an experiment depend on the seed, the world and
-the experiment's number alone, not on how the work is shared out.
+The zones, views and errors of an experiment depend on the seed, the world and the experiment's
+number alone, not on the distribution of the work.
 """
 
 from collections import defaultdict
@@ -27,7 +27,7 @@ SHELF_BYTES = 64 << 20
 
 @dataclass(frozen=True)
 class Task:
-    """One experiment: which world, which draw of it, and which runs and identifiers see it."""
+    """One experiment: its world and number, and the runs and identifiers that share its views."""
 
     world: str
     seed: int
@@ -43,11 +43,10 @@ def run_experiments(
     identifiers: Sequence[Identifier] = ("starid",),
     processes: int | None = None,
 ) -> list[Tally]:
-    """The tallies of every run, per identifier.
+    """Simulate every run with each identifier, and count outcomes.
 
-    Whole experiments are made until each run has `stars` stars for each seed.
-    `processes` is the number of workers, all cores where it is None; 1 works
-    in this process.
+    Whole experiments are repeated until each run has `stars` stars for each seed. `processes` is
+    the number of workers, all cores if None; 1 works in this process.
     """
     by_world = defaultdict(list)
     for run in runs:
@@ -81,7 +80,7 @@ def run_experiments(
 
 
 def _missing(done: list[Integers], stars: int, world: World) -> range:
-    """The numbers of the experiments that are still to be made."""
+    """Numbers of the experiments that are still needed for the requested stars."""
     # Every run of a world sees the same stars: the first tells for all.
     seen = sum(int(counts[0, 0].sum()) for counts in done)
     most = world.zones * world.views * 5
@@ -94,7 +93,7 @@ def _stars_expected(task: Task) -> int:
 
 
 def _perform(task: Task) -> Integers:
-    """The counts (identifiers, runs, zones, 4) of one experiment."""
+    """Counts of stars by outcome (identifiers, runs, zones, 4) in one experiment."""
     sky, world = _sky(), the_paper().worlds[task.world]
     worlds = list(the_paper().worlds)
     rng = np.random.default_rng([task.seed, worlds.index(task.world), task.number])
@@ -116,7 +115,7 @@ def _perform(task: Task) -> Integers:
 
 
 def open_sky() -> SkyModel:
-    """The embedded catalog with a small cache: a zone serves the runs of its views alone."""
+    """Sky model of the embedded catalog with a small cache, since zones are used only briefly."""
     return SkyModel(load_embedded(), LruCache(SHELF_BYTES))
 
 

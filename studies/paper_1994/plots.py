@@ -1,4 +1,4 @@
-"""Rates against each error, the paper's beside ours, as pictures for the documentation."""
+"""Pictures of identification rates against each error, the paper's and ours."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -21,7 +21,7 @@ BASELINE_ARCSEC = (40, 40, 60)
 
 @dataclass(frozen=True)
 class Panel:
-    """One axis of a picture: the runs that it shows, and where each stands on it."""
+    """One panel of a picture: the runs shown, and their values on the abscissa."""
 
     title: str
     unit: str
@@ -63,9 +63,9 @@ PLACES = "paper-places"
 
 
 def draw(tallies: Sequence[Tally], folder: Path) -> list[Path]:
-    """Draw every picture that the tallies have runs for; the SVG files written.
+    """Draw all pictures for which there are results; returns the SVG files written.
 
-    Raises `NotAvailable` where matplotlib is not installed.
+    Raises `NotAvailable` without matplotlib.
     """
     with pictures_in(folder, "paper") as pictures:
         for name, panels in PICTURES.items():
@@ -86,7 +86,7 @@ def draw(tallies: Sequence[Tally], folder: Path) -> list[Path]:
 
 
 def _percent(tallies: Sequence[Tally], k: int) -> tuple[Any, Any, Any]:
-    """Printed rates, ours, and the standard deviation of an experiment of the paper's size."""
+    """Printed rates, our rates, and the standard deviation of an experiment of the paper's size."""
     printed, ours, sigma = [], [], []
     for tally in tallies:
         counts = tally.run.printed

@@ -1,7 +1,7 @@
-"""The numbers that the paper prints: its worlds, its runs with their counts, its times and its k_g.
+"""Numbers printed in the paper: worlds, runs with their counts, times and k_g.
 
-Beside each run stands what an independent implementation of the same reading
-got from 40 experiments of the paper's size: the reference.
+With each run are the results of an independent implementation of the same interpretation, from 40
+experiments of the paper's size: the reference.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ Angles = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class World:
-    """Places of the zones of some tables, and the number that makes one experiment of the paper.
+    """Zone positions for some tables of the paper, and the size of one experiment.
 
     A zone's axis is `axis_deg` (right ascension, declination), or the Sun's
     direction at one of `sun_dates`, or drawn over the sphere.
@@ -35,13 +35,13 @@ class World:
 
     @property
     def strata(self) -> int:
-        """How many kinds of zones follow each other in turn."""
+        """Number of kinds of zones that alternate, one per date of the Sun."""
         return max(1, len(self.sun_dates))
 
 
 @dataclass(frozen=True)
 class PrintedCounts:
-    """A printed run: stars, of them ambiguous (or unmatched), correct and misidentified."""
+    """Printed counts of a run: stars, ambiguous (or unmatched), correct and misidentified ones."""
 
     stars: int
     ambiguous: int
@@ -51,7 +51,7 @@ class PrintedCounts:
 
 @dataclass(frozen=True)
 class Reference:
-    """The reference's rates in percent; `sd` is that of one experiment of the paper's size."""
+    """Reference rates in percent; `sd` is the deviation of one experiment of the paper's size."""
 
     stars: int
     ambiguous_pct: float
@@ -62,13 +62,13 @@ class Reference:
 
     @property
     def unidentified_pct(self) -> float:
-        """Ambiguous or unmatched."""
+        """Percentage of stars that are ambiguous or unmatched."""
         return self.ambiguous_pct + self.unmatched_pct
 
 
 @dataclass(frozen=True)
 class Run:
-    """One run: the errors that are put in, whether the tests of geometry are on, what came of it.
+    """A run of the paper: simulated errors, use of geometry tests, and printed counts.
 
     `rotation_arcsec` is the error of the attitude: phi, theta, psi.
     """
@@ -86,13 +86,13 @@ class Run:
 
     @property
     def number(self) -> int:
-        """The table's number: 9 for both 9D and 9F."""
+        """Number of the run's table: 9 for both 9D and 9F."""
         return int(self.table.rstrip("DF"))
 
 
 @dataclass(frozen=True)
 class Times:
-    """A row of Tables 11 and 12: seconds of 1994, least and greatest, with NCAP and NTOT."""
+    """A printed row of Tables 11 and 12: least and greatest times in seconds, NCAP and NTOT."""
 
     table: str
     world: str
@@ -108,7 +108,7 @@ class Times:
 
 @dataclass(frozen=True)
 class Proportion:
-    """A row of Tables 13 and 14: k_g from the areas and from NCAP and NTOT."""
+    """A printed row of Tables 13 and 14: k_g from areas, and from NCAP and NTOT."""
 
     table: str
     stars: int
@@ -119,7 +119,7 @@ class Proportion:
 
 @dataclass(frozen=True)
 class Paper:
-    """All figures printed in the 1994 paper."""
+    """All numbers printed in the 1994 paper."""
 
     worlds: dict[str, World]
     runs: tuple[Run, ...]
@@ -127,13 +127,13 @@ class Paper:
     proportions: tuple[Proportion, ...]
 
     def runs_of(self, tables: Sequence[int]) -> tuple[Run, ...]:
-        """The runs of some tables, in the paper's order."""
+        """Runs of the given tables, in the paper's order."""
         return tuple(run for run in self.runs if run.number in tables)
 
 
 @cache
 def the_paper() -> Paper:
-    """The numbers that the paper prints, read once."""
+    """Numbers printed in the 1994 paper, read once from a file."""
     data = msgspec.json.decode(_FILE.read_bytes())
     worlds = {name: {"name": name, **world} for name, world in data["worlds"].items()}
     return msgspec.convert({**data, "worlds": worlds}, Paper)

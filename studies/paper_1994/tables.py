@@ -1,6 +1,6 @@
-"""The tables as Markdown that reads well in a terminal too: the paper's numbers beside ours.
+"""Tables of the paper's numbers and ours in Markdown that is also readable in a terminal.
 
-Tables 11 to 14 are the times of 1994 beside ours, k_g and the memory that it bounds.
+Tables 11 to 14 compare times, k_g, and the memory that k_g bounds.
 """
 
 import math
@@ -53,12 +53,12 @@ TITLES: Mapping[int, str] = {
 
 
 def heading(table: int) -> str:
-    """A table's heading."""
+    """Heading of a table, with number and title."""
     return f"### Table {table}. {TITLES[table]}"
 
 
 def improvements(tallies: Sequence[Tally]) -> str:
-    """Rows of Tables 2 to 10 for an identifier that is meant to do better than the paper's."""
+    """Rows of Tables 2 to 10 for an identifier that should outperform the paper's."""
     header = ("run", "1994: not identified", "wrong", "stars", "ambiguous", "unmatched", "wrong")
     return markdown(
         header,
@@ -79,7 +79,7 @@ def improvements(tallies: Sequence[Tally]) -> str:
 
 
 def rates(tallies: Sequence[Tally]) -> str:
-    """Rows of Tables 2 to 10: printed counts and rates, ours, and whether they agree."""
+    """Rows of Tables 2 to 10: printed counts and rates, ours, and their agreement."""
     header = (
         "run",
         "stars of 1994",
@@ -130,7 +130,7 @@ def _of_reference(rate: Difference) -> str:
 
 
 def improvement_summary(tallies: Sequence[Tally]) -> str:
-    """Stars of all runs: how many were not identified, how many misidentified."""
+    """Sentence with the numbers of unidentified and misidentified stars in all runs."""
     stars = sum(tally.stars for tally in tallies)
     wrong = sum(tally.total(MISIDENTIFIED) for tally in tallies)
     unidentified = sum(tally.total(AMBIGUOUS) + tally.total(UNMATCHED) for tally in tallies)
@@ -141,7 +141,7 @@ def improvement_summary(tallies: Sequence[Tally]) -> str:
 
 
 def summary(tallies: Sequence[Tally]) -> str:
-    """How many printed runs lie inside, and how many rates agree with the reference."""
+    """Sentences with the number of printed runs in the 95 % region and of agreeing rates."""
     inside = sum(is_inside(tally) for tally in tallies)
     pairs = [(tally, differences(tally)) for tally in tallies]
     agree = sum(rate.agrees for _, both in pairs for rate in both)
@@ -166,11 +166,11 @@ def summary(tallies: Sequence[Tally]) -> str:
 
 
 BYTES_PER_PAIR = 8 + 4 + 4 + 4 / PAIRS_PER_BIN
-"""A separation, two rows and a share of a bin."""
+"""Memory of a pair in bytes: a separation, two rows and a share of a bin."""
 
 
 LIMITS_S = {11: 4.0, 12: 600.0}
-"""The times that the missions allow for an update (XTE, SWAS), and for a pass's result (SOHO)."""
+"""Time limits in seconds: for an update (XTE, SWAS), and for the result of a pass (SOHO)."""
 
 Row = dict[str, Any]
 
@@ -181,11 +181,10 @@ _NO_PAIRS_DEG = 1e-9
 
 @dataclass(frozen=True)
 class ZoneTime:
-    """One zone and the identifications of its views, in seconds.
+    """Times of building one zone and identifying its views, in seconds.
 
-    `first_s` is the pair index and the first identification, `later_s` the
-    identifications after it, `batch_s` those with all that the pipeline does
-    to a batch.
+    `first_s` includes the pair index and the first identification, `later_s` are the later
+    identifications, `batch_s` whole batches in the pipeline.
     """
 
     stars: int
@@ -198,7 +197,7 @@ class ZoneTime:
 
 
 def measure(case: Times, seed: int, identifier: Identifier = "starid") -> list[ZoneTime]:
-    """The times of a row's zones, ten views each, nominal errors, in this process."""
+    """Measure the times of a row's zones, ten views each, with nominal errors, in this process."""
     world = the_paper().worlds[case.world]
     sky = open_sky()
     mission = paper_mission(world.mission)
@@ -250,15 +249,14 @@ def _measure_zone(
 
 
 def proportion(stars: int, pairs: int) -> float:
-    """k_g: the share of all pairs of a zone's stars that are near enough to be seen together."""
+    """Share k_g of all pairs of a zone's stars that are close enough to be seen together."""
     return pairs / (stars * (stars - 1) / 2.0)
 
 
 def time_row(case: Times, zones: Sequence[ZoneTime], identifier: str) -> Row:
-    """A case of Table 11 or 12, times in ms: the least, the median and the greatest.
+    """Result row of Table 11 or 12, times in ms: least, median and greatest.
 
-    `stars` and `pairs` are those of the zones that were made and searched first the fastest and
-    the slowest, as the paper prints them.
+    `stars` and `pairs` are of the fastest and the slowest zone, as in the paper.
     """
     ordered = sorted(zones, key=lambda zone: zone.generate_s + zone.first_s)
     ends = ordered[0], ordered[-1]
@@ -280,7 +278,7 @@ def time_row(case: Times, zones: Sequence[ZoneTime], identifier: str) -> Row:
 
 
 def times(rows: Sequence[Row]) -> str:
-    """Tables 11 and 12: seconds of 1994, least to greatest, beside our milliseconds."""
+    """Tables 11 and 12 in Markdown: the paper's seconds, least to greatest; our milliseconds."""
     header = (
         *("case", "step", "1994 (s)", "ours: least, median, most (ms)"),
         *("NCAP 1994", "ours", "NTOT 1994", "ours"),
@@ -310,7 +308,7 @@ ABOUT_TIMES = (
 
 
 def limit(rows: Sequence[Row]) -> str:
-    """The time that the missions allow, beside the slowest zone of a table."""
+    """Sentence with a mission's time limit and the time of the slowest zone."""
     slowest = max(rows, key=lambda row: float(row["slowest_ms"]))
     allowed = LIMITS_S[slowest["table"]]
     return (
@@ -345,7 +343,8 @@ def _ms(values: Sequence[float]) -> str:
 
 
 def proportion_rows(table: int, case: Times, zones: Sequence[ZoneTime]) -> list[Row]:
-    """A case of Table 13 or 14: one zone where all are alike, else those of fewest and most stars.
+    """Result rows of Table 13 or 14: one zone if all are alike, else those of fewest and most
+    stars.
 
     The bound is that of equations 1 and 2.
     """
@@ -373,7 +372,7 @@ def proportion_rows(table: int, case: Times, zones: Sequence[ZoneTime]) -> list[
 
 
 def proportions(rows: Sequence[Row]) -> str:
-    """Tables 13 and 14: k_g, the bound it sets on NTOT, and the bytes of a pair index."""
+    """Tables 13 and 14 in Markdown: k_g, the bound on NTOT, and the size of a pair index."""
     header = (
         *("case", "NCAP 1994", "NTOT 1994", "k_g 1994", "NCAP", "NTOT", "k_g"),
         *("k_g of the areas", "bound on NTOT", "bound (kB)", "index (kB)"),
@@ -395,7 +394,7 @@ def proportions(rows: Sequence[Row]) -> str:
 
 
 def geometric_share(mission: Mission) -> float:
-    """The paper's approximation of k_g: thrice the field of view's area over the zone's, flat."""
+    """Approximate k_g of the paper: thrice the field of view's area over the zone's, both flat."""
     radius = mission.trackers[0].field_of_view_radius_deg
     if isinstance(mission.zone, Band):
         return 3.0 * math.pi * radius**2 / (360.0 * 2.0 * mission.zone.half_width_deg)

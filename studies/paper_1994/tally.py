@@ -1,9 +1,8 @@
-"""The outcome of a run's stars, zone by zone, and tests if two sets of counts agree.
+"""Counts of a run's stars by outcome and zone, and tests of agreement between counts.
 
-Compared are the printed run with ours, and our rates with the reference's.
-An experiment is many independent zones, so that the covariance of its counts
-is that of one zone's counts times their number: as good from few experiments
-as from many.
+The printed run is compared with ours, and our rates with the reference's.  An experiment has many
+independent zones, so that the covariance of its counts is that of one zone's counts times their
+number: estimated as well from few experiments as from many.
 """
 
 import math
@@ -24,7 +23,7 @@ Integers = npt.NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Tally:
-    """The outcome of a run's stars: counts (zones, 4), zone by zone, over all experiments."""
+    """Counts of a run's stars by outcome (zones, 4), over all experiments."""
 
     run: Run
     identifier: Identifier
@@ -32,21 +31,21 @@ class Tally:
 
     @property
     def stars(self) -> int:
-        """The number of stars observed."""
+        """Number of observed stars."""
         return int(self.counts.sum())
 
     def total(self, outcome: int) -> int:
-        """The number of stars of one outcome."""
+        """Number of stars with an outcome."""
         return int(self.counts[:, outcome].sum())
 
     @property
     def world(self) -> World:
-        """The run's world."""
+        """World that the run is simulated in."""
         return the_paper().worlds[self.run.world]
 
 
 def counts_of(found: Identification, truth: npt.NDArray[np.intp]) -> Integers:
-    """The stars by outcome (4,), given the catalog rows that are the truth."""
+    """Number of stars by outcome (4,), compared with the true catalog rows."""
     counts = np.zeros(4, np.int64)
     is_right = found.star == truth
     counts[AMBIGUOUS] = np.count_nonzero(found.outcome == Outcome.AMBIGUOUS)
@@ -64,10 +63,9 @@ ALLOWED_PCT = 0.05
 
 @dataclass(frozen=True)
 class Spread:
-    """One experiment of the paper's size, over `experiments`: mean (2,) and covariance (2, 2).
+    """Mean (2,) and covariance (2, 2) of the counts in one experiment of the paper's size.
 
-    The two counts are the stars not identified (ambiguous or unmatched) and
-    those misidentified.
+    The two counts are the stars not identified (ambiguous or unmatched) and the misidentified ones.
     """
 
     experiments: float
@@ -78,7 +76,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Difference:
-    """Our rate beside the reference's, in percent, and how far apart they may be."""
+    """Our rate and the reference's, in percent, with the tolerated difference."""
 
     ours_pct: float
     ours_sigma_pct: float
@@ -87,17 +85,17 @@ class Difference:
 
     @property
     def agrees(self) -> bool:
-        """True if the rates differ by no more than may be."""
+        """True if the rates agree within the tolerated difference."""
         return abs(self.ours_pct - self.reference_pct) <= self.allowed_pct
 
 
 def unidentified_and_wrong(counts: Integers) -> Integers:
-    """Stars ambiguous or unmatched, and stars misidentified: (zones, 2)."""
+    """Numbers of unidentified (ambiguous or unmatched) and misidentified stars: (zones, 2)."""
     return np.stack([counts[:, AMBIGUOUS] + counts[:, UNMATCHED], counts[:, MISIDENTIFIED]], axis=1)
 
 
 def spread(tally: Tally) -> Spread:
-    """The mean and the covariance of an experiment's counts."""
+    """Mean and covariance of the counts in an experiment of the paper's size."""
     world = tally.world
     counts = unidentified_and_wrong(tally.counts).astype(np.float64)
     zones = len(counts)
@@ -116,11 +114,10 @@ def spread(tally: Tally) -> Spread:
 
 
 def distance_squared(printed: PrintedCounts, ours: Spread) -> float:
-    """How far printed counts lie from ours: at most 5.99 in 95 of 100 experiments.
+    """Squared distance of printed counts from ours: at most 5.99 in 95 of 100 experiments.
 
-    d^T C^-1 d with C = (1 + 1/n) the covariance of an experiment's counts, n
-    being the number of experiments that gave the mean, and 1/2 for counts
-    being whole.
+    d^T C^-1 d with C = (1 + 1/n) times the covariance of an experiment's counts, n being the number
+    of experiments behind the mean, plus 1/2 since counts are whole numbers.
     """
     apart = np.array([printed.ambiguous, printed.misidentified]) - ours.mean
     covariance = (1.0 + 1.0 / ours.experiments) * ours.covariance + 0.5 * np.eye(2)
@@ -128,14 +125,14 @@ def distance_squared(printed: PrintedCounts, ours: Spread) -> float:
 
 
 def is_inside(tally: Tally) -> bool:
-    """True if the printed counts lie in the 95 % region of experiments of their size."""
+    """True if the printed counts are in the 95 % region of experiments of their size."""
     return distance_squared(tally.run.printed, spread(tally)) <= CHI_SQUARE_95
 
 
 def differences(tally: Tally) -> tuple[Difference, Difference]:
-    """Our rates of stars not identified and of stars misidentified beside the reference's.
+    """Our rates of unidentified and of misidentified stars, compared with the reference's.
 
-    They may differ by three combined standard errors, or by 0.05 percentage points.
+    The tolerance is three combined standard errors, or 0.05 percentage points.
     """
     ours, reference = spread(tally), tally.run.reference
     theirs = (

@@ -1,7 +1,7 @@
-"""The paper's simulator: random zones, fields of view within them, stars, and their errors.
+"""Simulator of the paper: random zones, fields of view within them, stars, and errors.
 
-Every run of a world sees the same zones, views, stars and draws, as the paper
-began every run with the same seed; only the sizes of the errors differ.
+All runs of a world see the same zones, views, stars and random draws, as the paper began every run
+with the same seed; only the sizes of the errors differ.
 """
 
 import math
@@ -25,15 +25,15 @@ from studies.paper_1994.printed import Run, World
 
 MOST_STARS = 5
 EPOCH = parse_utc("2000-01-01T12:00:00Z")
-"""Every view uses the run catalogs of 2000, also where the Sun stands as it did in 1995."""
+"""Time of all views, which use run catalogs of 2000, even with the Sun's place of 1995."""
 
 
 @cache
 def paper_mission(name: str) -> Mission:
-    """A shipped mission as the prototype flew it.
+    """Shipped mission with the catalog of the paper's prototype.
 
-    It read "all stars down to" a magnitude from a catalog of stars: one fainter
-    than that was not there, and lifted no brighter one by its light.
+    The prototype read "all stars down to" a magnitude from a catalog of stars: a fainter star was
+    missing, and its light brightened no other star.
     """
     settings = load_missions()[name].model_dump()
     settings["catalog"]["merge_limit_mag"] = settings["catalog"]["magnitude_limit_mag"]
@@ -42,7 +42,7 @@ def paper_mission(name: str) -> Mission:
 
 @dataclass(frozen=True)
 class View:
-    """One field of view with its stars, and the draws that their errors are made from.
+    """One field of view with its stars, and the random draws for their errors.
 
     `axis` is the zone's; `attitude` the true one, inertial to body; `star` the
     rows in the run catalog.  `radius` is a normal deviate, `bearing_rad` and
@@ -59,7 +59,7 @@ class View:
     share: vectors.Vector
 
     def seen(self, run: Run) -> tuple[vectors.Vector, vectors.Vector]:
-        """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, with errors."""
+        """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, all with errors."""
         radius = run.sigma_arcsec / vectors.ARCSEC_PER_RADIAN * self.radius[:, None]
         aside, above = across(self.direction)
         bearing = self.bearing_rad[:, None]
@@ -76,7 +76,7 @@ class View:
 
 
 def rotation(run: Run) -> vectors.Matrix:
-    """The error of the attitude, R1(psi) R2(theta) R3(phi): phi about Z first, psi about X last."""
+    """Attitude error R1(psi) R2(theta) R3(phi): phi about Z first, psi about X last."""
     phi, theta, psi = (arcsec / 3600.0 for arcsec in run.rotation_arcsec)
     return (
         vectors.coordinate_rotation(0, psi)
@@ -93,7 +93,7 @@ def draw_zone(
     rng: np.random.Generator,
     most_stars: int = MOST_STARS,
 ) -> Iterator[View]:
-    """The views of one zone; `number` chooses among the Sun's dates where the world has them."""
+    """Draw the views of one zone; `number` selects the Sun's date if the world has several."""
     axis = _axis(world, number, rng)
     for _ in range(world.views):
         yield _view(world, axis, mission, catalog, rng, most_stars)
@@ -141,7 +141,7 @@ def _view(
 
 
 def _within(axis: vectors.Vector, radius_rad: float, rng: np.random.Generator) -> vectors.Vector:
-    """A direction drawn evenly over the cap about an axis."""
+    """Random direction, uniform over the cap about an axis."""
     # 1 - cos, so that small caps lose no digits.
     height = rng.uniform(0.0, 2.0 * math.sin(radius_rad / 2.0) ** 2)
     sine = math.sqrt(height * (2.0 - height))
@@ -152,10 +152,10 @@ def _within(axis: vectors.Vector, radius_rad: float, rng: np.random.Generator) -
 
 
 def batch_of(view: View, run: Run, mission: Mission, identifier: Identifier) -> ObservationBatch:
-    """The view as the service gets it.
+    """Observation batch of a view, as sent to the service.
 
-    The a priori attitude has body X on the zone's axis, and the sensor vectors
-    are those that it carries to the paper's inertial ones.
+    The a priori attitude has body X on the zone's axis, and the sensor vectors are rotated by it to
+    the paper's inertial ones.
     """
     tracker = mission.trackers[0]
     direction, magnitude = view.seen(run)

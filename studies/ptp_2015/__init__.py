@@ -1,1 +1,1 @@
-"""Zhou & Ye 2015: their tables and figures, and the rivals that they compare with."""
+"""Reproduction of Zhou & Ye 2015: tables, figures, and the compared algorithms."""

@@ -1,4 +1,4 @@
-"""`acquire simulate paper --table ptp-5` and its like: Zhou & Ye 2015 beside ours."""
+"""Command `acquire simulate paper --table ptp-5` and similar: Zhou & Ye 2015 and our results."""
 
 import sys
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from studies.ptp_2015.tables import OF_PROJECTIONS, TITLES, Measurements, sectio
 DEFAULT_SCENES = 10_000
 SLAVES = ("PTP, 3 slaves", "PTP", "PTP, 5 slaves", "PTP, 6 slaves")
 ALL = "ptp"
-"""Names every table and figure together."""
+"""Name that selects all tables and figures."""
 
 CASES: Mapping[str, Sequence[Case]] = {
     "ptp-1": [],
@@ -54,11 +54,11 @@ def run_ptp(
     report_path: Path | None = None,
     out: TextIO | None = None,
 ) -> Measurements:
-    """Print one table or figure of the PTP paper, or all (`ptp`), its numbers beside ours.
+    """Print one table or figure of the PTP paper, or all (`ptp`), with its numbers and ours.
 
-    `scenes` fields are drawn for each condition.  `json_path` takes one row per
-    condition and algorithm, the folder `plots` the pictures, `report_path` the
-    document, instead of printing.  Raises `BadInput` for a table there is not.
+    `scenes` fields are drawn for each condition.  `json_path` receives one row per condition and
+    algorithm, the folder `plots` the pictures, `report_path` the document, instead of printing.
+    Raises `BadInput` for an unknown table.
     """
     wanted = _checked(table, scenes, seed)
     out = out or sys.stdout
@@ -91,7 +91,7 @@ def _checked(table: str, scenes: int, seed: int) -> Sequence[str]:
 def measured(
     wanted: Sequence[str], scenes: int, seed: int, processes: int | None = None
 ) -> Measurements:
-    """Everything that some tables and figures show."""
+    """Compute all results that the requested tables and figures show."""
     cases = [case for name in wanted for case in CASES[name]]
     tallies = comparison.compare(cases, scenes, seed, processes) if cases else []
     names = dict.fromkeys(t.algorithm for t in tallies if t.case.name.startswith("ptp-"))
@@ -107,7 +107,7 @@ def measured(
 
 
 def rows_of(found: Measurements) -> list[dict[str, Any]]:
-    """One row per condition and algorithm, and those of the tables of projections."""
+    """Result rows, one per condition and algorithm, and those of the projection tables."""
     rows: list[dict[str, Any]] = [
         tally.row() for tallies in found.tallies.values() for tally in tallies
     ]
@@ -193,10 +193,11 @@ separations; it answers with four stars. Nothing was tuned beyond that.
 
 
 def document(found: Measurements, plots: Path, file: Path) -> str:
-    """Markdown: how the paper was read, its axis and ours, databases, tables, figures.
+    """Markdown document: interpretation of the paper, its axis and ours, databases, tables,
+    figures.
 
-    The pictures are those that `plots.draw` made in the folder `plots`, linked
-    as seen from the document's own `file`.
+    The pictures are those of `plots.draw` in the folder `plots`, linked relative to the document
+    `file`.
     """
     parts = [
         "# PTP and its rivals: Zhou & Ye 2015",
@@ -229,7 +230,7 @@ def _not_of_table_5(databases: Sequence[comparison.Database]) -> list[comparison
 
 
 def _in_short(found: Measurements) -> list[str]:
-    """The algorithms side by side at one pixel and at two, the best answer of its own first."""
+    """Summary table of the algorithms at one and at two pixels, the best strict rate first."""
     # Of one pixel and half a magnitude: it is their order that is claimed.
     printed = {row.algorithm: row.rate_pct for row in the_ptp_paper().table_6}
     rows = []
@@ -246,7 +247,7 @@ def _in_short(found: Measurements) -> list[str]:
 
 
 def _axis() -> str:
-    """The paper's axis, recovered from its Table 1, beside that of our catalog."""
+    """Table of the paper's principal axis, recovered from its Table 1, and of our own axes."""
     paper = the_ptp_paper()
     rows = [("paper, from Table 1", f"{paper.catalog_stars:,}", "", *_numbers(paper.axis))]
     rows[0] = (*rows[0], f"{paper.mean_projection:.2f}")

@@ -1,9 +1,9 @@
-"""Fields of the paper's camera given to several algorithms, on all cores.
+"""Comparison of algorithms on the same simulated fields of the paper's camera, on all cores.
 
-Every algorithm sees the same fields.  Each is asked twice: for its own answer,
-and for what is left of its proposals after the service's attitude check.
+Each algorithm is judged twice: by its own answer, and by the proposals that remain after the
+service's attitude check.
 
-The outcome of the fields of one condition under one algorithm is a `Tally`, with its rates.
+The outcomes for one condition and algorithm are a `Tally`, with its rates.
 """
 
 import math
@@ -30,8 +30,9 @@ from studies.ptp_2015.rivals.pyramid import build_pyramid
 from studies.workers import mapping
 
 COLUMNS = ("stars", "named", "named_right", "unique", "unique_right", "own_us", "check_us")
-"""Counts of a field: stars, those that the algorithm names, those named rightly; the last two
-after the check; microseconds of the algorithm, of the check."""
+"""Columns of a field's counts: stars; named and rightly named by the algorithm; named and rightly
+named after the check; microseconds of the algorithm and of the check.
+"""
 SIGMAS_95 = 1.959964
 
 Fields = npt.NDArray[np.bool_]
@@ -39,19 +40,19 @@ Fields = npt.NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class FieldShare:
-    """A share of fields in percent with its 95 % interval (Wilson)."""
+    """Share of fields in percent with its 95 % interval (Wilson)."""
 
     count: int
     of: int
 
     @property
     def percent(self) -> float:
-        """The share; NaN of no fields."""
+        """Share of fields in percent; NaN without fields."""
         return 100.0 * self.count / self.of if self.of else math.nan
 
     @property
     def interval(self) -> tuple[float, float]:
-        """Least and greatest share that the count agrees with."""
+        """Bounds of the 95 % interval of the share, in percent."""
         if not self.of:
             return math.nan, math.nan
         z2, share = SIGMAS_95**2 / self.of, self.count / self.of
@@ -69,10 +70,10 @@ LIMIT_MAG = 6.0
 
 @dataclass(frozen=True)
 class Case:
-    """One condition and the algorithms that see its fields.
+    """One simulated condition, with the algorithms compared on its fields.
 
-    `adds`: noise of magnitude lifts stars fainter than the limit into the field
-    as well as it drops brighter ones; without it the sky ends at the limit.
+    `adds`: noise of magnitude also lifts stars fainter than the limit into the field; otherwise the
+    sky ends at the limit.
     """
 
     name: str
@@ -84,7 +85,7 @@ class Case:
 
     @property
     def conditions(self) -> Conditions:
-        """The same for the simulator."""
+        """Condition in the form of the scene simulator."""
         return Conditions(
             position_px=self.position_px,
             magnitude_sigma_mag=self.magnitude_sigma_mag,
@@ -95,12 +96,11 @@ class Case:
 
 @dataclass(frozen=True, eq=False)
 class Tally:
-    """Rows (fields, columns) of one case and algorithm; see `COLUMNS`.
+    """Counts (fields, columns) of one condition and algorithm; see `COLUMNS`.
 
-    The paper never says when a field counts as identified.  *strict*: three
-    stars or more are named, all rightly; *loose*: two or more, most of them
-    rightly; *checked*: three or more after the attitude check, all rightly;
-    *wrong*: after the check some star has a name that is not its own.
+    The paper does not define when a field is identified.  *strict*: three stars or more are named,
+    all rightly; *loose*: two or more, most of them rightly; *checked*: three or more after the
+    attitude check, all rightly; *wrong*: a star is misnamed after the check.
     """
 
     case: Case
@@ -112,52 +112,52 @@ class Tally:
 
     @cached_property
     def strict(self) -> FieldShare:
-        """All named stars rightly named, three at least."""
+        """Share of fields with at least three named stars, all named rightly."""
         named, right = self._column("named"), self._column("named_right")
         return self._rate((named >= 3) & (right == named))
 
     @cached_property
     def loose(self) -> FieldShare:
-        """Most named stars rightly named, two at least."""
+        """Share of fields with at least two named stars, most of them named rightly."""
         named, right = self._column("named"), self._column("named_right")
         return self._rate((named >= 2) & (2 * right > named))
 
     @cached_property
     def checked(self) -> FieldShare:
-        """The same as strict after the attitude check."""
+        """Share of fields with at least three named stars after the attitude check, all rightly."""
         unique, right = self._column("unique"), self._column("unique_right")
         return self._rate((unique >= 3) & (right == unique))
 
     @cached_property
     def wrong(self) -> FieldShare:
-        """The share of fields in which a star is misnamed after the attitude check."""
+        """Share of fields with a misnamed star after the attitude check."""
         return self._rate(self._column("unique_right") < self._column("unique"))
 
     @property
     def rates(self) -> tuple[FieldShare, ...]:
-        """Strict, loose, checked and wrong."""
+        """Shares of fields identified strictly, loosely, after the check, and wrongly."""
         return self.strict, self.loose, self.checked, self.wrong
 
     @cached_property
     def median_ms(self) -> tuple[float, float]:
-        """Median milliseconds of a field: of the algorithm itself, and with the check."""
+        """Median milliseconds per field: of the algorithm alone, and with the check."""
         own, check = self._column("own_us"), self._column("check_us")
         return float(np.median(own)) / 1000.0, float(np.median(own + check)) / 1000.0
 
     @cached_property
     def mean_ms(self) -> tuple[float, float]:
-        """Average milliseconds of a field, likewise; what the paper prints."""
+        """Mean milliseconds per field, as in the paper: algorithm alone, and with the check."""
         own, check = self._column("own_us"), self._column("check_us")
         return float(np.mean(own)) / 1000.0, float(np.mean(own + check)) / 1000.0
 
     @property
     def times(self) -> str:
-        """Median and average of the algorithm itself, and with the check, as the tables show."""
+        """Text of median and mean times, of the algorithm alone, and with the check."""
         pairs = zip(self.median_ms, self.mean_ms, strict=True)
         return " / ".join(f"{median:.2f} ({mean:.2f})" for median, mean in pairs)
 
     def of_fields_with(self, least: int, most: int) -> "Tally":
-        """The fields that hold so many stars."""
+        """Counts of the fields with a number of stars from `least` to `most`."""
         stars = self._column("stars")
         return Tally(self.case, self.algorithm, self.rows[(stars >= least) & (stars <= most)])
 
@@ -165,7 +165,7 @@ class Tally:
         return FieldShare(int(fields.sum()), len(self.rows))
 
     def row(self) -> dict[str, Any]:
-        """The tally as a JSON object."""
+        """Results of one condition and algorithm as a JSON object."""
         own_ms, checked_ms = self.median_ms
         return {
             "table": self.case.name,
@@ -196,7 +196,7 @@ ALGORITHMS: Mapping[str, Build] = {
 OF_THE_PAPER = ("PTP", "P-vector", "planar triangle")
 COMPARED = (*OF_THE_PAPER, "Liebe's triangles", "pyramid")
 SIGMA_FLOOR_PX = 0.25
-"""The sigma that algorithms assume where there is no noise: a range of nothing finds nothing."""
+"""Sigma in pixels that algorithms assume for noiseless fields: a search needs some range."""
 SCENES_A_TASK = 50
 
 
@@ -210,7 +210,7 @@ class _Task:
 
 @dataclass(frozen=True)
 class Database:
-    """The data that an algorithm keeps for the catalog to V 6, and the cost of making them."""
+    """Database of an algorithm for the catalog to V 6: entries, size, and building time."""
 
     algorithm: str
     entries: int
@@ -221,10 +221,10 @@ class Database:
 def compare(
     cases: Sequence[Case], scenes: int, seed: int, processes: int | None = None
 ) -> list[Tally]:
-    """The tallies of every case and algorithm, in their order.
+    """Compare algorithms on the fields of several cases; returns a tally for each.
 
-    Scene k of a seed is the same whatever the number of scenes and of workers;
-    `processes` is one a core where it is None, and 1 works in this process.
+    Scene k of a seed is the same for any number of scenes and workers; `processes` is one per core
+    if None, and 1 works in this process.
     """
     tasks = [
         _Task(case, seed, first, min(SCENES_A_TASK, scenes - first))
@@ -247,7 +247,7 @@ def compare(
 
 
 def _perform(task: _Task) -> npt.NDArray[np.int64]:
-    """Counts (algorithms, scenes, columns) of some scenes of a case."""
+    """Counts (algorithms, scenes, columns) for some scenes of a case."""
     case = task.case
     sky = _sky(case.magnitude_sigma_mag if case.adds else 0.0)
     assumed_rad = max(case.position_px, SIGMA_FLOOR_PX) * case.conditions.camera.pixel_rad
@@ -262,7 +262,7 @@ def _perform(task: _Task) -> npt.NDArray[np.int64]:
 
 
 def _ask(algorithm: Algorithm, scene: Scene) -> tuple[int, ...]:
-    """One row of a tally; see `COLUMNS`."""
+    """Run an algorithm and the check on one scene; returns counts and times, see `COLUMNS`."""
     started = perf_counter_ns()
     proposed = algorithm.identify(scene)
     answered = perf_counter_ns()
@@ -283,9 +283,9 @@ def _ask(algorithm: Algorithm, scene: Scene) -> tuple[int, ...]:
 
 
 def false_fields(scenes: int, seed: int) -> list[dict[str, str | int]]:
-    """Mirrored skies, and fields of as many random points, that PTP names stars of, at 2 px.
+    """Numbers of mirrored skies and of random-point fields in which PTP names stars, at 2 px.
 
-    Counted are fields with three stars or more by sharing stars, and behind the attitude check.
+    Counted are fields with three named stars or more, by sharing stars and after the check.
     """
     case, rng = Case("ptp-false", ("PTP",), 2.0), np.random.default_rng([seed, 2])
     half = np.tan(np.radians(5.0))
@@ -315,7 +315,7 @@ def false_fields(scenes: int, seed: int) -> list[dict[str, str | int]]:
 
 
 def databases(names: Sequence[str] = COMPARED) -> list[Database]:
-    """Each algorithm's database, built twice: compiling is no part of the second time."""
+    """Build each algorithm's database twice, and time the second build, free of compilation."""
     made = []
     for name in names:
         ALGORITHMS[name](_sky(0.0).run_catalog)
@@ -327,14 +327,14 @@ def databases(names: Sequence[str] = COMPARED) -> list[Database]:
 
 
 def stars_in_fields(scenes: int, seed: int) -> npt.NDArray[np.int64]:
-    """How many stars to the limit stand in fields at attitudes spread evenly: Figure 10."""
+    """Numbers of stars to the limit in fields at random attitudes, for Figure 10."""
     case = Case("figure-10", (), 0.0, fewest=0)
     drawn = draw_scenes(_sky(0.0), case.conditions, scenes, seed)
     return np.array([len(s.star) for s in tqdm(drawn, total=scenes, unit="scene", disable=None)])
 
 
 def all_projections() -> Projections:
-    """The projections of the sky's guide triangles to the limit: Table 2, Figures 6 and 7."""
+    """Projections of the sky's guide triangles to the limit: Table 2, Figures 6 and 7."""
     return projections_of(_sky(0.0).run_catalog)
 
 

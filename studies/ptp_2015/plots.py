@@ -1,4 +1,4 @@
-"""The paper's figures as pictures: our lines, and the ends that its text gives of its own."""
+"""Pictures of the paper's figures: our lines, and the end points given in its text."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,9 +23,9 @@ PlottedSeries = dict[str, Sequence[Tally] | npt.NDArray[np.int64] | Projections]
 
 
 def draw(found: PlottedSeries, folder: Path) -> list[Path]:
-    """Draw every figure that there are results for; the SVG files written.
+    """Draw all figures for which there are results; returns the SVG files written.
 
-    Raises `NotAvailable` where matplotlib is not installed.
+    Raises `NotAvailable` without matplotlib.
     """
     paper = the_ptp_paper()
     with pictures_in(folder, "ptp") as pictures:

@@ -1,7 +1,6 @@
-"""The printed experiments of Zhou & Ye 2015: the tables, and the text's numbers on figures.
+"""Numbers printed by Zhou & Ye 2015: tables, and values in the text about figures.
 
-The figures themselves are pictures without numbers; the text gives the ends of
-their lines.
+The figures themselves are pictures without numbers; the text gives the end points of their lines.
 """
 
 from dataclasses import dataclass
@@ -18,7 +17,7 @@ Ends = dict[str, tuple[float, float]]
 
 @dataclass(frozen=True)
 class Slaves:
-    """A row of Table 5: the guide database with so many slaves, at no noise."""
+    """A row of Table 5: guide database with a number of slave stars, without noise."""
 
     slaves: int
     memory_mb: float
@@ -28,7 +27,7 @@ class Slaves:
 
 @dataclass(frozen=True)
 class Compared:
-    """A row of Table 6: an algorithm at one pixel and half a magnitude of noise."""
+    """A row of Table 6: results of an algorithm at one pixel and half a magnitude of noise."""
 
     algorithm: str
     rate_pct: float
@@ -38,7 +37,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class StarsInField:
-    """The text's numbers on Figure 10: stars in the field of view over 10,000 attitudes."""
+    """Printed values of Figure 10: stars in the field of view over 10,000 attitudes."""
 
     least: int
     most: int
@@ -48,31 +47,31 @@ class StarsInField:
 
 @dataclass(frozen=True)
 class Printed:
-    """Figures printed in the paper.  `axis` and `mean_projection` are solved for from Table 1."""
+    """Numbers printed in the paper.  `axis` and `mean_projection` are solved for from Table 1."""
 
     axis: tuple[float, ...]
     mean_projection: float
     table_1: tuple[tuple[int, float], ...]
-    """Index and projection of the nine rows that are printed."""
+    """Index and projection in the nine printed rows of Table 1."""
     table_1_sides: tuple[tuple[float, ...], ...]
-    """The three sides of each of these rows."""
+    """Three sides of each triangle printed in Table 1."""
     table_3: dict[str, Any]
-    """Four triangles: stars of the field and their SAO numbers; the stars that are identified."""
+    """Table 3: four triangles as stars of the field and SAO numbers, and the identified stars."""
     table_2: tuple[tuple[int, int], ...]
-    """Limit index and k-vector."""
+    """Rows of Table 2: limit index and k-vector."""
     catalog_stars: int
     table_5: tuple[Slaves, ...]
     table_6: tuple[Compared, ...]
     figure_10: StarsInField
     figure_12: Ends
-    """Rates in percent at no noise of position and at two pixels."""
+    """Rates in percent without noise of position, and at two pixels."""
     figure_13: Ends
-    """Rates in percent at no noise of magnitude and at half a magnitude."""
+    """Rates in percent without noise of magnitude, and at half a magnitude."""
 
 
 @cache
 def the_ptp_paper() -> Printed:
-    """The printed numbers, read once."""
+    """Numbers printed in the PTP paper, read once from a file."""
     data = msgspec.json.decode(_FILE.read_bytes())
     table_1 = data["table_1"]
     of_table_1 = {

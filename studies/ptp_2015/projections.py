@@ -1,4 +1,4 @@
-"""Table 2 and figures 6 and 7 of the PTP paper: where the projections of all triangles lie."""
+"""Table 2 and Figures 6 and 7 of the PTP paper: distribution of triangle projections."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,16 +17,16 @@ from studies.ptp_2015.rivals.proposed import proposed_by_votes
 
 SHOWN_EVERY = 25
 SIGMA_AT_1_PX = 2.87
-"""The sigma of a projection, by the paper's equation 13 at one pixel of 35.25 arcsec."""
+"""Sigma of a projection by the paper's equation 13, at one pixel of 35.25 arcsec."""
 COLORS = ("#0b5394", "#b45309")
 
 
 @dataclass(frozen=True)
 class Projections:
-    """The guide triangles of the sky to V 6, as they are and as the printed tables suggest.
+    """Guide triangles of the sky to V 6, in our database and as the printed tables suggest.
 
-    `once` are the projections of four slaves' triangles, each set of three stars once; `three`
-    those of three slaves.
+    `once` are the projections of triangles of four slave stars, each set of three stars once;
+    `three` those of three slave stars.
     """
 
     triangles: TriangleIndex
@@ -34,7 +34,7 @@ class Projections:
     three: KVector
 
     def rows(self, name: str) -> list[dict[str, Any]]:
-        """A table or figure as rows of a file."""
+        """Rows of a table or figure, for JSON."""
         if name == "ptp-1":
             return rows_of_table_1()
         if name == "ptp-3":
@@ -49,7 +49,7 @@ class Projections:
         ]
 
     def table_2(self) -> list[tuple[int, int, int, int]]:
-        """Limit index, the paper's K, ours, and ours of three slaves with each triangle once."""
+        """Rows of Table 2: limit index, K of the paper, ours, and ours with three slave stars."""
         ours = self.triangles.projection.below
         return [
             (index, paper, int(ours[index - 1]), int(self.three.below[index - 1]))
@@ -58,20 +58,20 @@ class Projections:
 
 
 def projections_of(stars: RunCatalog) -> Projections:
-    """The projections of a list of stars."""
+    """Compute the projections of guide triangles for a list of stars."""
     four = build_triangles(stars.direction)
     return Projections(four, _once(four), _once(build_triangles(stars.direction, slaves=3)))
 
 
 def _once(index: TriangleIndex) -> KVector:
-    """The projections of triangles, each set of three stars once: with its brightest as master."""
+    """Projections of triangles, each set of three stars once, with its brightest as master."""
     order = np.argsort(index.star[:, 0], kind="stable")
     _, first = np.unique(np.sort(index.star[order], axis=1), axis=0, return_index=True)
     return build_kvector(index.projection.value[np.sort(order[first])])
 
 
 def recovered_axis() -> tuple[Vector, float]:
-    """The axis and the mean projection of Table 1: four unknowns of nine equations."""
+    """Axis and mean projection behind Table 1, from a least-squares fit of nine equations."""
     paper = the_ptp_paper()
     sides, printed = np.array(paper.table_1_sides), np.array([row[1] for row in paper.table_1])
     unknowns = np.linalg.lstsq(np.column_stack([sides, -np.ones(len(sides))]), printed)[0]
@@ -79,7 +79,7 @@ def recovered_axis() -> tuple[Vector, float]:
 
 
 def rows_of_table_1() -> list[dict[str, Any]]:
-    """The printed triangles: sides, the projection that is printed, and by the recovered axis."""
+    """Rows of Table 1: sides of a triangle, printed projection, and that by the recovered axis."""
     axis, mean = recovered_axis()
     paper = the_ptp_paper()
     return [
@@ -95,7 +95,7 @@ def rows_of_table_1() -> list[dict[str, Any]]:
 
 
 def table_1(found: Projections) -> str:
-    """Table 1: the printed projections, and those that its sides give on the recovered axis."""
+    """Table 1 in Markdown: printed projections, and those of the sides on the recovered axis."""
     axis, mean = recovered_axis()
     lines = [
         (
@@ -116,7 +116,7 @@ def table_1(found: Projections) -> str:
 
 
 def rows_of_table_3() -> list[dict[str, Any]]:
-    """The stars of Table 3 with the SAO number that sharing stars validate, None for none."""
+    """Rows of Table 3: each star with the SAO number that sharing stars validate, or None."""
     triangles = the_ptp_paper().table_3["triangles"]
     sao = sorted({number for each in triangles for number in each["sao"]})
     image = np.array([each["stars"] for each in triangles], np.int32)
@@ -130,7 +130,7 @@ def rows_of_table_3() -> list[dict[str, Any]]:
 
 
 def table_3(found: Projections) -> str:
-    """Table 3: which stars of the printed triangles sharing stars validate."""
+    """Table 3 in Markdown: stars of the printed triangles that sharing stars validate."""
     printed = the_ptp_paper().table_3["identified"]
     lines = [
         (
@@ -144,7 +144,7 @@ def table_3(found: Projections) -> str:
 
 
 def table_2(found: Projections) -> str:
-    """Table 2: the k-vector at the printed limit indices."""
+    """Table 2 in Markdown: the k-vector at the printed limit indices."""
     rows = [[f"{cell:,}" for cell in row] for row in found.table_2()]
     four, three = found.triangles.projection, found.three
     rows.append(["triangles", "", f"{len(four.value):,}", f"{len(three.value):,}"])
@@ -154,10 +154,10 @@ def table_2(found: Projections) -> str:
 
 
 def printed_slope(found: Projections) -> float:
-    """The worth of one limit index in P, if Tables 1 and 2 are of one database.
+    """Step of P per limit index, if Tables 1 and 2 are of one database.
 
-    K of the first row of Table 2 is the row of a triangle whose P follows from the rows of
-    Table 1, 90 rows before, by the density that they show themselves.
+    K of the first row of Table 2 is the row of a triangle whose P is extrapolated from the rows of
+    Table 1, 90 rows before, with their density.
     """
     index, count = the_ptp_paper().table_2[0]
     rows = the_ptp_paper().table_1
@@ -167,7 +167,7 @@ def printed_slope(found: Projections) -> float:
 
 
 def note_on_table_2(found: Projections) -> str:
-    """A note on the database that the printed numbers imply."""
+    """Note on the size of the database that the printed numbers imply."""
     slope = printed_slope(found)
     value = found.triangles.projection.value
     implied = (float(value[-1]) - float(value[0])) / slope + 1.0
@@ -180,7 +180,7 @@ def note_on_table_2(found: Projections) -> str:
 
 
 def row_of_figure_6(found: Projections) -> dict[str, Any]:
-    """Figure 6 in numbers: how the triangles lie along the axis."""
+    """Row of Figure 6: distribution of the triangles along the axis."""
     value = found.triangles.projection.value
     gap = np.diff(value)
     return {
@@ -195,7 +195,7 @@ def row_of_figure_6(found: Projections) -> dict[str, Any]:
 
 
 def figure_6(found: Projections) -> str:
-    """Figure 6: how the triangles lie along the axis."""
+    """Figure 6 as a Markdown table: distribution of the triangles along the axis."""
     row = row_of_figure_6(found)
     shares = ", ".join(f"{100.0 * share:.0f} %" for share in row["explained"])
     rows = (
@@ -215,7 +215,7 @@ def figure_6(found: Projections) -> str:
 
 
 def figure_7(found: Projections) -> str:
-    """Figure 7: the index of a triangle by its projection, at the rows that Table 1 prints."""
+    """Figure 7 as a Markdown table: index of a triangle by projection, at the rows of Table 1."""
     rows = [
         (f"{row['projection']:.5f}", *(f"{row[name]:,}" for name in ("paper", "ours", "once")))
         for row in rows_of_figure_7(found)
@@ -224,7 +224,7 @@ def figure_7(found: Projections) -> str:
 
 
 def rows_of_figure_7(found: Projections) -> list[dict[str, Any]]:
-    """Projection, the printed index, ours, and ours with each triangle once."""
+    """Rows of Figure 7: projection, printed index, ours, and ours with each triangle once."""
     return [
         {
             "table": "figure-7",
