@@ -1,4 +1,4 @@
-"""The processes that work on the tasks of a study, on all cores."""
+"""Worker processes for the tasks of a study, on all cores."""
 
 import multiprocessing
 import os
@@ -12,7 +12,7 @@ from service.child_processes import Source, own_source, require_source, safe_pat
 
 
 def number_of(processes: int | None) -> int:
-    """The number of workers: one a core where it is None."""
+    """Number of workers; None: one per core."""
     return processes or len(os.sched_getaffinity(0))
 
 

@@ -59,7 +59,7 @@ class View:
     share: vectors.Vector
 
     def seen(self, run: Run) -> tuple[vectors.Vector, vectors.Vector]:
-        """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, all with errors."""
+        """Directions (n, 3), inertial by the erroneous attitude, and magnitudes, with noise."""
         radius = run.sigma_arcsec / vectors.ARCSEC_PER_RADIAN * self.radius[:, None]
         aside, above = across(self.direction)
         bearing = self.bearing_rad[:, None]

@@ -247,7 +247,7 @@ def _within(value: Vector, reach: float) -> npt.NDArray[np.int64]:
 
 
 def draw_figure_6(figure: Any, found: Projections) -> None:
-    """The sides of triangles with the axis of their projections, and how many lie where."""
+    """Draw the sides of triangles with the axis of their projections, and a histogram."""
     index = found.triangles
     left = figure.add_subplot(1, 2, 1, projection="3d")
     sides = index.side[::SHOWN_EVERY]
@@ -262,7 +262,7 @@ def draw_figure_6(figure: Any, found: Projections) -> None:
 
 
 def draw_figure_7(figure: Any, found: Projections) -> None:
-    """Projections by their index, ours and the nine that the paper prints."""
+    """Draw projections against their index: ours, and the nine printed in the paper."""
     axis = figure.subplots()
     named: Sequence[tuple[str, KVector, str]] = (
         ("ours", found.triangles.projection, COLORS[0]),

@@ -1,4 +1,4 @@
-"""The paper's tables and figures as Markdown, its numbers beside ours."""
+"""Tables and figures of the PTP paper in Markdown, its numbers and ours."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -35,17 +35,17 @@ OF_PROJECTIONS: Mapping[str, Callable[[Projections], str]] = {
     "figure-6": projections.figure_6,
     "figure-7": projections.figure_7,
 }
-"""Tables of all triangles of the sky: no field is drawn for these."""
+"""Functions for tables of all triangles of the sky, which need no simulated fields."""
 
 NOT_ON_THE_PAGE = (
     *("ptp-1", "ptp-2", "ptp-3", "figure-6", "figure-7"),
     *("figure-10", "figure-11", "figure-12", "figure-13"),
 )
-"""The page leaves out their rows, which the command prints; it has their notes and pictures."""
+"""Tables whose rows only the command prints; the page has their notes and pictures."""
 
 MB = 1e6
 STARS_IN_FIELD = ((3, 3), (4, 4), (5, 5), (6, 6), (7, 7), (8, 8), (9, 10), (11, 15), (16, 99))
-"""The columns of Figure 11, first to last."""
+"""Ranges of the numbers of stars in a field, the columns of Figure 11."""
 
 RATES = (
     "Shares of fields in percent, in brackets the 95 % interval. *Strict*: the algorithm names "
@@ -61,7 +61,7 @@ ROWS = (
 
 @dataclass(frozen=True)
 class Measurements:
-    """The measurements: tallies by table, the counts of Figure 10, the databases."""
+    """Results of the comparison: tallies by table, star counts of Figure 10, databases."""
 
     scenes: int
     seed: int
@@ -70,11 +70,11 @@ class Measurements:
     databases: Sequence[Database] = field(default_factory=tuple)
     false_fields: Sequence[Mapping[str, str | int]] = ()
     projections: Projections | None = None
-    """The projections of the sky's triangles, for Table 2 and Figures 6 and 7."""
+    """Projections of the sky's triangles, for Table 2 and Figures 6 and 7."""
 
     @property
     def drawn(self) -> PlottedSeries:
-        """The figures, for the plots."""
+        """Data of the figures, for the plots."""
         figures: PlottedSeries = {} if self.stars is None else {"figure-10": self.stars}
         if self.projections is not None:
             wanted = [name for name in self.tallies if name.startswith("figure")]
@@ -85,7 +85,7 @@ class Measurements:
 
 
 def section(found: Measurements, name: str) -> str:
-    """A table or figure with its heading, and what the paper claims of it that cannot be."""
+    """Markdown section of a table or figure, with a note on claims that cannot be reproduced."""
     tallies, paper = found.tallies[name], the_ptp_paper()
     note = NOT_REPRODUCED.get(name)
     if name in OF_PROJECTIONS:
@@ -112,7 +112,7 @@ def section(found: Measurements, name: str) -> str:
 
 
 def on_the_page(found: Measurements, name: str) -> str:
-    """The section as the page has it: without the rows that the command alone prints."""
+    """Markdown section for the page, without the rows that only the command prints."""
     whole = section(found, name)
     if name not in NOT_ON_THE_PAGE:
         return whole
@@ -121,7 +121,7 @@ def on_the_page(found: Measurements, name: str) -> str:
 
 
 def table_5(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
-    """Table 5: how many slaves a master should have."""
+    """Table 5 in Markdown: rates and database sizes by the number of slave stars."""
     size = {each.algorithm: each for each in databases}
     rows = []
     for printed in the_ptp_paper().table_5:
@@ -151,7 +151,7 @@ def _names(slaves: int) -> tuple[str, ...]:
 
 
 def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
-    """Table 6: the algorithms at one pixel and half a magnitude, without and with added stars."""
+    """Table 6 in Markdown: algorithms at one pixel and half a magnitude of noise."""
     size = {each.algorithm: each for each in databases}
     printed = {row.algorithm: row for row in the_ptp_paper().table_6}
     rows = []
@@ -177,7 +177,7 @@ def table_6(tallies: Sequence[Tally], databases: Sequence[Database]) -> str:
 
 
 def database_table(databases: Iterable[Database]) -> str:
-    """The data that each algorithm keeps for the sky to V 6, and the time to make them."""
+    """Table of each algorithm's database for the sky to V 6: rows, size, building time."""
     printed = {row.algorithm: row.memory_mb for row in the_ptp_paper().table_6}
     rows = (
         (
@@ -193,7 +193,7 @@ def database_table(databases: Iterable[Database]) -> str:
 
 
 def figure_10(stars: npt.NDArray[np.int64]) -> str:
-    """Figure 10: stars in the field of view."""
+    """Figure 10 as a Markdown table: stars in the field of view."""
     printed = the_ptp_paper().figure_10
     rows = (
         ("mean", f"{printed.mean:.2f}", f"{stars.mean():.2f}"),
@@ -209,7 +209,7 @@ def figure_10(stars: npt.NDArray[np.int64]) -> str:
 
 
 def figure_11(tallies: Sequence[Tally]) -> str:
-    """Figure 11: the rate against the stars in the field, strict and checked."""
+    """Figure 11 as a Markdown table: strict and checked rates by the stars in the field."""
     rows = []
     for tally in tallies:
         parts = [tally.of_fields_with(least, most) for least, most in STARS_IN_FIELD]
@@ -223,14 +223,14 @@ def figure_11(tallies: Sequence[Tally]) -> str:
 
 
 def false_fields(rows: Sequence[Mapping[str, str | int]]) -> str:
-    """Mirrored skies and random points in which three stars or more are named."""
+    """Table of mirrored skies and random fields in which three stars or more are named."""
     header = ("fields", "of", "by sharing stars (section 2.3)", "behind the attitude check")
     names = ("fields", "scenes", "sharing", "checked")
     return markdown(header, [tuple(f"{row[name]}" for name in names) for row in rows])
 
 
 def line_table(tallies: Sequence[Tally], axis: str, unit: str, printed: Ends) -> str:
-    """Figures 12 and 13: rates against one kind of noise; `axis` names the case's field."""
+    """Figures 12 and 13 as Markdown tables: rates against the noise in the case's field `axis`."""
     values = sorted({getattr(tally.case, axis) for tally in tallies})
     rows = []
     for tally in sorted(tallies, key=lambda t: getattr(t.case, axis)):

@@ -1,1 +1,1 @@
-"""The star image detection report, each claim compared with this project's implementation."""
+"""Check of the star image detection report: each claim compared with this project's results."""

@@ -1,4 +1,4 @@
-"""Claims of the report beside this project's measured values, gathered in rows."""
+"""Records of the report's claims and this project's measured values."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -10,12 +10,12 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Verdict = Literal["confirmed", "corrected", "qualified", "added"]
-"""Corrected: a slip of the report, mended.  Qualified: right within limits that ours shows."""
+"""Verdicts on a claim; corrected: the report had an error; qualified: valid within limits."""
 
 
 @dataclass(frozen=True)
 class Claim:
-    """A statement of the report in a section, the finding here, and whether that is in its bounds.
+    """A claim of a section of the report, our finding, and whether it is within its bounds.
 
     `figures` are the numbers behind `ours`, by name.
     """
@@ -30,7 +30,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Picture:
-    """A figure of the documentation: its size in inches, what it shows, and how it is drawn."""
+    """A figure of the documentation: caption, size in inches, and drawing function."""
 
     caption: str
     size: tuple[float, float]
@@ -39,7 +39,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Row:
-    """One system of the report: `IM-4`, its title, its claims and pictures by name."""
+    """One system of the report, such as `IM-4`: title, claims, and pictures by name."""
 
     name: str
     title: str
@@ -48,25 +48,25 @@ class Row:
 
     @property
     def holds(self) -> bool:
-        """True if everything is within its bounds."""
+        """True if all claims are within their bounds."""
         return all(claim.holds for claim in self.claims)
 
 
 @dataclass(frozen=True)
 class Study:
-    """How the rows are measured: from which seed, and on samples how large."""
+    """Parameters of the measurements: random seed, and reduced sample sizes if quick."""
 
     seed: int
     quick: bool = False
 
     def rng(self, row: int) -> np.random.Generator:
-        """Random numbers of one row: the same whether or not the others are measured."""
+        """Random generator of one row, independent of which other rows are measured."""
         return np.random.default_rng([self.seed, row])
 
     def trials(self, full: int) -> int:
-        """The size of a sample."""
+        """Size of a sample, a tenth if quick."""
         return max(full // 10, 200) if self.quick else full
 
     def slack(self, trials: int, bound: float) -> float:
-        """A bound on a scatter, with four standard errors of so many trials where they are few."""
+        """Bound on the ratio of two scatters, raised to four standard errors for few trials."""
         return max(bound, 4.0 / float(np.sqrt(2.0 * trials)))

@@ -1,4 +1,4 @@
-"""`acquire simulate imaging`: every claim of the star image detection report beside ours."""
+"""Command `acquire simulate imaging`: claims of the star image detection report and our results."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -72,11 +72,10 @@ def run_imaging(
     report_path: Path | None = None,
     out: TextIO | None = None,
 ) -> list[Row]:
-    """Print some rows, or all, with the report's claims and ours; the rows.
+    """Check some rows of claims, or all, print them with our results, and return the rows.
 
-    `json_path` takes the claims with their figures, `plots_folder` the pictures,
-    `report_path` all of it as a page instead of printing it.  Raises `BadInput` for a row
-    that is not there.
+    `json_path` receives the claims with their figures, `plots_folder` the pictures, `report_path` a
+    page with everything, instead of printing.  Raises `BadInput` for an unknown row.
     """
     names = list(dict.fromkeys(name.upper() for name in wanted)) or list(ROWS)
     faults = [
@@ -106,7 +105,7 @@ def run_imaging(
 
 
 def table(row: Row) -> str:
-    """A row of claims as a Markdown table."""
+    """Markdown table of the claims of one row."""
     lines = ["| section | the report | here | |", "|---|---|---|---|"]
     lines += [
         f"| {claim.section} | {_cell(claim.says)} | {_cell(claim.ours)} | {_mark(claim)} |"
@@ -124,7 +123,7 @@ def _mark(claim: Claim) -> str:
 
 
 def document(rows: Sequence[Row], seed: int, folder: Path, file: Path) -> str:
-    """All rows as a page, pictures linked as seen from the page's own `file`."""
+    """Markdown page of all rows, pictures linked relative to the page `file`."""
     total = sum(len(row.claims) for row in rows)
     held = sum(claim.holds for row in rows for claim in row.claims)
     parts = [
@@ -146,7 +145,7 @@ def document(rows: Sequence[Row], seed: int, folder: Path, file: Path) -> str:
 
 
 def as_json(rows: Sequence[Row]) -> str:
-    """One claim a line, with its figures."""
+    """JSON with one claim per line, and its figures."""
     return json_rows(
         {
             "row": row.name,
@@ -163,9 +162,9 @@ def as_json(rows: Sequence[Row]) -> str:
 
 
 def draw(rows: Sequence[Row], folder: Path) -> list[Path]:
-    """Draw every picture of the rows; the files written.
+    """Draw all pictures of the rows; returns the files written.
 
-    Raises `NotAvailable` where matplotlib is not installed.
+    Raises `NotAvailable` without matplotlib.
     """
     with pictures_in(folder, "imaging") as pictures:
         for row in rows:

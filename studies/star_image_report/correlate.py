@@ -1,10 +1,10 @@
-"""Location by cross-correlation (report, part III, and the experiment of 5.4).
+"""Location of star images by cross-correlation (report, part III, and experiment 5.4).
 
-Arrays are (rows, columns), displacements in pixels: u along columns, v along rows, of
-the image from where the reference stands.  Correlations are circular: a reference
-that falls to nothing before its rim is compared as if it went on for ever.
+Arrays are (rows, columns), displacements in pixels: u along columns, v along rows, of the image
+from the reference.  Correlations are circular: a reference that falls to nothing before its edge is
+treated as periodic.
 
-Rotation in the correlation: phi(k, h, theta) of 3.2, and the three unknowns found from it.
+Also correlation with rotation: phi(k, h, theta) of 3.2, and the three unknowns found from it.
 """
 
 import math
@@ -22,10 +22,10 @@ from studies.star_image_report.claims import Claim, Picture, Study
 
 @dataclass(frozen=True)
 class Location:
-    """The place of an image against its reference.
+    """Displacement of an image from its reference, with sigmas.
 
-    `peak` is the normalised correlation there, 1 for equal shapes; `peak_ratio` that peak
-    over the next one; the sigmas are the Cramér-Rao bound for the noise that was told.
+    `peak` is the normalised correlation, 1 for equal shapes; `peak_ratio` is that peak over the
+    next one; the sigmas are the Cramér-Rao bound for the given noise.
     """
 
     u_px: float
@@ -37,7 +37,7 @@ class Location:
 
 
 def peak_offset(samples: Array) -> float:
-    """The place of the greatest sample of a circle, from the first, by a parabola through three."""
+    """Position of the maximum of periodic samples, from the first, by a parabola through three."""
     at = int(np.argmax(samples))
     n = len(samples)
     before, peak, after = samples[at - 1], samples[at], samples[(at + 1) % n]
@@ -48,16 +48,16 @@ def peak_offset(samples: Array) -> float:
 
 
 def displacement_by_peak(signal: Array, reference: Array) -> float:
-    """How far a signal is shifted: where its correlation with the reference is greatest."""
+    """Shift of a signal in samples, at the maximum of its correlation with the reference."""
     turned = np.fft.rfft(signal) * np.conj(np.fft.rfft(reference))
     return peak_offset(np.fft.irfft(turned, len(signal)))
 
 
 def displacement_by_derivative(signal: Array, reference: Array) -> float:
-    """The same by the zero of the correlation with the reference's derivative.
+    """Shift of a signal, at the zero of its correlation with the reference's derivative.
 
-    It has a sign on either side, which is what a control loop wants; between samples
-    the correlation is the trigonometric polynomial through them.
+    The correlation changes sign there, as a control loop needs; between samples it is the
+    trigonometric polynomial through them.
     """
     n = len(signal)
     turned = np.fft.fft(signal) * np.conj(np.fft.fft(reference))
@@ -79,9 +79,10 @@ def displacement_by_derivative(signal: Array, reference: Array) -> float:
 
 
 def misaligned(image: Array, k_px: float, h_px: float, turn_rad: float) -> Array:
-    """f((x + k) cos t - (y + h) sin t, (x + k) sin t + (y + h) cos t) about the middle pixel.
+    """Shifted and rotated image f((x + k) cos t - (y + h) sin t, (x + k) sin t + (y + h) cos t).
 
-    One printing of the report has a sine for the last cosine.
+    Coordinates count from the middle pixel.  One printing of the report has a sine for the last
+    cosine.
     """
     rows, columns = image.shape
     y, x = np.mgrid[: float(rows), : float(columns)]
@@ -93,16 +94,16 @@ def misaligned(image: Array, k_px: float, h_px: float, turn_rad: float) -> Array
 
 
 def overlap(image: Array, reference: Array) -> float:
-    """phi: the correlation of two images as they lie, over the geometric mean of their own."""
+    """Correlation phi of two images as they are, normalised by the root of their energies."""
     norm = math.sqrt(float(np.sum(image**2)) * float(np.sum(reference**2)))
     return float(np.sum(image * reference)) / norm
 
 
 def search_by_axes(image: Array, reference: Array, rounds: int = 2) -> tuple[float, float]:
-    """(u, v) by searching along one axis to a peak, then along the other (Fig. 3-3).
+    """Displacement (u, v) by a search along one axis to a peak, then along the other (Fig. 3-3).
 
-    It works on crosses, whose bars overlap wherever they are; a compact star gives no
-    peak to climb until it is nearly aligned.  A second round sharpens the first.
+    The search works on crosses, whose bars always overlap; a compact star gives no peak until
+    nearly aligned.  A second round improves the first.
     """
     _same_shape(image, reference)
     in_u, in_v = np.fft.rfft(reference, axis=1), np.fft.rfft(reference, axis=0)
@@ -119,15 +120,15 @@ def _line_peak(image: Array, reference_transform: npt.NDArray[np.complex128], ax
 
 
 def _shifted(image: Array, u_px: float, v_px: float) -> Array:
-    """The image moved back by whole pixels."""
+    """Image shifted back by whole pixels."""
     return np.roll(image, (-round(v_px), -round(u_px)), axis=(0, 1)) if u_px or v_px else image
 
 
 def locate(image: Array, reference: Array, noise_sigma: float = 0.0) -> Location:
-    """The place of the reference in an image of the same shape, to a small part of a pixel.
+    """Displacement of an image from a reference of the same shape, to a small part of a pixel.
 
-    The greatest normalised correlation over all whole displacements, then the zero of
-    its derivatives.  `noise_sigma` is that of a pixel of the image.
+    The maximum of the normalised correlation over all whole displacements, then the zero of its
+    derivatives.  `noise_sigma` is that of a pixel of the image.
     """
     _same_shape(image, reference)
     rows, columns = image.shape
@@ -159,7 +160,7 @@ def _same_shape(image: Array, reference: Array) -> None:
 
 
 def _polished(turned: npt.NDArray[np.complex128], u: float, v: float) -> tuple[float, float, float]:
-    """Newton's steps to where both derivatives of the correlation vanish, and its value there."""
+    """Newton iteration to the zero of both derivatives of the correlation; also its value there."""
     rows, columns = turned.shape
     fu = 2.0 * math.pi * np.fft.fftfreq(columns)[None, :]
     fv = 2.0 * math.pi * np.fft.fftfreq(rows)[:, None]
@@ -179,14 +180,14 @@ def _polished(turned: npt.NDArray[np.complex128], u: float, v: float) -> tuple[f
 
 
 def _peak_ratio(surface: Array, row: int, column: int) -> float:
-    """The greatest peak over the next that is a peak of its own; infinite where none is."""
+    """Ratio of the highest peak to the next separate one; infinite without another."""
     peaks = (surface == maximum_filter(surface, size=5, mode="wrap")) & (surface > 0.0)
     peaks[row, column] = False
     return float(surface[row, column] / surface[peaks].max()) if peaks.any() else math.inf
 
 
 def _bounds(pattern: Array, scale: float, noise_sigma: float) -> tuple[float, float]:
-    """The bounds of any unbiased method, in white noise, for this many times the pattern."""
+    """Cramér-Rao bounds of a displacement in white noise, for a pattern times `scale`."""
     transform = np.fft.fft2(pattern)
     fu = 2j * math.pi * np.fft.fftfreq(pattern.shape[1])[None, :]
     fv = 2j * math.pi * np.fft.fftfreq(pattern.shape[0])[:, None]
@@ -197,12 +198,12 @@ def _bounds(pattern: Array, scale: float, noise_sigma: float) -> tuple[float, fl
 
 
 def negative(image: Array, full_at: float) -> Array:
-    """A film that light darkened: 1 where there was none, 0 from `full_at` of the peak on (5.4)."""
+    """Film exposed by an image: 1 without light, 0 from a fraction `full_at` of the peak (5.4)."""
     return np.asarray(1.0 - np.minimum(image / (full_at * float(image.max())), 1.0))
 
 
 def light_through(image: Array, film: Array, u_px: int, v_px: int) -> float:
-    """The share of an image's light that passes a film moved by whole pixels."""
+    """Share of an image's light that passes a film shifted by whole pixels."""
     moved = np.roll(film, (v_px, u_px), axis=(0, 1))
     return float(np.sum(image * moved) / np.sum(image))
 
@@ -210,16 +211,16 @@ def light_through(image: Array, film: Array, u_px: int, v_px: int) -> float:
 HALF_PX = 40
 SIGMA_PX = 2.0
 FIELD = ((-22.0, -9.0, 1.0), (17.0, -19.0, 0.8), (5.0, 21.0, 0.6), (-12.0, 16.0, 0.9))
-"""Stars of a field: x and y from its middle, px, and light."""
+"""Stars of a test field: x and y from the middle in px, and brightness."""
 TURN_STEP_RAD = 0.07
-"""An image turned by half of it still overlaps: 0.9 px at the farthest star."""
+"""Step of trial rotations: after half of it, 0.9 px at the farthest star, images overlap."""
 ROUNDS = 12
 DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The misalignment (k, h in px, turn in rad) of an image; one sigma of each, in white noise."""
+    """Misalignment of an image: k and h in px, rotation in rad, and the sigma of each."""
 
     k_px: float
     h_px: float
@@ -228,7 +229,7 @@ class Alignment:
 
 
 def field_image(stars: tuple[tuple[float, float, float], ...] = FIELD) -> Array:
-    """Gaussian stars on 2 HALF + 1 pixels each way."""
+    """Image of Gaussian stars on 2 HALF + 1 pixels each way."""
     place = np.arange(-HALF_PX, HALF_PX + 1.0)
     image = np.zeros((len(place), len(place)))
     for x, y, light in stars:
@@ -240,10 +241,10 @@ def field_image(stars: tuple[tuple[float, float, float], ...] = FIELD) -> Array:
 def correlation_of_field(
     k_px: float, h_px: float, turn_rad: float, stars: tuple[tuple[float, float, float], ...] = FIELD
 ) -> float:
-    """phi(k, h, theta) of Gaussian stars over phi(0, 0, 0), in closed form.
+    """Correlation phi(k, h, theta) of Gaussian stars over phi(0, 0, 0), in closed form.
 
     The misaligned image of a round star is that star at R^T r - (k, h); the product of two
-    Gaussians that are d apart integrates to exp(-d² / 4 sigma²), up to a constant.
+    Gaussians at a distance d integrates to exp(-d² / 4 sigma²), up to a constant.
     """
     place = np.array([(x, y) for x, y, _ in stars])
     light = np.array([each[2] for each in stars])
@@ -258,9 +259,10 @@ def correlation_of_field(
 
 
 def align(image: Array, reference: Array, noise_sigma: float) -> Alignment:
-    """The misalignment of an image whose turn may be anything: the greatest phi(k, h, theta).
+    """Find the misalignment of an image with any rotation: the maximum of phi(k, h, theta).
 
-    For each of many turns all displacements at once by a transform, then steps of least squares.
+    For each of many rotations all displacements are tried by a Fourier transform, followed by least
+    squares.
     """
     best, start = -math.inf, (0.0, 0.0, 0.0)
     transform = np.fft.rfft2(image)
@@ -281,7 +283,7 @@ def align(image: Array, reference: Array, noise_sigma: float) -> Alignment:
 def refine(
     image: Array, reference: Array, start: tuple[float, float, float], noise_sigma: float
 ) -> Alignment:
-    """The best misalignment near a start; `sigmas` are the Cramér-Rao bound."""
+    """Refine a misalignment by least squares from a start; `sigmas` are the Cramér-Rao bound."""
     state = np.array(start)
     for _ in range(ROUNDS):
         model = misaligned(reference, *state)
@@ -298,7 +300,7 @@ def refine(
 
 
 def _changes(reference: Array, state: Array) -> Array:
-    """The image's changes (pixels, 3) with k, h and the turn."""
+    """Derivatives of the image (pixels, 3) by k, h and the rotation."""
     columns = []
     for axis in range(3):
         step = DIFFERENCE * np.eye(3)[axis] * (1.0 if axis < 2 else 0.05)
@@ -308,7 +310,7 @@ def _changes(reference: Array, state: Array) -> Array:
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """The claims of 3.2."""
+    """Check the claims of section 3.2 on rotated images."""
     rng = study.rng(31)
     reference = field_image()
     off = 0.0
@@ -359,7 +361,7 @@ def _along(axis: int, value: float) -> tuple[float, float, float]:
 
 
 def _where_half(axis: int) -> float:
-    """The misalignment along one axis alone at which phi is a half, by bisection."""
+    """Misalignment along one axis at which phi falls to a half, by bisection."""
     low, high = 0.0, (6.0, 6.0, 0.4)[axis]
     for _ in range(60):
         middle = 0.5 * (low + high)
@@ -394,7 +396,7 @@ def _scatter(rng: np.random.Generator, reference: Array, trials: int) -> list[fl
 
 
 def pictures() -> dict[str, Picture]:
-    """The figures of 3.2."""
+    """Figures of section 3.2 on rotated images."""
     return {
         "imaging-rotation": Picture(
             "phi of a field of four stars as one of k and theta moves alone; circles: by the "

@@ -1,4 +1,4 @@
-"""IM-7: the discrete sequential estimator."""
+"""Claims of IM-7: the discrete sequential estimator of a star's position."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ REACHES = (0.25, 0.5, 1.0, 1.5)
 
 
 def gaussian(u: Array, v: Array) -> Array:
-    """An image of sigma 1."""
+    """Gaussian star image with sigma 1."""
     return np.asarray(np.exp(-0.5 * (u**2 + v**2)))
 
 
@@ -28,7 +28,7 @@ def gaussian_slopes(u: Array, v: Array) -> tuple[Array, Array]:
 
 
 def sequential(study: Study) -> Row:
-    """IM-7."""
+    """Check the claims of IM-7 on the sequential estimator."""
     rng = study.rng(7)
     u, v = rng.uniform(-1, 1, (2, 4000))
     seen = ROUND.intensity(u + TRUTH[0], v + TRUTH[1]) + rng.normal(0, SIGMA, 4000)
@@ -204,7 +204,7 @@ def _differenced(rng: np.random.Generator) -> tuple[Claim, ...]:
 
 
 def limits(reach: float) -> tuple[StateEstimate, Hump, tuple[Array, Array], Array]:
-    """A Gaussian offset by .3 taken for its hump, by points evenly within a circle."""
+    """Estimate the offset .3 of a Gaussian image by its quadratic model, within a circle."""
     hump = hump_of(lambda x, y: float(gaussian(np.asarray(x), np.asarray(y))), 1e-3)
     side = np.linspace(-reach, reach, 61)
     u, v = (each.ravel() for each in np.meshgrid(side, side))

@@ -1,4 +1,4 @@
-"""IM-3, IM-5 and IM-6: correlation, the sun tracker, the experiment of 15 arcseconds."""
+"""Claims of IM-3, IM-5 and IM-6: correlation, sun tracker, 15-arcsecond experiment."""
 
 import math
 from typing import Any
@@ -31,7 +31,7 @@ def _cross(u: float = 0.0, v: float = 0.0) -> Array:
 
 
 def correlation(study: Study) -> Row:
-    """IM-3."""
+    """Check the claims of IM-3 on correlation."""
     rng = study.rng(3)
     x = np.arange(128.0)
     lines = []
@@ -123,9 +123,9 @@ def _searches(rng: np.random.Generator, number: int) -> float:
 
 
 def _cost_of_the_cross(sigma_px: float = 0.9, reach: int = 60) -> tuple[float, float]:
-    """The least error of place behind crossed wires over that of the clear aperture, by noise.
+    """Ratio of the position error bounds behind crossed wires and with a clear aperture, by noise.
 
-    Of the same star, so that the cross has the light that its wires let pass.
+    The star is the same, so that the cross has only the light that passes the wires.
     """
     wires = [(turn, at, 0.1) for turn in (0.0, 90.0) for at in (-0.25, 0.25)]
     size_px, place = AIRY_OVER_SIGMA * sigma_px, np.arange(-reach, reach + 1.0)
@@ -171,7 +171,7 @@ def _draw_search(figure: Any) -> None:
 
 
 def sun(study: Study) -> Row:
-    """IM-5."""
+    """Check the claims of IM-5 on the sun tracker."""
     tracker = SunTracker()
     slope = tracker.slope_per_arcmin()
     both = tracker.errors(8.0, 8.0)
@@ -234,7 +234,7 @@ def sun(study: Study) -> Row:
 
 
 def fifteen_arcsec(study: Study) -> Row:
-    """IM-6."""
+    """Check the claims of IM-6 on the experiment of 15 arcseconds."""
     half = 0.25 * DIAMETER_M
     wires = [(-half, THIN_M), (half, THICK_M)]
     step = 5.0 / ARCSEC_PER_RADIAN

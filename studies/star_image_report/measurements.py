@@ -1,16 +1,16 @@
-"""The rows of the sequential estimator for the hump of a star's image (report, part VI).
+"""Linear equations of the sequential estimator for the peak of a star image (report, part VI).
 
-The image is Phi = Phi00 + M u² + 2 J u v + L v² (6.4), and, where asked for, + Q u^4 +
-R v^4 + T u² v².  A telescope off by (a, b) measures S = Phi(u + a, v + b) + noise at
-known points; the star then stands at (-a, -b).
+The image is Phi = Phi00 + M u² + 2 J u v + L v² (6.4), and optionally + Q u^4 + R v^4 + T u² v².  A
+telescope with the error (a, b) measures S = Phi(u + a, v + b) + noise at known points; the star
+then stands at (-a, -b).
 
-The report takes a, b, a², a b, b² for five unknowns.  With the second-order image the
-columns of the last three are the same number at every point: the rows have rank
-three, no amount of measuring tells the five apart, and the matrix of 6.13 cannot be
-inverted.  Two forms here cure that: three unknowns a, b and g = M a² + 2 J a b + L b², into
-which a constant background falls as well, or an image of fourth order with all five.
+The report takes a, b, a², a b, b² as five unknowns.  For the second-order image the last three
+columns are constant over all points: the rows have rank three, no number of measurements separates
+the five unknowns, and the matrix of 6.13 is singular.  Two remedies are implemented: three unknowns
+a, b and g = M a² + 2 J a b + L b², which also absorbs a constant background, or an image of fourth
+order with all five.
 
-With them the order of measurements that tells most, and noise that is learned from them (6.1, 4).
+Also the most informative order of measurements, and noise estimated from them (6.1, 4).
 """
 
 import math
@@ -29,7 +29,7 @@ from studies.star_image_report.claims import Claim, Picture, Study
 
 @dataclass(frozen=True)
 class Hump:
-    """The image about its middle: M = Phi_uu / 2, J = Phi_uv / 2, L = Phi_vv / 2, and onwards."""
+    """Model of an image's peak: M = Phi_uu / 2, J = Phi_uv / 2, L = Phi_vv / 2, higher terms."""
 
     peak: float
     M: float
@@ -40,25 +40,25 @@ class Hump:
     T: float = 0.0
 
     def intensity(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Array:
-        """Phi(u, v)."""
+        """Intensity Phi(u, v) of the modelled image."""
         u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
         second = self.M * u**2 + 2.0 * self.J * u * v + self.L * v**2
         fourth = self.Q * u**4 + self.R * v**4 + self.T * u**2 * v**2
         return np.asarray(self.peak + second + fourth)
 
     def remainder(self, u: npt.ArrayLike, v: npt.ArrayLike, measured: npt.ArrayLike) -> Array:
-        """R = S - Phi(u, v): the left sides of 6.6."""
+        """Measured minus modelled intensity, R = S - Phi(u, v): the left sides of 6.6."""
         return np.asarray(measured, dtype=np.float64) - self.intensity(u, v)
 
     def rows(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Array:
-        """(n, 3) rows for (a, b, g)."""
+        """Coefficients (n, 3) of the unknowns (a, b, g) at points (u, v)."""
         u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
         in_a = 2.0 * (u * self.M + v * self.J)
         in_b = 2.0 * (v * self.L + u * self.J)
         return np.stack([in_a, in_b, np.ones_like(in_a)], axis=-1)
 
     def rows_of_five(self, u: npt.ArrayLike, v: npt.ArrayLike) -> Array:
-        """(n, 5) rows for (a, b, a², a b, b²); of rank three for an image of second order (6.6)."""
+        """Coefficients (n, 5) of (a, b, a², a b, b²); rank three for a second-order image (6.6)."""
         u, v = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
         Q, R, T = self.Q, self.R, self.T
         plain = self.rows(u, v)
@@ -70,11 +70,11 @@ class Hump:
         return np.stack([in_a, in_b, in_aa, in_ab, in_bb], axis=-1)
 
     def differenced(self, u: Array, v: Array, measured: Array) -> tuple[Array, Array]:
-        """Rows (n/2, 2) for (a, b) and their left sides, from disjoint pairs of points (6.21).
+        """Equations (n/2, 2) for (a, b) and their left sides, from disjoint pairs of points (6.21).
 
-        g and a constant background cancel; the noise has twice the variance.  Pairs share no
-        point: those that do are correlated by -1/2.  The report's 6.21 has lost the factor
-        two before a and b (and writes N for J), which doubles the answer.
+        g and a constant background cancel; the noise has twice the variance.  Pairs share no point,
+        since sharing pairs are correlated by -1/2.  The report's 6.21 lacks the factor two before a
+        and b (and has N for J), which doubles the answer.
         """
         even = len(u) - len(u) % 2
         one, other = slice(0, even, 2), slice(1, even, 2)
@@ -83,10 +83,10 @@ class Hump:
         return rows[one] - rows[other], left[one] - left[other]
 
     def inconsistency(self, estimate: StateEstimate) -> tuple[float, float]:
-        """G as it is estimated minus g of the estimated (a, b), and the sigma of that (6.4).
+        """Estimated g minus the g of the estimated (a, b), and the sigma of the difference (6.4).
 
-        Not zero within its sigma: the offset is outside the hump, or a background is
-        taken for none.  The report compares a² in the same way.
+        A significant difference means that the offset is outside of the peak, or that a background
+        was neglected.  The report compares a² in the same way.
         """
         a, b, g = estimate.state
         slope = np.array([-2.0 * (self.M * a + self.J * b), -2.0 * (self.J * a + self.L * b), 1.0])
@@ -96,17 +96,16 @@ class Hump:
 
 @dataclass(frozen=True)
 class StopRule:
-    """When enough was measured: both sigmas below what is required, and the hump consistent.
+    """Stopping rule of the estimator: both sigmas below the required one, and a consistent peak.
 
-    `inconsistency_sigmas` is None where a background is not known: g then holds it, and
-    tells nothing of a and b.
+    `inconsistency_sigmas` is None for an unknown background, which g then absorbs.
     """
 
     required_sigma: float
     inconsistency_sigmas: float | None = 4.0
 
     def says(self, hump: Hump, estimate: StateEstimate) -> "Verdict":
-        """The verdict on an estimate: go on, or stop, with an image that is consistent or not."""
+        """Verdict on an estimate: continue, or stop with a consistent or an inconsistent image."""
         if not np.all(estimate.sigma[:2] < self.required_sigma):
             return Verdict(done=False, consistent=True)
         if self.inconsistency_sigmas is None:
@@ -117,14 +116,14 @@ class StopRule:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Tells if the estimate is as sharp as required, and if the image is where it may be."""
+    """Verdict of the stopping rule: precise enough, and consistent with the model of the image."""
 
     done: bool
     consistent: bool
 
 
 def hump_of(image: Callable[[float, float], float], step: float, fourth: bool = False) -> Hump:
-    """The hump of an even image given as a function, by differences of `step`.
+    """Peak model of an even image given as a function, from differences of `step`.
 
     An even polynomial of fourth order through the differences, exact for such an image.
     """
@@ -151,10 +150,10 @@ def recentred(
     variance: float,
     passes: int = 10,
 ) -> StateEstimate:
-    """(a, b) and a background with the true image and its slopes, re-centred at each pass.
+    """Estimate (a, b) and a background with the true image and slopes, expanded again at each pass.
 
-    The remedy for an offset that is not small against the hump: the expansion is then made
-    where the star was last found, so that what it neglects vanishes.
+    This suits offsets that are not small against the peak: the expansion is about the last
+    estimate, so that neglected terms vanish.
     """
     u, v = points
     a = b = level = 0.0
@@ -176,20 +175,20 @@ WANTED_SIGMA = 0.004
 
 
 def grid_points(side: int) -> tuple[Array, Array]:
-    """The points (n,) of a square grid over -1 ... 1, row by row, as a scan measures them."""
+    """Points (n,) of a square grid over -1 ... 1, row by row, in the order of a scan."""
     place = np.linspace(-1.0, 1.0, side)
     return np.tile(place, side), np.repeat(place, side)
 
 
 def spread_of(estimate: StateEstimate) -> float:
-    """The trace of the covariance of the place (a, b): what is to become small."""
+    """Trace of the covariance of the position (a, b), to be minimised."""
     return float(estimate.covariance[0, 0] + estimate.covariance[1, 1])
 
 
 def most_telling(estimate: StateEstimate, rows: Array, variance: float) -> int:
-    """The row whose measurement lessens the spread of the place most.
+    """Index of the row whose measurement reduces the position's covariance trace most.
 
-    By 6.26 the trace falls by |(P c)_ab|² / (sigma² + c^T P c), which no measured value enters.
+    By 6.26 the trace falls by |(P c)_ab|² / (sigma² + c^T P c), independent of the measured value.
     """
     gain = rows @ estimate.covariance
     spread = variance + (gain * rows).sum(axis=1)
@@ -197,7 +196,7 @@ def most_telling(estimate: StateEstimate, rows: Array, variance: float) -> int:
 
 
 def best_order(rows: Array, variance: float, count: int, prior: Sequence[float] = PRIOR) -> Array:
-    """Choose `count` rows, each the most informative after those before; a row may come again."""
+    """Choose `count` rows, each the most informative after those before; rows may repeat."""
     estimate, chosen = diffuse(prior), []
     for _ in range(count):
         chosen.append(most_telling(estimate, rows, variance))
@@ -206,7 +205,7 @@ def best_order(rows: Array, variance: float, count: int, prior: Sequence[float] 
 
 
 def spreads_along(rows: Array, variance: float, prior: Sequence[float] = PRIOR) -> Array:
-    """The spread of the place after each of the rows in their order."""
+    """Covariance trace of the position after each of the rows in order."""
     estimate, found = diffuse(prior), []
     for row in rows:
         estimate = estimate.updated(row, 0.0, variance)
@@ -215,7 +214,7 @@ def spreads_along(rows: Array, variance: float, prior: Sequence[float] = PRIOR) 
 
 
 def least_spread(rows: Array, variance: float, count: int) -> float:
-    """The least spread of any `count` different rows: all of them tried."""
+    """Least covariance trace of the position by any `count` different rows, all tried."""
     prior = np.diag(1.0 / np.square(PRIOR))
     found = math.inf
     for chosen in combinations(range(len(rows)), count):
@@ -227,11 +226,11 @@ def least_spread(rows: Array, variance: float, count: int) -> float:
 
 @dataclass(frozen=True)
 class LearningEstimate:
-    """A state with its covariance in units of the noise's variance, and what tells that variance.
+    """Estimate with unknown noise: covariance in units of the noise variance, and its statistics.
 
-    `squares` sums the squared surprises, each over 1 + c^T G c: their expectation is the
-    variance of the noise, whatever the state.  From a vague start, the first measurements only
-    settle the state: as many as there are unknowns tell nothing of the noise.
+    `squares` sums the squared residuals of predictions, each over 1 + c^T G c: their expectation is
+    the variance of the noise, whatever the state.  From a vague start, as many measurements as
+    there are unknowns only determine the state and show nothing of the noise.
     """
 
     estimate: StateEstimate
@@ -239,7 +238,7 @@ class LearningEstimate:
     measurements: int = 0
 
     def updated(self, row: Array, value: float) -> "LearningEstimate":
-        """One more measurement added, of noise as large as all others' (6.19, with sigma = 1)."""
+        """Add one measurement with the common noise (6.19, with sigma = 1)."""
         surprise = value - float(row @ self.estimate.state)
         expected = 1.0 + float(row @ self.estimate.covariance @ row)
         return LearningEstimate(
@@ -250,27 +249,27 @@ class LearningEstimate:
 
     @property
     def freedom(self) -> int:
-        """Measurements beyond those that settle the state."""
+        """Degrees of freedom: measurements beyond those that determine the state."""
         return self.measurements - len(self.estimate.state)
 
     @property
     def noise_variance(self) -> float:
-        """The variance of a measurement, as learned."""
+        """Estimated variance of a measurement; infinite without degrees of freedom."""
         return self.squares / self.freedom if self.freedom > 0 else math.inf
 
     @property
     def sigma(self) -> Array:
-        """One standard deviation of every part of the state, by the noise that was learned."""
+        """Standard deviations of the state, from the estimated noise."""
         return np.asarray(self.estimate.sigma * math.sqrt(self.noise_variance))
 
 
 def learning(unknowns: int) -> LearningEstimate:
-    """The start that knows neither the state nor the noise."""
+    """Initial estimate without knowledge of state or noise."""
     return LearningEstimate(diffuse([1e4] * unknowns))
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """The claims of 6.1 (4)."""
+    """Check the claims of section 6.1 (4) on the order of measurements and on learned noise."""
     rng = study.rng(61)
     u, v = grid_points(7)
     rows = HUMP.rows(u, v)
@@ -319,14 +318,14 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def _needed(rows: Array) -> float:
-    """The number of rows after which both errors together are as small as wanted."""
+    """Number of rows after which both position errors together are as small as required."""
     spreads = spreads_along(rows, SIGMA**2)
     enough = np.flatnonzero(spreads < 2.0 * WANTED_SIGMA**2)
     return float(enough[0] + 1) if len(enough) else math.inf
 
 
 def _learned(rng: np.random.Generator, trials: int) -> tuple[float, float, float]:
-    """Learned variance over the true, and how often the place is within its 68.3 % bounds."""
+    """Ratio of estimated to true variance, and coverage of the 68.3 % bounds of the position."""
     from scipy.stats import t
 
     points = 12
@@ -347,7 +346,7 @@ def _learned(rng: np.random.Generator, trials: int) -> tuple[float, float, float
 
 
 def pictures() -> dict[str, Picture]:
-    """The figures of 6.1 (4)."""
+    """Figures of section 6.1 (4) on the order of measurements."""
     return {
         "imaging-order": Picture(
             "One sigma of the place after so many points, by the order in which they are measured.",

@@ -1,4 +1,4 @@
-"""IM-4: crosses of wire meshes."""
+"""Claims of IM-4: diffraction crosses of wire meshes."""
 
 from typing import Any
 
@@ -39,7 +39,7 @@ HALF_ORDER_RAD = 0.5 * LASER_M / MESH.pitch_m
 
 
 def mesh(study: Study) -> Row:
-    """IM-4."""
+    """Check the claims of IM-4 on wire meshes."""
     fine = 1200 if study.quick else 1500
     across = MESH.across(DIAMETER_M)
     screen = filtered(DIAMETER_M, across, across, fine)

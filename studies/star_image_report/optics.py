@@ -1,4 +1,4 @@
-"""IM-1 and IM-2: the transfer functional, and its example."""
+"""Claims of IM-1 and IM-2: the optical transfer functional and its example."""
 
 import math
 from typing import Any
@@ -25,7 +25,7 @@ WIDTHS = (0.02, 0.1, 0.2)
 
 
 def transfer(study: Study) -> Row:
-    """IM-1."""
+    """Check the claims of IM-1 on the transfer functional."""
     off = {width: _against_airy(width) for width in WIDTHS}
     cells = 256 if study.quick else 768
     phi = autocorrelation(disc(cells, DIAMETER_M / cells, DIAMETER_M / 2.0))
@@ -106,7 +106,7 @@ def _against_airy(width: float, steps: int = 150) -> float:
 
 
 def example(study: Study) -> Row:
-    """IM-2."""
+    """Check the claims of IM-2, the example of the transfer functional."""
     del study  # nothing is random
     widths = (1e-4, 0.02, 0.05, 0.1, 0.2)
     fills = {width: null_fill(width) for width in widths}
@@ -154,9 +154,10 @@ def example(study: Study) -> Row:
 def line_correlation(
     delay_s: npt.ArrayLike, omega0_rad_per_s: float, sigma_rad_per_s: float
 ) -> npt.NDArray[np.complex128]:
-    """e_hh of exp(-(omega - omega0)² / 2 sigma²): a Gaussian times e^(j omega0 tau).
+    """Correlation e_hh of the line exp(-(omega - omega0)² / 2 sigma²): a Gaussian times e^(j omega0
+    tau).
 
-    One-sided; of the spectrum that has both signs of omega the cosine is left.
+    The spectrum is one-sided; with both signs of omega the cosine remains.
     """
     tau = np.asarray(delay_s, dtype=np.float64)
     height = sigma_rad_per_s / math.sqrt(2.0 * math.pi)
@@ -165,13 +166,13 @@ def line_correlation(
 
 
 def disc_autocorrelation(distance_m: npt.ArrayLike, radius_m: float) -> Array:
-    """Phi of a circle: the area that two of them share at a distance D, zero from 2 a on."""
+    """Autocorrelation Phi of a circle: overlap of two at a distance D, zero from 2 a on."""
     half = np.minimum(np.asarray(distance_m, dtype=np.float64) / (2.0 * radius_m), 1.0)
     return np.asarray(2.0 * radius_m**2 * (np.arccos(half) - half * np.sqrt(1.0 - half**2)))
 
 
 def airy(angle_rad: npt.ArrayLike, radius_m: float, wavelength_m: npt.ArrayLike) -> Array:
-    """[2 J1(q) / q]², q = omega a r / (c f): one colour's image, 1 at its middle."""
+    """Monochromatic image of a circular aperture, [2 J1(q) / q]², q = omega a r / (c f)."""
     q = 2.0 * math.pi * radius_m * np.asarray(angle_rad) / np.asarray(wavelength_m)
     at_zero = q == 0.0
     safe = np.where(at_zero, 1.0, q)
@@ -186,7 +187,7 @@ def disc_image(
     report_weight: bool = False,
     colours: int = 401,
 ) -> Array:
-    """The image along a radius, per unit of power; `report_weight` leaves out 1/(lambda f)²."""
+    """Image along a radius, per unit of power; `report_weight` omits 1/(lambda f)²."""
     line = gaussian_line(wavelength_m, relative_width, colours)
     power = line.power / line.power.sum()
     angle = np.asarray(angle_rad, dtype=np.float64)[..., None]
@@ -197,14 +198,14 @@ def disc_image(
 
 
 def first_null_rad(radius_m: float, wavelength_m: float) -> float:
-    """The first dark ring of one colour, 1.22 lambda / D."""
+    """Angle of the first dark ring of one wavelength, 1.22 lambda / D."""
     return float(jn_zeros(1, 1)[0]) * wavelength_m / (2.0 * math.pi * radius_m)
 
 
 def null_fill(relative_width: float, report_weight: bool = False) -> float:
-    """Light at the middle colour's first dark ring, over that at the centre.
+    """Light at the mean wavelength's first dark ring, relative to the centre.
 
-    It is the same for every aperture and colour.
+    The ratio is the same for every aperture and wavelength.
     """
     radius, wavelength = 1.0, 1e-6
     places = np.array([0.0, first_null_rad(radius, wavelength)])

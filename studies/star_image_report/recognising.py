@@ -1,4 +1,4 @@
-"""IM-11: raster finder and pattern constant."""
+"""Claims of IM-11: finding stars by raster sums, and the pattern constant."""
 
 import itertools
 import math
@@ -17,7 +17,7 @@ from service.vectors import ARCSEC_PER_RADIAN, unit
 from studies.star_image_report.claims import Claim, Picture, Row, Study
 
 SIGMA_ARCSEC = 35.25
-"""A pixel of the lost-in-space paper's camera."""
+"""Angle of a pixel in the lost-in-space paper's camera, in arcsec."""
 STORES = (10, 30, 100, 300, 1000, 3000)
 STARS = (3, 5, 8)
 LEAST_FIELDS = 600
@@ -25,7 +25,7 @@ RADIUS_DEG, FAINTEST_MAG = 5.0, 6.0
 
 
 def patterns(study: Study) -> Row:
-    """IM-11."""
+    """Check the claims of IM-11 on raster sums and the pattern constant."""
     rng = study.rng(11)
     shares = _discrimination(study)
     return Row(
@@ -120,7 +120,7 @@ def _rasters(rng: np.random.Generator, fields: int) -> tuple[Claim, ...]:
 
 
 def _fields(rng: np.random.Generator, number: int, stars: int) -> list[Array]:
-    """The brightest stars within 5° of anywhere, as unit vectors, where there are as many."""
+    """Unit vectors of the brightest stars within 5° of random directions with enough stars."""
     catalog = load_embedded()
     bright = catalog.direction[: int(np.searchsorted(catalog.magnitude_v_mag, FAINTEST_MAG))]
     fields: list[Array] = []
@@ -133,7 +133,7 @@ def _fields(rng: np.random.Generator, number: int, stars: int) -> list[Array]:
 
 
 def _discrimination(study: Study) -> dict[int, list[tuple[int, float, float]]]:
-    """By number of stars, rows of store size, share unique within 3 sigma, share nearest right."""
+    """By number of stars: rows of store size, share unique within 3 sigma, share nearest right."""
     rng = study.rng(111)
     sigma = SIGMA_ARCSEC / ARCSEC_PER_RADIAN
     sizes = STORES[:4] if study.quick else STORES
@@ -177,7 +177,7 @@ def _recogniser(shares: dict[int, list[tuple[int, float, float]]]) -> Claim:
 
 
 def _pointing(rng: np.random.Generator) -> Claim:
-    """How far K of flat coordinates moves when the telescope points elsewhere."""
+    """Check how much K of flat coordinates changes when the telescope points elsewhere."""
     sigma = SIGMA_ARCSEC / ARCSEC_PER_RADIAN
     moved, chords = [], []
     for field in _fields(rng, 300, 5):
@@ -219,10 +219,10 @@ def _draw(figure: Any, shares: dict[int, list[tuple[int, float, float]]]) -> Non
 
 
 def pattern_constant(u: npt.ArrayLike, v: npt.ArrayLike) -> float:
-    """K = (N - 1)(sum u² + sum v²) - sum over i, j of (u_i u_j + v_i v_j) (7.43), unpaired.
+    """Pattern constant K = (N - 1)(sum u² + sum v²) - sum over i, j of (u_i u_j + v_i v_j) (7.43).
 
-    Computed as N sum |r - mean|², which is the same and does not cancel.  (In the
-    report 7.42 reads "a" for its second 2, and 7.46 pairs x with y where both are one.)
+    Points need no order.  Computed as N sum |r - mean|², which is equal and free of cancellation.
+    (In the report 7.42 has "a" for its second 2, and 7.46 pairs x with y where both are equal.)
     """
     x, y = np.asarray(u, dtype=np.float64), np.asarray(v, dtype=np.float64)
     if x.shape != y.shape or x.ndim != 1:
@@ -232,22 +232,22 @@ def pattern_constant(u: npt.ArrayLike, v: npt.ArrayLike) -> float:
 
 
 def chord_constant(vectors: npt.ArrayLike) -> float:
-    """The same of unit vectors (n, 3), by their chords: exact for any pointing in a wide field."""
+    """Pattern constant of unit vectors (n, 3) by their chords, exact for any pointing."""
     v = np.asarray(vectors, dtype=np.float64)
     return len(v) * float(np.sum((v - v.mean(axis=0)) ** 2))
 
 
 def constant_sigma(constant: float, stars: int, position_sigma: float) -> float:
-    """sigma_K = 2 sigma sqrt(N K) for errors `position_sigma` per axis."""
+    """Standard deviation of the pattern constant, sigma_K = 2 sigma sqrt(N K)."""
     return 2.0 * position_sigma * math.sqrt(stars * constant)
 
 
 @dataclass(frozen=True)
 class PatternStore:
-    """Known fields by (number of stars, sqrt(K / N)), whose noise is the same for all: sigma.
+    """Known star fields by (number of stars, sqrt(K / N)), the latter with equal noise sigma.
 
-    One missing or false star makes another pattern of a field; alone this tells apart some
-    thirty fields, and beyond that narrows a search.
+    A missing or false star changes a field's pattern; the key alone distinguishes about thirty
+    fields, and narrows the search among more.
     """
 
     names: tuple[str, ...]
@@ -257,12 +257,12 @@ class PatternStore:
     def within(
         self, stars: int, constant: float, position_sigma: float, sigmas: float = 3.0
     ) -> list[str]:
-        """The stored fields of as many stars within the tolerance, nearest first."""
+        """Stored fields with the same number of stars within the tolerance, nearest first."""
         order, distance = self._ranked(stars, constant)
         return [self.names[i] for i in order if distance[i] <= sigmas * position_sigma]
 
     def nearest(self, stars: int, constant: float) -> str | None:
-        """The stored field of as many stars that is nearest; None where there is none."""
+        """Nearest stored field with the same number of stars; None without any."""
         order, _ = self._ranked(stars, constant)
         return self.names[order[0]] if len(order) else None
 
@@ -273,12 +273,12 @@ class PatternStore:
 
 
 def key_of(stars: int, constant: float) -> float:
-    """sqrt(K / N)."""
+    """Key of a star pattern with equal noise for all fields, sqrt(K / N)."""
     return math.sqrt(constant / stars)
 
 
 def store_of(patterns: dict[str, tuple[int, float]]) -> PatternStore:
-    """A store of fields by name: number of stars and K."""
+    """Build a store from fields by name, each with number of stars and K."""
     counts = np.array([stars for stars, _ in patterns.values()], dtype=np.intp)
     keys = np.array([key_of(stars, constant) for stars, constant in patterns.values()])
     return PatternStore(tuple(patterns), counts, keys)
@@ -286,7 +286,7 @@ def store_of(patterns: dict[str, tuple[int, float]]) -> PatternStore:
 
 @dataclass(frozen=True)
 class RasterStars:
-    """Places of stars along either axis in pixels, rising and unpaired; why not, if refused."""
+    """Star positions along each axis in pixels, ascending, not paired, or reason for refusal."""
 
     u_px: Array
     v_px: Array
@@ -296,11 +296,11 @@ class RasterStars:
 def find_by_rasters(
     image: Array, noise_sigma: float, threshold_sigmas: float = 6.0, background: float = 0.0
 ) -> RasterStars:
-    """Stars of a field by row and column sums, to about a pixel.
+    """Find the stars of a field by row and column sums, to about a pixel.
 
-    A line is a star's where its sum is a maximum `threshold_sigmas` above the noise of such
-    a sum.  Two stars in one band of rows or columns look like one: the counts then differ
-    and the field is refused; where that happens to both axes alike it goes unseen.
+    A line holds a star if its sum is a maximum `threshold_sigmas` above the noise of such a sum.
+    Two stars in one band of rows or columns look like one: the counts then differ and the field is
+    refused; if both axes have such a pair, it goes unnoticed.
     """
     light = image - background
     u = line_peaks(light.sum(axis=0), noise_sigma * np.sqrt(image.shape[0]) * threshold_sigmas)

@@ -1,4 +1,4 @@
-"""IM-8, IM-9 and IM-10: the cross-scan, two stars, and noise."""
+"""Claims of IM-8, IM-9 and IM-10: cross-scan, two stars, and noise."""
 
 import math
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ def _steps(reach: int) -> Array:
 
 
 def centroid(study: Study) -> Row:
-    """IM-8."""
+    """Check the claims of IM-8 on the centroid by a cross-scan."""
     del study  # nothing is random
     pupil = disc(120, DIAMETER_M / 100, DIAMETER_M / 2.0, obscuration=0.3)
     image = image_by_fft(pupil, LASER_M).intensity
@@ -125,7 +125,7 @@ def _loss(half: int, d: float = 0.9) -> tuple[float, float]:
 
 
 def two_stars(study: Study) -> Row:
-    """IM-9."""
+    """Check the claims of IM-9 on misalignment from two stars."""
     rng, u0, sigma, trials = study.rng(9), 0.05, 1e-4, study.trials(20_000)
     nominal = np.array([[-u0, 0.0], [u0, 0.0]])
     worst = 0.0
@@ -173,7 +173,7 @@ def two_stars(study: Study) -> Row:
 
 
 def noise(study: Study) -> Row:
-    """IM-10."""
+    """Check the claims of IM-10 on the noise of scans."""
     rng, trials = study.rng(10), study.trials(100_000)
     laws = {case: (*_laws(*case), _scatter(rng, *case, SIGMA, trials)) for case in CASES}
     off = max(abs(mc / full - 1.0) for _, _, full, mc in laws.values())
@@ -301,7 +301,7 @@ def _draw_noise(figure: Any, rng: np.random.Generator, trials: int) -> None:
 
 @dataclass(frozen=True)
 class Misalignment:
-    """How a pattern stands off: displacements in the units of the image plane, roll in radians.
+    """Misalignment of a star pattern: displacement in units of the image plane, roll in radians.
 
     The image is the nominal one turned by `roll_rad` about the boresight, then moved by
     (`du`, `dv`).
@@ -313,10 +313,10 @@ class Misalignment:
 
 
 def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: float) -> Misalignment:
-    """The misalignment from two stars that should stand at (-u0, 0) and (u0, 0) (7.23 to 7.25).
+    """Misalignment from two stars with nominal places (-u0, 0) and (u0, 0) (7.23 to 7.25).
 
-    Only right for a pair symmetric about the boresight.  Two stars that look alike leave
-    half a turn open: this is the answer within a quarter turn.
+    Valid only for a pair symmetric about the boresight.  Two stars that look alike leave half a
+    turn ambiguous: the answer is within a quarter turn.
     """
     if half_distance <= 0.0:
         raise BadInput(Fault("half_distance", "must be above zero", str(half_distance)))
@@ -327,9 +327,9 @@ def by_two_scans(a1: float, b1: float, a2: float, b2: float, half_distance: floa
 
 
 def by_positions(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> Misalignment:
-    """The misalignment from two or more stars (n, 2) anywhere: roll first, then displacement.
+    """Misalignment from two or more stars (n, 2) anywhere: roll first, then displacement.
 
-    Least squares of a turn and a move, stars told apart, so that any roll is found.
+    Least squares over rotation and displacement with known identities, so that any roll is found.
     Raises `BadInput` for fewer than two stars, or for stars all in one place.
     """
     should, are = _pairs(nominal, observed)
@@ -346,7 +346,7 @@ def by_positions(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> Misalignmen
 
 
 def sigmas(position_sigma: float, half_distance: float) -> tuple[float, float]:
-    """Sigmas of either displacement, sigma / sqrt 2, and of the roll, sqrt 2 sigma / (2 u0)."""
+    """Sigmas of each displacement, sigma / sqrt 2, and of the roll, sqrt 2 sigma / (2 u0)."""
     return position_sigma / math.sqrt(2.0), math.sqrt(2.0) * position_sigma / (2.0 * half_distance)
 
 
@@ -365,14 +365,14 @@ def _pairs(nominal: npt.ArrayLike, observed: npt.ArrayLike) -> tuple[Array, Arra
 def nyquist_spacing(
     shortest_wavelength_m: float, focal_length_m: float, diameter_m: float
 ) -> float:
-    """T = pi / B = lambda f / (2 D): the widest step at which samples hold all of an image (m)."""
+    """Nyquist step T = pi / B = lambda f / (2 D) of an image, in metres."""
     return shortest_wavelength_m * focal_length_m / (2.0 * diameter_m)
 
 
 def variance_sampled(spacing: float, noise_sigma: float, reach: int, light_sum: float) -> float:
-    """T² sigma² N (N + 1)(2N + 1) / [3 (sum Phi)²] (7.36; one printing has N² + 1 in it).
+    """Variance of a centroid, T² sigma² N (N + 1)(2N + 1) / [3 (sum Phi)²] (7.36).
 
-    For a star in the middle of the scan and white noise.
+    For a star in the middle of the scan and white noise.  One printing has N² + 1.
     """
     n = reach
     return spacing**2 * noise_sigma**2 * n * (n + 1) * (2 * n + 1) / (3.0 * light_sum**2)
@@ -381,20 +381,21 @@ def variance_sampled(spacing: float, noise_sigma: float, reach: int, light_sum: 
 def variance_of_long_scan(
     spacing: float, noise_sigma: float, half_length: float, light_integral: float
 ) -> float:
-    """(pi / B) 2 sigma² V³ / [3 (integral of Phi)²] (7.40): 7.36 for N far above 1."""
+    """Variance of a centroid by a long scan, (pi / B) 2 sigma² V³ / [3 (integral Phi)²] (7.40)."""
     return spacing * 2.0 * noise_sigma**2 * half_length**3 / (3.0 * light_integral**2)
 
 
 def variance_in_full(samples: Array, spacing: float, noise_sigma: float) -> ProfileMoment:
-    """sigma² sum (v - d)² / (sum Phi)²: 7.36 and (2N + 1) d² sigma² / (sum Phi)² for a star off it.
+    """Variance of a centroid for a star off the middle: sigma² sum (v - d)² / (sum Phi)².
 
-    In steps of the scan; `variance` times spacing² is the law.
+    In steps of the scan: 7.36 plus (2N + 1) d² sigma² / (sum Phi)²; `variance` times spacing² is
+    the law.
     """
     return moment(samples, np.full(samples.shape, noise_sigma**2))
 
 
 def truncated(displacement: float, half_length: float, end_light: float, light: float) -> float:
-    """The result of a scan from -V to V: d [1 - 2 V <Phi(V)> / E]; <Phi(V)> the mean of its ends.
+    """Displacement by a scan cut at -V and V: d [1 - 2 V <Phi(V)> / E], <Phi(V)> the ends' mean.
 
     `light` is E, the integral along the line.
     """
@@ -404,5 +405,5 @@ def truncated(displacement: float, half_length: float, end_light: float, light: 
 def with_background(
     displacement: float, light_sum: float, samples: int, background: float
 ) -> float:
-    """The result of a scan when a level is left in: d E / (E + (2N + 1) b0)."""
+    """Displacement by a scan with an uncorrected background: d E / (E + (2N + 1) b0)."""
     return displacement * light_sum / (light_sum + samples * background)

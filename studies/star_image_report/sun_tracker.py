@@ -1,15 +1,14 @@
-"""A sun tracker on the tails of the cross (report, 5.3).
+"""Model of a sun tracker on the tails of a diffraction cross (report, 5.3).
 
-A screen of wires throws the sun's disc along two tails.  A pair of detectors far out on
-the tail along p sees how far the sun is off along q, and a pair on the other tail the
-other error: two signals without moving parts, in light that burns nothing.  There is no
-gain of resolution: the tail is narrower than the sun because its rim is faint.
-Angles are in arcminutes.
+A screen of wires diffracts the sun's disc along two tails.  A pair of detectors far out on the tail
+along p measures the sun's error along q, and a pair on the other tail the other error: two signals
+without moving parts, in harmless light.  Resolution does not improve: the tail is narrower than the
+sun because its rim is faint.  Angles are in arcminutes.
 
-One with three apertures or photodiodes: one to acquire, two on the tails.
-The report has pairs in mind only for its signals X and Y; three single detectors do as well:
-that of acquisition sees the direct sun, says that it is there, and is the measure of its
-brightness for the two others.  Angles are in arcminutes; a detector's place is (p, q).
+Also a tracker with three apertures or photodiodes: one to acquire, two on the tails.  The report
+considers pairs only for its signals X and Y; three single detectors suffice: the acquisition
+detector sees the direct sun, shows its presence, and measures its brightness for the other two.
+Angles are in arcminutes; a detector's place is (p, q).
 """
 
 import math
@@ -28,7 +27,7 @@ ARCMIN_PER_RADIAN = 180.0 * 60.0 / np.pi
 
 @dataclass(frozen=True)
 class SunTracker:
-    """The screen, the band of light, the sun, and where the pairs of detectors stand.
+    """Parameters of a sun tracker: screen, band of light, sun, and places of the detector pairs.
 
     A detector is a square of side `side_arcmin`, `out_arcmin` along its tail and
     +-`aside_arcmin` across it.  The faint dots off the tails are left out.
@@ -46,7 +45,7 @@ class SunTracker:
 
     @cached_property
     def _orders(self) -> tuple[Array, Array]:
-        """Places (arcmin, rising) of all orders and colours on a tail, and sums of their light."""
+        """Positions (arcmin, ascending) of all orders and wavelengths, and cumulative light."""
         wavelengths = np.linspace(self.shortest_m, self.longest_m, self.colours)
         reach = (self.out_arcmin + 4.0 * self.sun_radius_arcmin) / ARCMIN_PER_RADIAN
         most = int(np.ceil(reach * self.mesh.pitch_m / self.shortest_m))
@@ -59,9 +58,9 @@ class SunTracker:
         return places[rank], np.concatenate([[0.0], total])
 
     def tail_light(self, along_arcmin: Array, across_arcmin: Array) -> Array:
-        """Brightness of the sun's cross, on the tail only, 1 for the direct sun.
+        """Brightness of the sun's cross on its tail, 1 for the direct sun.
 
-        At distances from where the middle of the sun stands, along the tail and across it.
+        At distances from the middle of the sun, along the tail and across it.
         """
         places, total = self._orders
         across = np.abs(across_arcmin)
@@ -71,7 +70,7 @@ class SunTracker:
         return np.where(across < self.sun_radius_arcmin, total[high] - total[low], 0.0)
 
     def errors(self, p_arcmin: float, q_arcmin: float) -> tuple[float, float]:
-        """The two signals e = (I+ - I-) / (I+ + I-) for a sun off by (p, q)."""
+        """Error signals e = (I+ - I-) / (I+ + I-) of both pairs for a sun displaced by (p, q)."""
         # The tail along q tells p, and the other way round.
         return self._signal(q_arcmin, p_arcmin), self._signal(p_arcmin, q_arcmin)
 
@@ -85,58 +84,58 @@ class SunTracker:
         return (light[0] - light[1]) / (light[0] + light[1]) if sum(light) > 0.0 else 0.0
 
     def slope_per_arcmin(self, step_arcmin: float = 0.5) -> float:
-        """How fast the signal grows about zero."""
+        """Slope of the error signal at zero, per arcminute."""
         return (self.errors(step_arcmin, 0.0)[0] - self.errors(-step_arcmin, 0.0)[0]) / (
             2.0 * step_arcmin
         )
 
     def tail_width_arcmin(self) -> float:
-        """Full width at half of the maximum, across the tail where the detectors stand."""
+        """Full width at half maximum of the tail, across it at the detectors, in arcminutes."""
         across = np.linspace(0.0, self.sun_radius_arcmin, 1601)
         out = np.array([self.out_arcmin])
         profile = np.array([float(self.tail_light(out, np.array([x]))[0]) for x in across])
         return 2.0 * float(across[np.argmax(profile < 0.5 * profile[0])])
 
     def attenuation(self) -> float:
-        """Brightness on the tail at the detectors, over that of the direct image."""
+        """Brightness of the tail at the detectors, relative to the direct image."""
         zero = np.zeros(1)
         tail = float(self.tail_light(np.array([self.out_arcmin]), zero)[0])
         return tail / float(self.tail_light(zero, zero)[0])
 
 
 FIELD_ARCMIN = 600.0
-"""Farthest from the axis that a search begins."""
+"""Greatest angle from the axis at which a search begins, in arcminutes."""
 STEPS = 40
 GAIN = 0.6
 
 
 @dataclass(frozen=True)
 class ThreeDetectors:
-    """Squares: `acquire_arcmin` wide in the middle, and one on the flank of each tail."""
+    """Sun tracker with three square detectors: one in the middle, one on each tail's flank."""
 
     tracker: SunTracker = field(default_factory=SunTracker)
     acquire_arcmin: float = 48.0
     samples: int = 41
     threshold: float = 0.5
-    """The share of the sun's light in the middle from which on the sun counts as acquired."""
+    """Share of the sun's light on the middle detector from which the sun counts as acquired."""
 
     @cached_property
     def nominal(self) -> tuple[float, float]:
-        """Light on the middle detector and on one of the others, the sun in the middle."""
+        """Light on the middle detector and on a flank detector with a centred sun."""
         return self.acquired_light(0.0, 0.0), self.flank_light(0.0, 0.0)
 
     def acquired_light(self, p_arcmin: float, q_arcmin: float) -> float:
-        """The mean light of the direct sun on the middle detector, 1 for a sun that covers it."""
+        """Mean light of the direct sun on the middle detector, 1 if the sun covers it."""
         edge = self.acquire_arcmin
         near = ((np.arange(self.samples) + 0.5) / self.samples - 0.5) * edge
         away = np.hypot(near[None, :] - p_arcmin, near[:, None] - q_arcmin)
         return float((away < self.tracker.sun_radius_arcmin).mean())
 
     def signals(self, p_arcmin: float, q_arcmin: float) -> tuple[float, float] | None:
-        """The errors along p and q, of one detector each; None unless the sun is acquired.
+        """Error signals along p and q, from one detector each; None unless the sun is acquired.
 
-        The light on a flank over that on the middle detector, by the same for a centred sun,
-        less one: brightness of the sun and age of the screen cancel.
+        The ratio of light on a flank and the middle detector, relative to a centred sun, less one:
+        brightness of the sun and age of the screen cancel.
         """
         middle, flank = self.nominal
         acquired = self.acquired_light(p_arcmin, q_arcmin)
@@ -149,20 +148,20 @@ class ThreeDetectors:
         )
 
     def slope_per_arcmin(self, step_arcmin: float = 0.5) -> float:
-        """How fast a signal grows about zero."""
+        """Slope of a signal at zero, per arcminute."""
         ahead, behind = (self.signals(sign * step_arcmin, 0.0) for sign in (1.0, -1.0))
         assert ahead is not None
         assert behind is not None
         return (ahead[0] - behind[0]) / (2.0 * step_arcmin)
 
     def direct_onflank_light(self) -> float:
-        """Light on a flank's detector from a sun that shines on it directly, over its own light."""
+        """Light of the direct sun on a flank detector, relative to its normal light."""
         tracker = self.tracker
         light = self.flank_light(tracker.out_arcmin, tracker.aside_arcmin)
         return light / self.nominal[1]
 
     def steered(self, p_arcmin: float, q_arcmin: float) -> tuple[float, float, int] | None:
-        """The place where the loop leaves a sun at (p, q), and the number of places searched.
+        """Final error of the control loop for a sun at (p, q), and the number of searched places.
 
         A square spiral until the middle detector sees the sun, then steps along both signals.
         """
@@ -184,7 +183,7 @@ class ThreeDetectors:
         return None
 
     def flank_light(self, along_arcmin: float, across_arcmin: float) -> float:
-        """The mean light on a tail's detector, the sun so far off along that tail and across."""
+        """Mean light on a tail's detector, for a sun displaced along that tail and across it."""
         tracker = self.tracker
         near = (np.arange(tracker.samples) + 0.5) / tracker.samples - 0.5
         along = tracker.out_arcmin + near * tracker.side_arcmin - along_arcmin
@@ -193,7 +192,7 @@ class ThreeDetectors:
 
 
 def _spiral(step_arcmin: float, reach_arcmin: float) -> list[tuple[float, float]]:
-    """Places of a square grid, ring by ring from the middle."""
+    """Points of a square grid, ring by ring from the middle."""
     rings = math.ceil(reach_arcmin / step_arcmin)
     places = [(0.0, 0.0)]
     for ring in range(1, rings + 1):
@@ -207,7 +206,7 @@ def _spiral(step_arcmin: float, reach_arcmin: float) -> list[tuple[float, float]
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """The claims of 5.3."""
+    """Check the claims of section 5.3 with three detectors."""
     rng = study.rng(53)
     three = ThreeDetectors()
     slope = three.slope_per_arcmin()
@@ -249,7 +248,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def pictures() -> dict[str, Picture]:
-    """The figures of 5.3."""
+    """Figures of section 5.3 with three detectors."""
     return {
         "imaging-three-detectors": Picture(
             "Three photodiodes: the two signals as the sun moves along p. They end where the "

@@ -1,7 +1,7 @@
-"""Wire meshes before the lens, which make a cross of every star (report, part IV).
+"""Wire meshes in front of the lens, which make a diffraction cross of each star (part IV).
 
-Wires along y diffract light along x, into a tail of dashes.  Angles are in radians,
-p along x and q along y; lengths in metres.
+Wires along y diffract light along x, into a tail of dashes.  Angles are in radians, p along x and q
+along y; lengths in metres.
 """
 
 import math
@@ -16,41 +16,41 @@ from service.imaging.optics import Pupil, between_wires, disc, image_at, image_b
 
 INCH_M = 0.0254
 Wires = Sequence[tuple[float, float]]
-"""(place, diameter) of parallel wires."""
+"""Parallel wires as (place, diameter) in metres."""
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """A square mesh: wires every `pitch_m`, each `wire_m` thick."""
+    """Square wire mesh: wires every `pitch_m` metres, `wire_m` thick."""
 
     pitch_m: float
     wire_m: float
 
     @property
     def opening_m(self) -> float:
-        """The opening between two wires: s = d - wire."""
+        """Width of the opening between two wires, s = d - wire, in metres."""
         return self.pitch_m - self.wire_m
 
     @property
     def blocked(self) -> float:
-        """The share of one axis that wires cover, e = 1 - s / d."""
+        """Share of an axis covered by wires, e = 1 - s / d."""
         return self.wire_m / self.pitch_m
 
     def wires(self, number: int) -> Wires:
-        """A count of neighbouring wires about the middle of a mesh: (place, width) in m."""
+        """Given number of adjacent wires about the middle of a mesh: (place, width) in m."""
         places = (np.arange(number) - (number - 1) / 2.0) * self.pitch_m
         return [(float(place), self.wire_m) for place in places]
 
     def across(self, diameter_m: float) -> Wires:
-        """The wires that cross an aperture, an opening in its middle."""
+        """Wires across an aperture with an opening in its middle."""
         return self.wires(2 * math.floor(diameter_m / (2.0 * self.pitch_m) + 0.5))
 
     def shares(self) -> tuple[float, float, float]:
-        """Transmitted light in the middle, on the tails and off them, for a full mesh.
+        """Shares of transmitted light in the middle, on the tails and off them, for a full mesh.
 
-        (1 - e)², 2 e (1 - e), e²: the spreading grows as the product of what the two
-        axes block.  The report lets it depend on the total number of wires, which is
-        the same thing while that total is split evenly.
+        (1 - e)², 2 e (1 - e), e²: the scattered light grows as the product of the shares covered on
+        both axes.  In the report it depends on the total number of wires, which is equivalent if
+        that total is split evenly.
         """
         e = self.blocked
         return (1.0 - e) ** 2, 2.0 * e * (1.0 - e), e**2
@@ -59,10 +59,10 @@ class Mesh:
 def filtered(
     diameter_m: float, across_x: Wires, across_y: Wires, cells: int = 1500, width: float = 1.0
 ) -> Pupil:
-    """A circular aperture behind wires at places along x, and along y.
+    """Circular aperture behind wires at given places along x and y.
 
-    `cells` a diameter: a tenth of the thinnest wire, or finer.  The grid is `width`
-    diameters wide; twice or more where the image is to be had by `image_by_fft`.
+    `cells` per diameter: a tenth of the thinnest wire, or finer.  The grid is `width` diameters
+    wide; twice or more for `image_by_fft`.
     """
     cell = diameter_m / cells
     clear = disc(2 * math.ceil(width * cells / 2), cell, diameter_m / 2.0)
@@ -80,11 +80,11 @@ def mesh_intensity(
     mesh: Mesh,
     openings: int,
 ) -> Array:
-    """The report's 4.1 for N x N openings, as irradiance per direction.
+    """Diffraction by N x N openings (report, 4.1), as irradiance per direction.
 
-    C [sin(N k d p / 2) / sin(k d p / 2)]² [sin(k s p / 2) / (k s p / 2)]² and the same
-    of q.  The report has its C grow with s^4, with the aperture's diameter and with
-    1 / lambda; it is s^4 / lambda² (over f² per area), N^4 being in the first factors.
+    C [sin(N k d p / 2) / sin(k d p / 2)]² [sin(k s p / 2) / (k s p / 2)]² and the same for q.  In
+    the report C grows with s^4, the aperture's diameter and 1 / lambda; correct is s^4 / lambda²
+    (over f² per area), N^4 being in the first factors.
     """
     scale = mesh.opening_m**4 / wavelength_m**2
     return (
@@ -107,7 +107,7 @@ def _factor(angle_rad: npt.ArrayLike, wavelength_m: float, mesh: Mesh, openings:
 
 
 def along_p(pupil: Pupil, wavelength_m: float, p_rad: Array) -> Array:
-    """Intensity along the tail of the wires across x, over that at the star."""
+    """Intensity along the tail of wires across x, relative to the star."""
     intensity = image_at(pupil, wavelength_m, np.concatenate([[0.0], p_rad]), np.zeros(1))[0]
     return np.asarray(intensity[1:] / intensity[0])
 
@@ -115,9 +115,9 @@ def along_p(pupil: Pupil, wavelength_m: float, p_rad: Array) -> Array:
 def tail(
     pupil: Pupil, wavelength_m: float, p_rad: Array, fringe_rad: float, samples: int = 9
 ) -> Array:
-    """`along_p` averaged over a fringe: the tail without its fine structure.
+    """Tail intensity averaged over a fringe, without its fine structure.
 
-    That is lambda / D for one wire, and lambda over their separation for two.
+    A fringe is lambda / D for one wire, and lambda over their separation for two.
     """
     steps = (np.arange(samples) + 0.5) / samples - 0.5
     fine = np.asarray(p_rad)[:, None] + fringe_rad * steps[None, :]
@@ -127,7 +127,7 @@ def tail(
 def first_tail_null_rad(
     pupil: Pupil, wavelength_m: float, diameter_m: float, low_rad: float, high_rad: float
 ) -> float:
-    """The angle between two angles where the tail is darkest, to a small part of a fringe."""
+    """Angle of the darkest place of a tail between two angles, to a small part of a fringe."""
     p = np.linspace(low_rad, high_rad, 241)
     light = tail(pupil, wavelength_m, p, wavelength_m / diameter_m)
     at = int(np.clip(np.argmin(light), 1, len(p) - 2))
@@ -139,7 +139,7 @@ def first_tail_null_rad(
 def shares_of_light(
     pupil: Pupil, wavelength_m: float, half_width_rad: float
 ) -> tuple[float, float, float]:
-    """Light of an image in the middle, on the two tails, and off them, of all that is transmitted.
+    """Shares of transmitted light in the middle of an image, on both tails, and off them.
 
     The middle is the square within `half_width_rad` (half of lambda / d parts the orders
     of a mesh), the tails are the bands of that width about both axes.
@@ -153,5 +153,5 @@ def shares_of_light(
 
 
 def order_angle_rad(order: int, wavelength_m: float, mesh: Mesh) -> float:
-    """The angle of a principal maximum of the mesh: m lambda / d."""
+    """Angle of a principal maximum of the mesh, m lambda / d, in radians."""
     return order * wavelength_m / mesh.pitch_m

@@ -1,4 +1,4 @@
-"""A third wire, and light of lines beside that of a band (report, 4.3)."""
+"""Claims of section 4.3 on a third wire, and on light of spectral lines or a band."""
 
 import math
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from studies.star_image_report.wires import INCH_M, Mesh, Wires, filtered, tail
 
 THIN_M, THICK_M = 0.00443 * INCH_M, 0.00663 * INCH_M
 THIRD_M = 0.75 * THIN_M
-"""Its first side lobe is highest where the nulls of the two others meet, at 2 lambda / thin."""
+"""Diameter of a third wire, its first side lobe at the common null of the other two."""
 PLACES_INCH = (-0.1355, 0.1355, 0.0)
 MERCURY_NM = (404.7, 435.8, 546.1, 577.0, 579.1, 690.7)
-"""Six lines of a mercury arc from violet to red, here taken as equally bright."""
+"""Wavelengths of six mercury lines from violet to red, here assumed equally bright."""
 BAND_NM = (400.0, 700.0)
 MESH = Mesh(INCH_M / 18.0, 0.011 * INCH_M)
 
 
 def wires(*diameters_m: float) -> Wires:
-    """Parallel wires of several diameters, at places whose fringes are finer than the lobes."""
+    """Parallel wires with given diameters, at places whose fringes are finer than the lobes."""
     return [
         (place * INCH_M, diameter)
         for place, diameter in zip(PLACES_INCH, diameters_m, strict=False)
@@ -33,7 +33,7 @@ def wires(*diameters_m: float) -> Wires:
 
 
 def lines(wavelengths_nm: Sequence[float], powers: Sequence[float] | None = None) -> Spectrum:
-    """A spectrum of narrow lines; equally bright where no powers are given."""
+    """Spectrum of narrow lines, equally bright without `powers`."""
     power = np.ones(len(wavelengths_nm)) if powers is None else np.array(powers, dtype=np.float64)
     omega = 2.0 * np.pi * LIGHT_SPEED_M_PER_S / (np.array(wavelengths_nm) * 1e-9)
     order = np.argsort(omega)
@@ -41,15 +41,15 @@ def lines(wavelengths_nm: Sequence[float], powers: Sequence[float] | None = None
 
 
 def uniform_band(shortest_nm: float, longest_nm: float, colours: int = 41) -> Spectrum:
-    """The same power at every wavelength of a band."""
+    """Spectrum with equal power at every wavelength of a band."""
     return lines(np.linspace(shortest_nm, longest_nm, colours).tolist())
 
 
 def tail_of_wires(wire_list: Wires, wavelength_m: float, p_rad: Array) -> Array:
-    """Intensity along the tail over that at the star, by an integral over the chords of a circle.
+    """Tail intensity relative to the star, from an integral over the chords of a circle.
 
-    Behind wires that run along y, the aperture is as high at x as the chord of the circle, or
-    dark: one dimension does, and nothing is put on a grid of cells.
+    Behind wires along y, the aperture at x is the chord of the circle, or dark: the integral is
+    one-dimensional and needs no grid of cells.
     """
     edges = sorted(
         {-0.5 * DIAMETER_M, 0.5 * DIAMETER_M}
@@ -82,7 +82,7 @@ def _gauss(nodes: int) -> tuple[Array, Array]:
 
 
 def in_light(spectrum: Spectrum, wire_list: Wires, p_rad: Array, fringe: int = 5) -> Array:
-    """The tail in all colours, over the star, averaged over a fringe of the wires."""
+    """Tail intensity in all wavelengths, relative to the star, averaged over a fringe."""
     total = np.zeros(len(p_rad))
     share = spectrum.power / spectrum.power.sum()
     steps = (np.arange(fringe) + 0.5) / fringe - 0.5
@@ -94,7 +94,7 @@ def in_light(spectrum: Spectrum, wire_list: Wires, p_rad: Array, fringe: int = 5
 
 
 def depth_of_null(spectrum: Spectrum, wire_m: float) -> float:
-    """The darkest place of one wire's tail over the next lobe behind it."""
+    """Darkest intensity in a wire's tail, relative to the following lobe."""
     middle = spectrum.mean_wavelength_m / wire_m
     p = np.linspace(0.6, 1.9, 131) * middle
     light = in_light(spectrum, [(0.0, wire_m)], p)
@@ -103,7 +103,7 @@ def depth_of_null(spectrum: Spectrum, wire_m: float) -> float:
 
 
 def contrast_of_orders(spectrum: Spectrum) -> float:
-    """The contrast of a mesh's orders in the second dash of its tail, in all colours."""
+    """Contrast of a mesh's orders in the second dash of its tail, in all wavelengths."""
     across = MESH.across(DIAMETER_M)
     p = np.linspace(6.6, 7.6, 61) * spectrum.mean_wavelength_m / MESH.pitch_m
     share = spectrum.power / spectrum.power.sum()
@@ -116,7 +116,7 @@ def contrast_of_orders(spectrum: Spectrum) -> float:
 
 
 def claims(study: Study) -> tuple[Claim, ...]:
-    """The claims of 4.3."""
+    """Check the claims of section 4.3 on a third wire and on spectral lines."""
     cells = 1200 if study.quick else 1500
     p = np.linspace(0.8 * LASER_M / THICK_M, 2.6 * LASER_M / THIN_M, 240)
     fringe = 2.0 * LASER_M / DIAMETER_M
@@ -173,7 +173,7 @@ def claims(study: Study) -> tuple[Claim, ...]:
 
 
 def pictures() -> dict[str, Picture]:
-    """The figures of 4.3."""
+    """Figures of section 4.3 on a third wire and on spectral lines."""
     return {
         "imaging-third-wire": Picture(
             "The tail of two and of three wires in laser light, and of three in the light of six "

@@ -1,5 +1,5 @@
-"""Other ways to name stars without a prior, made as their authors describe them, to compare with.
+"""Other star identification algorithms, implemented as published, to compare with.
 
-They live beside the simulator and are no identifiers of the service: nothing is
-tuned here beyond what a fair comparison asks for.
+They belong to the simulator and are not identifiers of the service: nothing is tuned beyond the
+needs of a fair comparison.
 """

@@ -1,10 +1,9 @@
-"""Liebe's triangles: a star by the distances of two neighbours and the angle between them.
+"""Liebe's algorithm: a star is identified by two neighbours' distances and the angle between.
 
-C. C. Liebe, "Pattern Recognition of Star Constellations for Spacecraft
-Applications", IEEE Aerospace and Electronic Systems Magazine 7(6), 1992, 34-41.
-He kept 1,000 stars in 185,000 triangles, to allow for any that the noise leaves
-out; here every star has the triangles with each two of its four nearest, and
-the distance to the nearer of them is looked up by k-vector.
+C. C. Liebe, "Pattern Recognition of Star Constellations for Spacecraft Applications", IEEE
+Aerospace and Electronic Systems Magazine 7(6), 1992, 34-41.  Liebe kept 1,000 stars in 185,000
+triangles, to allow for any missing star; here every star has the triangles with each two of its
+four nearest, and the distance to the nearer one is looked up by k-vector.
 """
 
 import math
@@ -29,7 +28,7 @@ _PAIRS = np.array(list(combinations(range(NEIGHBOURS), 2)))
 
 @dataclass(frozen=True)
 class Liebe:
-    """Triangles by the distance of the nearer neighbour.
+    """Database of Liebe's algorithm: triangles sorted by the distance of the nearer neighbour.
 
     `star` (N, 3): master, nearer and farther neighbour; `feature` (N, 3): their
     distances from the master and the angle at it, in radians.
@@ -42,16 +41,16 @@ class Liebe:
 
     @property
     def entries(self) -> int:
-        """Six triangles a star."""
+        """Number of triangles in the database: six per star."""
         return len(self.star)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of triangles and k-vector."""
+        """Size of triangles and k-vector in bytes."""
         return self.star.nbytes + self.feature.nbytes + self.nearer.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """Name each observed star by the catalog star with the most votes."""
+        """Name each observed star by the catalog star with the most votes of matching triangles."""
         image, feature = features(scene.direction)
         matched, guide = np.empty((2, MAX_MATCHES), np.int32)
         index = self.nearer
@@ -72,7 +71,7 @@ class Liebe:
 
 
 def build_liebe(stars: RunCatalog) -> Liebe:
-    """Liebe's triangles of a star list."""
+    """Build the database of Liebe's algorithm for a star list."""
     star, feature = features(stars.direction)
     order = np.argsort(feature[:, 0], kind="stable")
     star, feature = star[order], feature[order]
@@ -123,7 +122,7 @@ def _measure(direction, near, pairs, star, feature):  # type: ignore[no-untyped-
 def _match(  # type: ignore[no-untyped-def]
     image, feature, sigma_rad, guide_feature, value, below, slope, intercept, matched, guide
 ):
-    """Observed and guide triangles that agree in both distances and in the angle."""
+    """Find pairs of observed and catalog triangles that agree in both distances and the angle."""
     count = 0
     for t in range(len(image)):
         near, far, angle = feature[t]

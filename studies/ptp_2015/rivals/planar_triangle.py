@@ -1,10 +1,9 @@
-"""Planar triangles by area and polar moment, told apart by pivoting.
+"""Planar triangle algorithm: triangles matched by area and polar moment, selected by pivoting.
 
-C. L. Cole & J. L. Crassidis, "Fast Star-Pattern Recognition Using Planar
-Triangles", Journal of Guidance, Control, and Dynamics 29(1), 2006, 64-71.
-Every triangle of the sky is in the database.  Many agree with an observed one
-in both numbers; those stay that share two stars with a candidate of the next
-triangle, until one is left.
+C. L. Cole & J. L. Crassidis, "Fast Star-Pattern Recognition Using Planar Triangles", Journal of
+Guidance, Control, and Dynamics 29(1), 2006, 64-71.  Every triangle of the sky is in the database.
+Many agree with an observed one in both numbers; candidates remain if they share two stars with a
+candidate of the next triangle, until one is left.
 """
 
 import math
@@ -23,16 +22,16 @@ from service.vectors import Vector, locked, read_only
 from studies.ptp_2015.rivals.proposed import Proposed
 
 SIDE_MAX_DEG = 10.0
-"""The longest side, that of the field of view."""
+"""Longest side of a triangle in degrees, equal to the field of view."""
 BRIGHTEST = 20
-"""Brightest stars of a field that make triangles."""
+"""Number of brightest stars of a field that form triangles."""
 MAX_BASES, MAX_PIVOTS = 30, 40
 MAX_CANDIDATES = 100_000
 
 
 @dataclass(frozen=True)
 class PlanarTriangle:
-    """Triangles in order of area: their stars (N, 3), rows ascending, and polar moments (N,)."""
+    """Triangles sorted by area: star rows (N, 3), ascending, and polar moments (N,)."""
 
     star: npt.NDArray[np.uint16]
     moment: npt.NDArray[np.float32]
@@ -41,16 +40,16 @@ class PlanarTriangle:
 
     @property
     def entries(self) -> int:
-        """Every triangle without a side longer than the field."""
+        """Number of triangles in the database, all without a side longer than the field."""
         return len(self.star)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of triangles and k-vector."""
+        """Size of triangles and k-vector in bytes."""
         return self.star.nbytes + self.moment.nbytes + self.area.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """Three stars, those of the first triangle that pivoting leaves one candidate of."""
+        """Name the three stars of the first triangle for which pivoting leaves one candidate."""
         n = len(scene.direction)
         image, star = np.empty((2, 3), np.int32)
         found = _pivot(
@@ -75,7 +74,7 @@ class PlanarTriangle:
 
 
 def build_planar_triangle(stars: RunCatalog, side_max_deg: float = SIDE_MAX_DEG) -> PlanarTriangle:
-    """Every planar triangle of a star list; raises `ValueError` beyond 65,535 stars."""
+    """Build a database of all planar triangles of a star list; `ValueError` above 65,535 stars."""
     if len(stars) > np.iinfo(np.uint16).max:
         raise ValueError(f"{len(stars)} stars: at most 65535 can be numbered")
     pairs = build_pairs(stars.direction, side_max_deg)
@@ -103,7 +102,7 @@ def _chord(a, b):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def area_and_moment(a, b, c):  # type: ignore[no-untyped-def]
-    """Heron's area of a triangle of three sides, and its polar moment A (a^2 + b^2 + c^2) / 36."""
+    """Area of a triangle from its sides (Heron), and polar moment A (a^2 + b^2 + c^2) / 36."""
     s = 0.5 * (a + b + c)
     area = math.sqrt(max(s * (s - a) * (s - b) * (s - c), 0.0))
     return area, area * (a * a + b * b + c * c) / 36.0
@@ -111,7 +110,7 @@ def area_and_moment(a, b, c):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def area_and_moment_sigma(u, v, w, su, sv, sw):  # type: ignore[no-untyped-def]
-    """Standard deviations of area and moment of three observed stars, by their gradients.
+    """Standard deviations of area and polar moment of three observed stars, from gradients.
 
     dA/da = a (b^2 + c^2 - a^2) / 8A, dJ/da = (a^2 + b^2 + c^2) / 36 dA/da + A a / 18.
     """
@@ -142,7 +141,7 @@ def area_and_moment_sigma(u, v, w, su, sv, sw):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _all_triangles(direction, other, first, most, star, feature):  # type: ignore[no-untyped-def]
-    """Every triangle of mutual neighbours into `star` and `feature`; only counted where empty."""
+    """Write all triangles of mutual neighbours to `star` and `feature`; only count if empty."""
     count = 0
     for i in range(len(direction)):
         for x in range(first[i], first[i + 1]):
@@ -164,7 +163,7 @@ def _all_triangles(direction, other, first, most, star, feature):  # type: ignor
 def _candidates(  # type: ignore[no-untyped-def]
     u, v, w, su, sv, sw, moment, value, below, slope, intercept, out
 ):
-    """Rows of the triangles that agree in area and moment; how many, -1 for more than fit."""
+    """Write rows of catalog triangles with equal area and moment; their number, -1: too many."""
     area, polar = area_and_moment(_chord(v, w), _chord(u, w), _chord(u, v))
     if not area > 0.0:
         return 0
@@ -185,7 +184,7 @@ def _candidates(  # type: ignore[no-untyped-def]
 def _pivot(  # type: ignore[no-untyped-def]
     observed, sigma, direction, star, moment, value, below, slope, intercept, most, image, out
 ):
-    """The first triangle of the field that comes down to one candidate; whether there is one."""
+    """Search the first triangle of a field reduced to one candidate by pivoting; True if found."""
     n = len(observed)
     kept, others = np.empty(MAX_CANDIDATES, np.int32), np.empty(MAX_CANDIDATES, np.int32)
     bases = 0
@@ -228,7 +227,7 @@ def _pivot(  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _sharing_two(star, kept, count, others, found):  # type: ignore[no-untyped-def]
-    """Leave of the kept candidates those that share two stars with one of the others."""
+    """Keep the candidates that share two stars with a candidate of another triangle."""
     edge = np.empty(3 * found, np.int64)
     for at in range(found):
         a, b, c = star[others[at]]
@@ -253,7 +252,7 @@ def _sharing_two(star, kept, count, others, found):  # type: ignore[no-untyped-d
 
 @njit(nogil=True)
 def _corners(observed, sigma, direction, stars, image, out):  # type: ignore[no-untyped-def]
-    """Which star of a triangle is which, by its sides; whether they agree at all."""
+    """Assign catalog stars to the corners of a triangle by its sides; True if the sides agree."""
     best = math.inf
     for a, b, c in ((0, 1, 2), (0, 2, 1), (1, 0, 2), (1, 2, 0), (2, 0, 1), (2, 1, 0)):
         order = (stars[a], stars[b], stars[c])

@@ -1,14 +1,12 @@
-"""Triangles found by their projection: PTP, and the P-vector before it.
+"""Algorithms that match triangles by their projection: PTP and the earlier P-vector.
 
-PTP is taken as the comparison takes it: the service's own triangles, its sharing stars for an
-answer.
+PTP uses the service's own triangles, with its sharing stars as the answer.
 
-The P-vector has one triangle a star, with its two brightest neighbours, found by one number.
-Yang Jian, Zhang Guangjun & Jiang Jie, "Fast Star Identification Algorithm Using
-P Vector", Acta Aeronautica et Astronautica Sinica 28(4), 2007, 897-900; as
-Zhou & Ye tell of it.  The projection is that of PTP.  What makes it weak is the
-choice of the triangle: a neighbour lost or added by noise of magnitude makes it
-another, and so does one that lies beyond the edge of the field.
+The P-vector has one triangle per star, with its two brightest neighbours, matched by one number.
+Yang Jian, Zhang Guangjun & Jiang Jie, "Fast Star Identification Algorithm Using P Vector", Acta
+Aeronautica et Astronautica Sinica 28(4), 2007, 897-900; as described by Zhou & Ye.  The projection
+is that of PTP.  Its weakness is the choice of the triangle: a neighbour lost or added by noise of
+magnitude changes the triangle, and so does a neighbour outside of the field.
 """
 
 from dataclasses import dataclass
@@ -43,7 +41,7 @@ BRIGHTEST = 2
 
 @dataclass(frozen=True)
 class PVector:
-    """The triangles of all stars; a triangle that finds one guide triangle alone is believed."""
+    """Database of the P-vector: one triangle per star; only unique matches are accepted."""
 
     triangles: TriangleIndex
     stars: int
@@ -55,11 +53,11 @@ class PVector:
 
     @property
     def nbytes(self) -> int:
-        """Bytes of triangles and k-vector."""
+        """Size of triangles and k-vector in bytes."""
         return self.triangles.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """Believe what a unique match names; of several names that with the most votes."""
+        """Name stars by triangles with a unique match; of several names, take the most votes."""
         n = len(scene.direction)
         near = np.empty((n, BRIGHTEST), np.int32)
         # Scenes are in order of measured brightness, as the catalog is of true brightness.
@@ -80,7 +78,7 @@ class PVector:
 
 
 def build_p_vector(stars: RunCatalog, within_deg: float = NEIGHBOURS_WITHIN_DEG) -> PVector:
-    """The P-vector's database of a star list in order of brightness."""
+    """Build the P-vector's database for a star list in order of brightness."""
     near = np.empty((len(stars), BRIGHTEST), np.int32)
     brightest_near(stars.direction, *chords(within_deg), near)
     return PVector(index_triangles(stars.direction, near, within_deg), len(stars))
@@ -88,7 +86,7 @@ def build_p_vector(stars: RunCatalog, within_deg: float = NEIGHBOURS_WITHIN_DEG)
 
 @njit(nogil=True)
 def brightest_near(direction, least, most, near):  # type: ignore[no-untyped-def]
-    """Into `near` (n, k) the first rows, -1 for none, whose chord to each star is within bounds."""
+    """Write to `near` (n, k) the brightest stars at a range of chords from each star, -1: none."""
     n, wanted = near.shape
     near[:] = -1
     for master in range(n):
@@ -106,19 +104,19 @@ def brightest_near(direction, least, most, near):  # type: ignore[no-untyped-def
 
 @dataclass(frozen=True)
 class Ptp:
-    """The guide triangles."""
+    """Database of PTP: guide triangles of all stars."""
 
     triangles: TriangleIndex
     stars: int
 
     @property
     def entries(self) -> int:
-        """Triangles: five of a star with four slaves."""
+        """Number of triangles: five per star with four slave stars."""
         return self.triangles.count
 
     @property
     def nbytes(self) -> int:
-        """Bytes of triangles and k-vector."""
+        """Size of triangles and k-vector in bytes."""
         return self.triangles.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
@@ -129,5 +127,5 @@ class Ptp:
 
 
 def build_ptp(stars: RunCatalog, slaves: int = SLAVES) -> Ptp:
-    """The guide triangles of a star list, with so many slaves to a master."""
+    """Build the guide triangles of a star list, with a number of slave stars per master."""
     return Ptp(build_triangles(stars.direction, REACH_DEG, slaves), len(stars))

@@ -15,11 +15,10 @@ Rows = npt.NDArray[np.int32]
 
 @dataclass(frozen=True)
 class Proposed:
-    """An algorithm's word on one field.
+    """Answer of an identification algorithm for one field.
 
-    `match` (n,) is its own answer, rows of the star list or -1.  `image` and
-    `star` are the pairs that it thinks possible, the likeliest first: what an
-    attitude check may be made of.
+    `match` (n,) is the algorithm's answer, rows of the star list or -1.  `image` and `star` are the
+    pairs that it considers possible, the likeliest first, as input of an attitude check.
     """
 
     match: Rows
@@ -28,33 +27,33 @@ class Proposed:
 
 
 class Algorithm(Protocol):
-    """A database with the search in it."""
+    """Interface of an identification algorithm with its database."""
 
     @property
     def entries(self) -> int:
-        """Rows of the database."""
+        """Number of rows in the database."""
         ...
 
     @property
     def nbytes(self) -> int:
-        """Bytes of the database, without the star list that every algorithm needs."""
+        """Size of the database in bytes, without the star list that every algorithm needs."""
         ...
 
     def identify(self, scene: Scene) -> Proposed:
-        """Name the stars of a field; `scene.sigma_rad` is what it is told of the noise."""
+        """Name the stars of a field; `scene.sigma_rad` is the noise that may be assumed."""
         ...
 
 
 class Build(Protocol):
-    """Makes an algorithm's database for the stars of a run catalog."""
+    """Interface of a function that builds an algorithm's database for a run catalog."""
 
     def __call__(self, stars: RunCatalog) -> Algorithm:
-        """The algorithm, ready."""
+        """Build the algorithm with its database."""
         ...
 
 
 def proposed_by_votes(image: Rows, star: Rows, stars: int, n: int, shared: bool) -> Proposed:
-    """Each star's most-voted name of matched triangles (m, 3); `shared`: sharing stars decide."""
+    """Most-voted names by matched triangles (m, 3); `shared`: only names by sharing stars count."""
     pairs, held = np.empty((3, 3 * len(image)), np.int32), np.empty(3 * len(image), np.bool_)
     count = 0
     if len(image):

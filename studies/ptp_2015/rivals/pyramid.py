@@ -1,9 +1,8 @@
-"""The pyramid: a triangle found by its three separations, confirmed by a fourth star.
+"""Pyramid algorithm: a triangle matched by three separations, confirmed by a fourth star.
 
-D. Mortari, M. A. Samaan, C. Bruccoleri & J. L. Junkins, "The Pyramid Star
-Identification Technique", Navigation 51(3), 2004, 171-183.  Triangles are tried
-in an order that exchanges every star soon, so that a point that is no star
-does not spoil one after another.
+D. Mortari, M. A. Samaan, C. Bruccoleri & J. L. Junkins, "The Pyramid Star Identification
+Technique", Navigation 51(3), 2004, 171-183.  Triangles are tried in an order that soon replaces
+every star, so that a false point does not spoil many of them in a row.
 """
 
 import math
@@ -23,19 +22,19 @@ from service.vectors import Vector, locked
 from studies.ptp_2015.rivals.proposed import Proposed, Rows
 
 SEPARATION_MAX_DEG = 14.2
-"""The diagonal of the field."""
+"""Largest separation of indexed pairs in degrees, the diagonal of the field."""
 MAX_TRIANGLES, MAX_CANDIDATES = 500, 2_000
 
 
 class ObservedField(NamedTuple):
-    """The observed stars (n): unit vectors, and their noise in radians."""
+    """Observed stars (n): unit vectors, and noise in radians."""
 
     direction: Any
     sigma: Any
 
 
 class GuidePairs(NamedTuple):
-    """Catalog stars (m, 3) and their pairs by separation, which a k-vector finds."""
+    """Catalog stars (m, 3) and their pairs sorted by separation, with a k-vector."""
 
     direction: Any
     brighter: Any
@@ -47,10 +46,10 @@ class GuidePairs(NamedTuple):
 
 
 class Chains(NamedTuple):
-    """Catalog pairs by either star.
+    """Linked lists of catalog pairs by either star.
 
-    From `head[a]` on, `link` leads through the pairs with star a, and `end` holds the
-    other star of each.
+    From `head[a]` on, `link` leads through the pairs with star a, and `end` holds the other star of
+    each.
     """
 
     head: Any
@@ -60,7 +59,7 @@ class Chains(NamedTuple):
 
 @dataclass(frozen=True)
 class Pyramid:
-    """Pairs of stars by separation in radians."""
+    """Database of the pyramid algorithm: star pairs by separation in radians."""
 
     brighter: Rows
     dimmer: Rows
@@ -69,16 +68,16 @@ class Pyramid:
 
     @property
     def entries(self) -> int:
-        """Every pair that fits into the field."""
+        """Number of pairs that fit into the field."""
         return len(self.brighter)
 
     @property
     def nbytes(self) -> int:
-        """Bytes of pairs and k-vector."""
+        """Size of pairs and k-vector in bytes."""
         return self.brighter.nbytes + self.dimmer.nbytes + self.separation.nbytes
 
     def identify(self, scene: Scene) -> Proposed:
-        """The four stars of the first pyramid that fits at one place of the sky alone."""
+        """Name the four stars of the first pyramid that fits at only one place of the sky."""
         image, star = np.empty((2, 4), np.int32)
         match = np.full(len(scene.direction), -1, np.int32)
         index = self.separation
@@ -94,7 +93,7 @@ class Pyramid:
 
 
 def build_pyramid(stars: RunCatalog, separation_max_deg: float = SEPARATION_MAX_DEG) -> Pyramid:
-    """The pyramid's pairs of a star list."""
+    """Build the pair database of the pyramid algorithm for a star list."""
     pairs = build_pairs(stars.direction, separation_max_deg)
     kvector = build_kvector(pairs.separation_rad)
     return Pyramid(pairs.brighter, pairs.dimmer, kvector, stars.direction)
@@ -102,7 +101,7 @@ def build_pyramid(stars: RunCatalog, separation_max_deg: float = SEPARATION_MAX_
 
 @njit(nogil=True)
 def _pairs_like(field, i, j, pairs):  # type: ignore[no-untyped-def]
-    """The range of catalog pairs that are as far apart as stars i and j."""
+    """Range of the catalog pairs with the separation of observed stars i and j."""
     apart = separation_rad(field.direction[i], field.direction[j])
     tolerance = SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
     return rows_within(
@@ -113,7 +112,7 @@ def _pairs_like(field, i, j, pairs):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
-    """Chain the catalog pairs that are as far apart as stars i and j, by either star."""
+    """Link the catalog pairs with the separation of observed stars i and j, by either star."""
     head, link, end = chains
     first, last = _pairs_like(field, i, j, pairs)
     head[:] = -1
@@ -128,14 +127,14 @@ def _chain(field, i, j, pairs, chains):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _fits(field, i, j, a, b):  # type: ignore[no-untyped-def]
-    """True if stars a and b are as far apart as observed i and j."""
+    """True if directions a and b have the separation of observed stars i and j."""
     off = separation_rad(field.direction[i], field.direction[j]) - separation_rad(a, b)
     return abs(off) <= SIGMAS * math.sqrt(field.sigma[i] ** 2 + field.sigma[j] ** 2)
 
 
 @njit(nogil=True)
 def _handed(a, b, c):  # type: ignore[no-untyped-def]
-    """The triple product: its sign tells a triangle from its mirror image."""
+    """Triple product of three vectors; its sign distinguishes a triangle from its mirror image."""
     return (
         a[0] * (b[1] * c[2] - b[2] * c[1])
         + a[1] * (b[2] * c[0] - b[0] * c[2])
@@ -145,7 +144,7 @@ def _handed(a, b, c):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
-    """The first pyramid that fits one place alone into `image` and `star` (4,); whether any."""
+    """Search the first pyramid with a unique fit, into `image` and `star` (4,); True if found."""
     n = len(field.direction)
     capacity = 2 * len(pairs.brighter)
     chains = Chains(
@@ -175,7 +174,7 @@ def _search(field, pairs, image, star):  # type: ignore[no-untyped-def]
 
 @njit(nogil=True)
 def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ignore[no-untyped-def]
-    """True if the fourth star confirms one candidate alone, written to `image` and `star`."""
+    """True if the fourth star confirms exactly one candidate, written to `image` and `star`."""
     i, j, k, r = four
     direction = pairs.direction
     _chain(field, i, r, pairs, chains)
@@ -199,7 +198,7 @@ def _confirmed(field, four, pairs, chains, candidate, image, star):  # type: ign
 
 @njit(nogil=True)
 def _triangles(field, i, j, k, pairs, chains, candidate):  # type: ignore[no-untyped-def]
-    """Catalog triangles in the place of stars i, j and k, of the same hand; how many."""
+    """Find catalog triangles like stars i, j and k, with equal handedness; returns a count."""
     direction = pairs.direction
     first, last = _pairs_like(field, i, j, pairs)
     _chain(field, i, k, pairs, chains)
