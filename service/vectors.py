@@ -10,10 +10,13 @@ the conjugate turn; the named converters below are the only bridges to them.
 """
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
+
+Projection = Literal["gnomonic", "equidistant", "equisolid", "stereographic"]
+"""How a lens projects the sky: on a plane, or as a fisheye in one of three ways."""
 
 Vector = npt.NDArray[np.float64]
 Matrix = npt.NDArray[np.float64]

@@ -12,10 +12,10 @@ from service.acquire.picture import (
     PictureAttitude,
     PictureResult,
     blind_sky,
-    doubt_of_exposure,
     solve_picture,
     trail_refusal,
 )
+from service.acquire.picture_remarks import doubt_of_exposure
 from service.identify.blind.lens import Lens
 from service.imaging import submit
 from service.imaging.frames.files import read_frame

@@ -1,25 +1,39 @@
 """A picture from anybody's lens: its attitude, its lens and its stars, with no mission at all."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from service.identify.blind.lens import Lens, LensFit, shared_variance_px2, simpler_fit
+from service.acquire.picture_remarks import (
+    CLEAR_RATIO,
+    LEAST_CLEAR,
+    advice_on,
+    remarks_on,
+    remarks_on_light,
+)
+from service.identify.blind.lens import (
+    PROJECTIONS,
+    Lens,
+    LensFit,
+    shared_variance_px2,
+    simpler_fit,
+)
 from service.identify.blind.solver import (
+    COARSE_GATE,
     WIDEST_FIELD_DEG,
     BlindResult,
     BlindSolver,
     FocalRange,
+    least_log_odds,
     rotation_between,
 )
-from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified
+from service.identify.blind.verify import LEAST_SIGMA_PX, Points, Verified, verify
 from service.imaging.detection.points import (
     FIRST_THRESHOLD,
-    MAX_POINTS,
     SECOND_THRESHOLD,
     PointSources,
     find_points,
@@ -28,7 +42,6 @@ from service.imaging.detection.points import (
 from service.imaging.frames.exif import is_by_rows, mirrored
 from service.imaging.frames.frame import Frame, require_light
 from service.imaging.sky_overlay import DrawnStar, SkyView, draw_sky
-from service.imaging.submit import exposure_stated
 from service.sky.catalog.proper_names import PROPER_NAMES
 from service.sky.catalog.star_catalog import Catalog
 from service.sky.ephemeris import apparent, observer_velocity
@@ -37,6 +50,7 @@ from service.times import parse_utc, utc_now
 from service.vectors import (
     ARCSEC_PER_RADIAN,
     Matrix,
+    Projection,
     Vector,
     attitude_error_arcsec,
     quaternion_from_matrix,
@@ -47,12 +61,13 @@ from service.vectors import (
 GUESS_SHARE = 0.25
 """How far off a focal length or field of view that is told may be."""
 REFINED_POINTS = 200
-CLEAR_RATIO, LEAST_CLEAR = 12.0, 25
-"""Signal to noise of clear points, and how many of them without an attitude speak for a lens or
-pixels of another kind."""
 LEAST_SIDE_PX = 100
 MIDDLE_SHARES = (1.0 / 3.0, 0.5, 0.25)
 """Parts of the sides of a wide picture that are solved alone."""
+CHANGED_TRIALS = 16
+"""Ways in which one picture is changed, at most: parts, mirror images, ranges of focal lengths."""
+LEAST_FAR_SHARE = 0.5
+"""The least share of points with a star far from the middle, over that near the middle."""
 MOST_SIGMA_SHARE = 1.0 / 400.0
 """The share of the longer side above which an attitude's sigma is too large for an answer.
 
@@ -180,16 +195,23 @@ def solve_picture(
     solver: BlindSolver,
     guess_px: float | None = None,
     whole_only: bool = False,
+    projection: Projection | None = None,
 ) -> PictureResult:
     """Find the attitude and the lens of a picture; `guess_px` is a rough focal length.
+
+    With a `projection` an attitude is one of the whole picture behind such a lens, or there is
+    none; see `_of_fisheye`.
 
     Where what is told leads to nothing all other focal lengths are tried, and where the
     clear candidates do, so are fainter ones.  Where all of that leads to nothing, the mirror
     image is tried: a result then is of the mirrored frame, which it holds.  Last, unless
-    `whole_only`, its middle alone and pixels averaged in pairs are tried, and a result is of
-    such a frame.  Raises `BadFile` for a picture without light.
+    `whole_only`, its middle alone and pixels averaged in pairs are tried.  From the middle the
+    lens of the whole is looked for; a result is of the middle or of averaged pixels where none
+    fits.  Raises `BadFile` for a picture without light.
     """
     require_light(frame, math.inf)
+    if projection not in (None, "gnomonic"):
+        return _of_fisheye(frame, sky, solver, guess_px, projection)
     side = max(frame.width_px, frame.height_px)
     ranges = [FocalRange.of_fields(side, WIDEST_FIELD_DEG)]
     if guess_px is not None:
@@ -219,35 +241,154 @@ def solve_picture(
                 return found
     clear = np.count_nonzero(tried[0].signal_ratio > CLEAR_RATIO)
     if clear >= LEAST_CLEAR and not whole_only:
-        for changed, remark in other_shapes(frame):
-            if min(changed.counts.shape) < LEAST_SIDE_PX:
-                continue
-            points = find_points(changed.counts)
-            focal = FocalRange.of_fields(max(changed.counts.shape), WIDEST_FIELD_DEG)
-            found = _solved(changed, points, sky, solver, focal, None)
+        projections = PROJECTIONS if projection is None else (projection,)
+        for whole, points in ((frame, tried[0]), (turned, tried[0].mirrored(is_by_rows(frame)))):
+            wide = _from_middle(whole, points, sky, solver, None, projections)
+            if wide is not None:
+                return wide
+        for changed, remark in _averaged(frame):
+            found = _solved_part(changed, sky, solver, None)
             if found.attitude is not None:
                 return replace(found, remarks=(remark, *found.remarks))
     points = tried[min(1, len(tried) - 1)]
-    return replace(result, points=points, remarks=tuple(_advice(points, frame, guess_px)))
+    return replace(result, points=points, remarks=tuple(advice_on(points, frame, guess_px)))
 
 
-def other_shapes(frame: Frame) -> Iterator[tuple[Frame, str]]:
-    """Changed pictures that a simple lens may fit, each with a remark that says what was changed.
+def _solved_part(
+    frame: Frame, sky: BrightStars, solver: BlindSolver, guess_px: float | None
+) -> PictureResult:
+    """The result of a changed picture; `guess_px` is its focal length within a quarter."""
+    points = find_points(frame.counts)
+    focal = FocalRange.of_fields(max(frame.counts.shape), WIDEST_FIELD_DEG)
+    if guess_px is not None:
+        focal = FocalRange.about(guess_px, GUESS_SHARE)
+    return _solved(frame, points, sky, solver, focal, None, CHANGED_TRIALS)
 
-    The middle of a picture has the same direction and roll as the whole.  Behind a fisheye, or
-    where a plane spans more than the solver looks for, the middle is like any other lens's.
+
+def _of_fisheye(
+    frame: Frame,
+    sky: BrightStars,
+    solver: BlindSolver,
+    guess_px: float | None,
+    projection: Projection,
+) -> PictureResult:
+    """The result of a picture through a fisheye whose projection is known, or of its mirror."""
+    points = find_points(frame.counts)
+    if points.trailed is not None:
+        return _refused_trails(frame, points)
+    mirror = mirrored(frame), points.mirrored(is_by_rows(frame))
+    for guess in (None,) if guess_px is None else (guess_px, None):
+        for whole, candidates in ((frame, points), mirror):
+            found = _from_middle(whole, candidates, sky, solver, guess, (projection,))
+            if found is not None:
+                return found
+    nothing = BlindResult(None, -math.inf, 0, 0, 0, False)
+    remark = (
+        f"no_match: neither the picture nor its middle fits the sky behind a lens of {projection} "
+        "projection: tell another projection, or none"
+    )
+    remarks = (remark, *remarks_on_light(points, has_dark(frame)))
+    return PictureResult(frame, points, None, nothing, remarks)
+
+
+def _from_middle(
+    frame: Frame,
+    points: PointSources,
+    sky: BrightStars,
+    solver: BlindSolver,
+    guess_px: float | None,
+    projections: Sequence[Projection],
+) -> PictureResult | None:
+    """The result of a wide picture, whose middle is like that of a plain lens; None without any.
+
+    The middle has the direction and the roll of the whole.  From its attitude, which the evidence
+    must prove by itself, the lens of the whole is looked for.  If none of several projections
+    fits, the result is that of the middle; if the only one does not, there is none.
     """
+    is_told = len(projections) == 1
+    for share in (*MIDDLE_SHARES, 1.0) if is_told else MIDDLE_SHARES:
+        part = _middle_of(frame, share)
+        if min(part.counts.shape) < LEAST_SIDE_PX:
+            continue
+        found = _solved_part(part, sky, solver, guess_px)
+        if found.attitude is None:
+            continue
+        whole = _widened(frame, points, found.attitude, sky, solver, projections)
+        if whole is not None:
+            return whole
+        if not is_told:
+            size = f"{part.width_px} x {part.height_px} px"
+            remark = (
+                f"wide_lens: the whole picture fits no lens of {WIDEST_FIELD_DEG[1]:g} degrees or "
+                f"less, and no wider one without strong distortion; only its middle, {size}, was "
+                "solved, and field and lens are those of the middle; tell how the lens projects "
+                "the sky (--lens NAME)"
+            )
+            return replace(found, remarks=(remark, *found.remarks))
+    return None
+
+
+def _fits_far_out(found: Verified, places: Points) -> bool:
+    """True if the half of the points that is far from the middle has stars, as the other has."""
+    middle_u, middle_v = _middle(found.fit.lens)
+    away = np.hypot(places.u_px - middle_u, places.v_px - middle_v)
+    far, has_star = away > np.median(away), found.star >= 0
+    return float(has_star[far].sum()) >= LEAST_FAR_SHARE * float(has_star[~far].sum())
+
+
+def _middle_of(frame: Frame, share: float) -> Frame:
+    """The middle of a picture, of a share of its sides."""
     height, width = frame.counts.shape
-    for share in MIDDLE_SHARES:
-        down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
-        counts = frame.counts[down : height - down, across : width - across]
-        size = f"{counts.shape[1]} x {counts.shape[0]} px"
-        remark = (
-            f"wide_lens: the whole picture fits no lens of {WIDEST_FIELD_DEG[1]:g} degrees or less "
-            f"without strong distortion; only its middle, {size}, was solved, and field and lens "
-            "are those of the middle"
-        )
-        yield replace(frame, counts=counts), remark
+    down, across = (round(0.5 * (1.0 - share) * side) for side in (height, width))
+    return replace(frame, counts=frame.counts[down : height - down, across : width - across])
+
+
+def _widened(
+    frame: Frame,
+    points: PointSources,
+    middle: PictureAttitude,
+    sky: BrightStars,
+    solver: BlindSolver,
+    projections: Sequence[Projection],
+) -> PictureResult | None:
+    """The result of the whole picture from the attitude of its middle; None where none fits.
+
+    Of several projections the one with the most evidence is taken.
+    """
+    places = places_of(points).first(REFINED_POINTS)
+    attitude = _of_the_middle(middle.lens, middle.fit.attitude)
+    focal = FocalRange.about(middle.lens.focal_px, GUESS_SHARE)
+    best: Verified | None = None
+    for projection in projections:
+        lens = Lens(frame.width_px, frame.height_px, middle.lens.focal_px, projection=projection)
+        gate_px = COARSE_GATE * lens.radius_px
+        found = verify(places, solver.stars, attitude, lens, focal.log_width, gate_px)
+        if found is not None and (best is None or found.log_odds > best.log_odds):
+            best = found
+    least = least_log_odds(CHANGED_TRIALS * len(projections))
+    if best is None or best.log_odds < least or not _fits_far_out(best, places):
+        return None
+    best = solver.refined(best, places, focal)
+    whole = _attitude(best, places_of(points), points, frame, sky)
+    if whole.sigma_share > MOST_SIGMA_SHARE:
+        return None
+    width_deg, height_deg = whole.field_deg
+    remark = (
+        f"wide_lens: a lens of {whole.lens.projection} projection and {width_deg:.0f} x "
+        f"{height_deg:.0f} degrees fits the whole picture"
+    )
+    remarks = (
+        remark,
+        *remarks_on(whole.lens, best, points, None, GUESS_SHARE),
+        *remarks_on_light(points, has_dark(frame)),
+    )
+    search = BlindResult(best, best.log_odds, 0, 0, 0, False)
+    return PictureResult(frame, points, whole, search, remarks)
+
+
+def _averaged(frame: Frame) -> Iterator[tuple[Frame, str]]:
+    """Pictures whose pixels are averaged in pairs, each with a remark that says so."""
+    height, width = frame.counts.shape
     for name, counts in (
         ("columns", frame.counts[:, : width // 2 * 2].reshape(height, -1, 2).mean(axis=2)),
         ("rows", frame.counts[: height // 2 * 2].reshape(-1, 2, width).mean(axis=1)),
@@ -281,10 +422,11 @@ def _solved(
     solver: BlindSolver,
     focal: FocalRange,
     guess_px: float | None,
+    trials: int = 1,
 ) -> PictureResult:
     """The result of one range of focal lengths; without an attitude it has no remarks."""
     places = places_of(points)
-    search = solver.solve(places, focal)
+    search = solver.solve(places, focal, trials)
     if search.found is None:
         return PictureResult(frame, points, None, search, ())
     found = solver.refined(search.found, places.first(REFINED_POINTS), focal)
@@ -293,7 +435,7 @@ def _solved(
         return PictureResult(frame, points, None, search, ())
     remarks = [
         *remarks_on(attitude.lens, found, points, guess_px, GUESS_SHARE),
-        *_light(points, has_dark(frame)),
+        *remarks_on_light(points, has_dark(frame)),
     ]
     return PictureResult(frame, points, attitude, search, tuple(remarks))
 
@@ -445,115 +587,3 @@ def _turns_of_the_middle(fit: LensFit) -> Matrix:
 
 def _angle_deg(one: Vector, other: Vector) -> float:
     return math.degrees(math.atan2(float(np.linalg.norm(np.cross(one, other))), float(one @ other)))
-
-
-def doubt_of_exposure(result: PictureResult, zero_point_mag: float | None) -> list[str]:
-    """A remark where the zero point of a picture is far from that of its camera."""
-    found = result.attitude
-    if found is None or zero_point_mag is None or not math.isfinite(found.zero_point_mag):
-        return []
-    off_mag = found.zero_point_mag - zero_point_mag
-    if abs(off_mag) <= MOST_OFF_MAG:
-        return []
-    remark = (
-        f"exposure_doubtful: with {exposure_stated(result.frame)}, the zero point is "
-        f"{found.zero_point_mag:.2f} mag, and that of the camera {zero_point_mag:.2f} mag: a "
-        f"factor of {10.0 ** (0.4 * abs(off_mag)):.3g}"
-    )
-    return [remark]
-
-
-MOST_OFF_MAG = 1.5
-"""The change of a camera's zero point that clouds and another aperture explain."""
-CLIPPED_SHARE = 0.5
-BLURRED_PX = 3.5
-FEW_POINTS = 6
-NOTABLE_HOT = 20
-NOTABLE_BEND = 0.003
-NOTABLE_FOCAL = 0.005
-
-
-def remarks_on(
-    lens: Lens, found: Verified, points: PointSources, guess_px: float | None, guess_share: float
-) -> Iterator[str]:
-    """Remarks that a user should read about a picture whose attitude was found."""
-    fitted_px = lens.focal_px
-    if guess_px is not None:
-        off = fitted_px / guess_px - 1.0
-        if abs(math.log(fitted_px / guess_px)) > math.log1p(guess_share):
-            yield (
-                f"focal_length: {fitted_px:.0f} px fits, far from the {guess_px:.0f} px that were "
-                "told; the whole range was searched"
-            )
-        elif abs(off) > NOTABLE_FOCAL:
-            yield (
-                f"focal_length: residuals are radial: {fitted_px:.0f} px instead of "
-                f"{guess_px:.0f} fits"
-            )
-    if abs(lens.bend) > NOTABLE_BEND:
-        kind = "pincushion" if lens.bend < 0.0 else "barrel"
-        yield (
-            f"distortion: a {kind} of {abs(lens.bend) * lens.radius_px:.1f} px at the corners "
-            "was fitted"
-        )
-    unmatched = len(found.star) - found.matched
-    if unmatched > found.matched:
-        yield f"clutter: {unmatched} of {len(found.star)} candidates are no star of the catalog"
-
-
-def _advice(points: PointSources, frame: Frame, guess_px: float | None) -> Iterator[str]:
-    """Likely reasons why a picture has no attitude, and options that were not tried."""
-    dark = has_dark(frame)
-    if points.count < 4:
-        yield (
-            f"too_few_points: {points.count} points of light, and four are needed: expose longer, "
-            "open the aperture, or focus on the stars"
-        )
-    elif points.count < FEW_POINTS:
-        yield f"few_points: {points.count} points of light hardly tell one field from another"
-    elif points.count >= MAX_POINTS:
-        steps = ["crop what is no sky"]
-        if not points.clipped_stars:
-            steps += [] if dark else ["take off hot pixels with a dark frame (--dark FILE)"]
-            steps.append("use a shorter exposure with less noise")
-        yield f"clutter: {MAX_POINTS} candidates and more: {', or '.join(steps)}"
-    clear = np.count_nonzero(points.signal_ratio > CLEAR_RATIO)
-    if clear >= LEAST_CLEAR:
-        least_deg, most_deg = WIDEST_FIELD_DEG
-        yield (
-            f"no_match: {clear} clear points fit no sky behind a lens of {least_deg:g} to "
-            f"{most_deg:g} degrees: they may be no stars, or the lens may be too wide, or the "
-            "pixels of unequal sides"
-        )
-    yield from _light(points, dark)
-    if guess_px is None:
-        yield "try_next: tell the field of view (--fov DEG), if it is known within a quarter"
-
-
-def _light(points: PointSources, dark: bool) -> Iterator[str]:
-    if points.clipped_stars:
-        yield (
-            f"clipped_stars: {points.clipped_stars} stars are cut off at the largest count: their "
-            "places are from their flanks and less sure, their magnitudes unknown; a picture that "
-            "is not stretched shows more"
-        )
-    if points.trail_px is not None:
-        yield (
-            f"trailed: stars moved by about {points.trail_px:.0f} px during the exposure; the "
-            "middles of their trails were taken, where they were at mid exposure"
-        )
-    if points.hot_pixels > NOTABLE_HOT:
-        more = "" if dark else "; a dark frame (--dark FILE) takes off all of them"
-        yield (
-            f"hot_pixels: {points.hot_pixels} single bright pixels were taken for no stars{more}"
-        )
-    if points.clipped_share > CLIPPED_SHARE:
-        yield (
-            f"clipped: {points.clipped_share:.0%} of the pixels are clipped to black: faint stars "
-            "are lost; raise the offset (black level) or expose longer"
-        )
-    if points.psf_sigma_px > BLURRED_PX:
-        yield (
-            f"blurred: images of stars are {2.35 * points.psf_sigma_px:.0f} px wide: out of focus, "
-            "or moved during the exposure"
-        )

@@ -23,6 +23,7 @@ from service.observations.schema import FromLastIn, Submission, submission_from_
 from service.storage.queries.results import answer_from_json, frame_of_result
 from service.storage.recording.unsaved_result import Answered
 from service.times import utc_now
+from service.vectors import Projection
 
 FRAME_WAIT_S = 30.0
 """The longest time that a frame waits for a thread: other frames may take seconds."""
@@ -90,6 +91,7 @@ class Frames:
         *,
         spacecraft: str | None = None,
         field_of_view_deg: float | None = None,
+        projection: Projection | None = None,
         image: str | None = None,
         draws: bool = False,
     ) -> Picture:
@@ -102,7 +104,8 @@ class Frames:
         """
         self._submissions.require_kernels()
         # Importing this takes a third of the time that the service needs to start.
-        from service.acquire.picture import blind_sky, doubt_of_exposure, overlay_of, solve_picture
+        from service.acquire.picture import blind_sky, overlay_of, solve_picture
+        from service.acquire.picture_remarks import doubt_of_exposure
         from service.identify.blind.solver import focal_px_of
 
         with file:
@@ -120,9 +123,9 @@ class Frames:
                 frame = read_frame(file, limits)
                 if field_of_view_deg is not None:
                     side_px = max(frame.width_px, frame.height_px)
-                    guess_px = focal_px_of(side_px, field_of_view_deg)
+                    guess_px = focal_px_of(side_px, field_of_view_deg, projection or "gnomonic")
                 sky, solver = blind_sky(self._context.sky.catalog)
-                result = solve_picture(frame, sky, solver, guess_px)
+                result = solve_picture(frame, sky, solver, guess_px, projection=projection)
                 drawn = overlay_of(result, "") if draws else None
             finally:
                 self._picture_turn.release()

@@ -333,8 +333,8 @@ def positive(text: str) -> float:
 def degrees(text: str) -> float:
     """Parse a field of view in degrees, above 0 and below 120, for an option."""
     number = positive(text)
-    if number >= 120:
-        raise argparse.ArgumentTypeError(f"must be below 120 degrees (got {text!r})")
+    if number > 180:
+        raise argparse.ArgumentTypeError(f"must be at most 180 degrees (got {text!r})")
     return number
 
 

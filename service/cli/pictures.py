@@ -15,8 +15,10 @@ from service.settings import Settings
 if TYPE_CHECKING:
     from service.acquire.picture import PictureResult
     from service.imaging.frames.frame import Frame
+    from service.vectors import Projection
 
 FEW_NAMES = 12
+WIDEST_PLAIN_DEG = 120
 LEAST_MEGAPIXELS = 64
 """Least limit in megapixels for pictures on this computer, higher than for uploads."""
 
@@ -34,7 +36,7 @@ def solve_pictures(parsed: Namespace, settings: Settings) -> int:
         try:
             frame = read(file, None)
             guess_px = focal_guess_px(parsed, frame.width_px, frame.height_px)
-            result = solve_picture(frame, sky, solver, guess_px)
+            result = solve_picture(frame, sky, solver, guess_px, projection=parsed.lens)
         except BadInput as error:
             failed += 1
             print(f"acquire: {file}: {error}", file=sys.stderr)
@@ -90,7 +92,11 @@ def focal_guess_px(parsed: Namespace, width_px: int, height_px: int) -> float | 
     if parsed.focal_mm is not None:
         return 1000.0 * float(parsed.focal_mm) / float(parsed.pixel_um)
     if parsed.fov is not None:
-        return focal_px_of(max(width_px, height_px), parsed.fov)
+        projection: Projection = getattr(parsed, "lens", None) or "gnomonic"
+        if projection == "gnomonic" and parsed.fov >= WIDEST_PLAIN_DEG:
+            message = f"must be below {WIDEST_PLAIN_DEG} degrees, unless --lens names a fisheye"
+            raise BadInput(Fault("--fov", message, shown_value(parsed.fov)))
+        return focal_px_of(max(width_px, height_px), parsed.fov, projection)
     return None
 
 
@@ -117,8 +123,10 @@ def _summary(file: Path, report: dict[str, Any]) -> str:
             f"{report['shared_error_px']:.2f} px that more stars would not take away; aberration "
             f"{found['aberration']}"
         )
+        projection = lens["projection"]
+        kind = "" if projection == "gnomonic" else f", {projection} projection"
         lines.append(
-            f"  field {width:.3f} x {height:.3f} deg, focal length {lens['focal_px']:.1f} "
+            f"  field {width:.3f} x {height:.3f} deg{kind}, focal length {lens['focal_px']:.1f} "
             f"+- {lens['focal_sigma_px'] or 0.0:.1f} px, star images "
             f"{report['psf_sigma_px']:.1f} px (one sigma)"
         )

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from service.contract.base import Components, Count, Quaternion, Record, doc
 from service.observations.frame_record import rounded_counts
+from service.vectors import Projection
 
 if TYPE_CHECKING:
     from service.acquire.picture import PictureAttitude, PictureResult
@@ -32,6 +33,9 @@ class PictureLens(Record, frozen=True, kw_only=True):
     """The lens that fits a picture; a sigma of a parameter that was not fitted is null."""
 
     field_deg: Annotated[list[float], doc("Angles of the width and of the height.")]
+    projection: Annotated[Projection, doc("`gnomonic`: on a plane; others of a fisheye.")] = (
+        "gnomonic"
+    )
     focal_px: float
     focal_sigma_px: float | None
     distortion_corner: Annotated[float, doc("At the corners, as a share of their distance.")]
@@ -131,6 +135,7 @@ def _lens(found: "PictureAttitude") -> PictureLens:
     lens = found.lens
     return PictureLens(
         field_deg=[round(angle, 4) for angle in found.field_deg],
+        projection=lens.projection,
         focal_px=round(lens.focal_px, 2),
         focal_sigma_px=_known(found.sigma_of(3) * lens.focal_px, 2),
         distortion_corner=round(lens.bend, 6),

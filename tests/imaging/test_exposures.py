@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from service.acquire.frame_submission import submit_frame
-from service.acquire.picture import blind_sky, doubt_of_exposure, solve_picture
+from service.acquire.picture import blind_sky, solve_picture
+from service.acquire.picture_remarks import doubt_of_exposure
 from service.errors import BadFile
 from service.imaging.frames.files import read_frame
 from service.imaging.frames.fits import write_fits

@@ -32,6 +32,8 @@ class PictureLens(Model, frozen=True, kw_only=True):
 
     field_deg: Sequence[float]
     """Angles of the width and of the height."""
+    projection: str = "gnomonic"
+    """`gnomonic`: on a plane; others of a fisheye."""
     focal_px: float
     focal_sigma_px: float | None
     distortion_corner: float

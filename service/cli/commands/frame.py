@@ -83,6 +83,11 @@ def _add_lens(parser: ArgumentParser) -> None:
         "--fov", type=arguments.degrees, metavar="DEG", help="field of view, the longer side"
     )
     lens.add_argument(
+        "--lens",
+        choices=("gnomonic", "equidistant", "equisolid", "stereographic"),
+        help="projection: gnomonic (on a plane) or of a fisheye; default: whatever fits",
+    )
+    lens.add_argument(
         "--focal-px", type=arguments.positive, metavar="PX", help="focal length in pixels"
     )
     lens.add_argument("--focal-mm", type=arguments.positive, metavar="MM", help="with --pixel-um")
@@ -110,7 +115,7 @@ def run(parsed: Namespace) -> int:
         from service.cli.pictures import solve_pictures
 
         return solve_pictures(parsed, arguments.settings_of(parsed))
-    for name in ("fov", "focal_px", "focal_mm", "pixel_um", "dark"):
+    for name in ("fov", "lens", "focal_px", "focal_mm", "pixel_um", "dark"):
         value = getattr(parsed, name)
         if value is not None:
             message = "goes without --spacecraft; a mission's file describes its camera"

@@ -1,5 +1,7 @@
 """A lens fitted to stars whose directions are known: focal length, centre, radial distortion.
 
+A plain lens projects the sky on a plane (gnomonic), a fisheye in one of three other ways.
+
 The error of a star's place averages down with the number of stars.  That of the model of
 the lens, of the catalog's epoch or of refraction does not: neighbours share it
 (`shared_variance_px2`).
@@ -7,11 +9,12 @@ the lens, of the catalog's epoch or of refraction does not: neighbours share it
 
 import math
 from dataclasses import dataclass, replace
+from typing import get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from service.vectors import Matrix, Vector, rotate_about
+from service.vectors import Matrix, Projection, Vector, rotate_about
 
 BEND_PRIOR = 0.04
 """One standard deviation of the radial displacement at the corner, as a share of the radius."""
@@ -26,6 +29,50 @@ _CONVERGED = 1e-8
 NEIGHBOURS = 3
 """Neighbours whose residuals estimate the correlated error of a star."""
 LEAST_RESIDUAL_PX = 0.05
+WIDEST_RAD = 2.1
+"""No lens shows what is farther from its axis."""
+PROJECTIONS: tuple[Projection, ...] = get_args(Projection)
+_NEAR_AXIS = 1e-3
+"""Sine of the angle from the axis below which an equidistant lens is expanded in a series."""
+
+
+def distance_of(projection: Projection, angle_rad: float) -> float:
+    """The distance from the axis, in focal lengths, of what is at an angle from it."""
+    return {
+        "gnomonic": math.tan(angle_rad),
+        "equidistant": angle_rad,
+        "equisolid": 2.0 * math.sin(0.5 * angle_rad),
+        "stereographic": 2.0 * math.tan(0.5 * angle_rad),
+    }[projection]
+
+
+def _angle_of(projection: Projection, distance: Vector) -> Vector:
+    """The angles from the axis of what is at distances, in focal lengths, from it."""
+    if projection == "gnomonic":
+        return np.arctan(distance)
+    if projection == "equidistant":
+        return np.minimum(distance, math.pi)
+    if projection == "equisolid":
+        return 2.0 * np.arcsin(np.minimum(0.5 * distance, 1.0))
+    return 2.0 * np.arctan(0.5 * distance)
+
+
+def _stretch_of(projection: Projection, body: Vector) -> tuple[Vector, Vector]:
+    """The distances of directions (n, 3) over the sines of their angles, and the slope by z.
+
+    Of a fisheye; both are infinite opposite to its axis.
+    """
+    z = body[:, 2]
+    if projection == "equisolid":
+        stretch = np.sqrt(2.0 / (1.0 + z))
+        return stretch, -0.5 * stretch / (1.0 + z)
+    if projection == "stereographic":
+        return 2.0 / (1.0 + z), -2.0 / (1.0 + z) ** 2
+    sine = np.hypot(body[:, 0], body[:, 1])
+    off = np.maximum(sine, _NEAR_AXIS)
+    near = (sine < _NEAR_AXIS) & (z > 0.0)
+    stretch = np.where(near, 1.0 + sine**2 / 6.0, np.arctan2(sine, z) / off)
+    return stretch, np.where(near, -1.0 / 3.0, (stretch * z - 1.0) / off**2)
 
 
 @dataclass(frozen=True)
@@ -34,7 +81,8 @@ class Lens:
 
     `bend` is the radial displacement at the half diagonal `radius_px`, as a share of the radius:
     the true distance from the axis is r (1 + bend (r / radius_px)^2).  `off_u` and
-    `off_v` are those of the axis from the middle, in units of `radius_px`.
+    `off_v` are those of the axis from the middle, in units of `radius_px`.  Near the axis the focal
+    length is that of a plain lens, whatever the projection.
     """
 
     width_px: int
@@ -43,6 +91,7 @@ class Lens:
     bend: float = 0.0
     off_u: float = 0.0
     off_v: float = 0.0
+    projection: Projection = "gnomonic"
 
     @property
     def radius_px(self) -> float:
@@ -58,7 +107,7 @@ class Lens:
         )
 
     def plane(self, u_px: Vector, v_px: Vector) -> Vector:
-        """True coordinates (n, 2) on the plane at unit distance."""
+        """True coordinates (n, 2) in the projection, in focal lengths."""
         center_u, center_v = self.center_px
         x, y = np.asarray(u_px) - center_u, np.asarray(v_px) - center_v
         scale = (1.0 + self.bend * (x * x + y * y) / self.radius_px**2) / self.focal_px
@@ -67,14 +116,34 @@ class Lens:
     def directions(self, u_px: Vector, v_px: Vector) -> Vector:
         """Unit vectors (n, 3): x to the right of the picture, y down, z the boresight."""
         plane = self.plane(u_px, v_px)
-        vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
-        return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+        if self.projection == "gnomonic":
+            vectors = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
+            return np.asarray(vectors / np.linalg.norm(vectors, axis=-1, keepdims=True))
+        distance = np.hypot(plane[..., :1], plane[..., 1:])
+        angle = _angle_of(self.projection, distance)
+        share = np.where(distance > 0.0, np.sin(angle) / np.maximum(distance, 1e-12), 1.0)
+        return np.concatenate([plane * share, np.cos(angle)], axis=-1)
+
+    @property
+    def reach_rad(self) -> float:
+        """The angle of the corners from the axis."""
+        distance = self.radius_px / self.focal_px * (1.0 + abs(self.bend))
+        if self.projection == "gnomonic":
+            return math.atan(distance)
+        return min(float(_angle_of(self.projection, np.array(distance))), WIDEST_RAD)
+
+    def projected(self, body: Vector) -> Vector:
+        """Coordinates (n, 2) in the projection, in focal lengths, of unit vectors (n, 3)."""
+        if self.projection == "gnomonic":
+            return np.asarray(body[:, :2] / body[:, 2:])
+        return np.asarray(body[:, :2] * _stretch_of(self.projection, body)[0][:, None])
 
     def places(self, directions: Vector) -> tuple[Vector, Vector]:
         """Pixels of directions (n, 3); NaN for those behind or far outside the picture."""
+        least_cosine = 0.0 if self.projection == "gnomonic" else math.cos(WIDEST_RAD)
         with np.errstate(divide="ignore", invalid="ignore"):
-            x = np.where(directions[:, 2] > 0.0, directions[:, 0] / directions[:, 2], np.nan)
-            y = np.where(directions[:, 2] > 0.0, directions[:, 1] / directions[:, 2], np.nan)
+            shown = directions[:, 2:] > least_cosine
+            x, y = np.where(shown, self.projected(directions), np.nan).T
             true = np.hypot(x, y) * self.focal_px / self.radius_px
             true[~(true < 1.6)] = np.nan
             seen = true.copy()
@@ -152,19 +221,13 @@ def lens_of(lens: Lens, names: tuple[str, ...], free: Vector) -> Lens:
     """A lens with other parameters: the first value is of the logarithm of the focal length."""
     values = dict(zip(names[1:], free[1:].tolist(), strict=True))
     values["focal_px"] = lens.focal_px * math.exp(free[0])
-    return Lens(lens.width_px, lens.height_px, **{**_bends(lens), **values})
-
-
-def _bends(lens: Lens) -> dict[str, float]:
-    return {"bend": lens.bend, "off_u": lens.off_u, "off_v": lens.off_v}
+    return replace(lens, **values)
 
 
 def _residual(lens: Lens, attitude: Matrix, u_px: Vector, v_px: Vector, star: Vector) -> Vector:
-    """Observed minus predicted (2 n,), in pixels of the undistorted plane."""
-    body = star @ attitude.T
-    return np.asarray(
-        ((lens.plane(u_px, v_px) - body[:, :2] / body[:, 2:]) * lens.focal_px).ravel()
-    )
+    """Observed minus predicted (2 n,), in pixels of the undistorted projection."""
+    predicted = lens.projected(star @ attitude.T)
+    return np.asarray(((lens.plane(u_px, v_px) - predicted) * lens.focal_px).ravel())
 
 
 def linearised(
@@ -182,10 +245,20 @@ def linearised(
     """
     trial = lens_of(lens, names, free)
     body = star @ attitude.T
-    x, y = (body[:, :2] / body[:, 2:]).T
     plane = trial.plane(u_px, v_px)
-    residual = (plane - np.column_stack([x, y])) * trial.focal_px
-    turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
+    predicted = trial.projected(body)
+    residual = (plane - predicted) * trial.focal_px
+    if trial.projection == "gnomonic":
+        x, y = predicted.T
+        turns = [[-x * y, -1.0 - y * y], [1.0 + x * x, x * y], [-y, x]]
+    else:
+        x, y, z = body.T
+        stretch, slope = _stretch_of(trial.projection, body)
+        turns = [
+            [slope * x * y, slope * y * y - stretch * z],
+            [stretch * z - slope * x * x, -slope * x * y],
+            [-stretch * y, stretch * x],
+        ]
     columns = [trial.focal_px * np.array(each) for each in turns]
     # In pixels of one focal length: else a longer one would make all residuals longer.
     columns.append(trial.focal_px * plane.T)

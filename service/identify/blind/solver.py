@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from service.identify.blind.lens import Lens
+from service.identify.blind.lens import Lens, distance_of
 from service.identify.blind.verify import Points, Stars, Verified, matched, refine, verify
 from service.sky.whole_sky.quads import (
     LEAST_WIDTH,
@@ -24,7 +24,7 @@ from service.sky.whole_sky.quads import (
     build_quad_level,
     quad_codes,
 )
-from service.vectors import Matrix, Vector
+from service.vectors import Matrix, Projection, Vector
 
 Sets = npt.NDArray[np.int64]
 
@@ -72,9 +72,14 @@ class FocalRange:
         return cls(least, most)
 
 
-def focal_px_of(side_px: int, field_deg: float) -> float:
+def focal_px_of(side_px: int, field_deg: float, projection: Projection = "gnomonic") -> float:
     """The focal length with which a side spans a field of view."""
-    return 0.5 * side_px / math.tan(math.radians(0.5 * field_deg))
+    return 0.5 * side_px / distance_of(projection, math.radians(0.5 * field_deg))
+
+
+def least_log_odds(trials: int) -> float:
+    """The evidence above which an attitude is accepted that is the best of so many trials."""
+    return ACCEPT_LOG_ODDS + math.log(trials)
 
 
 class BlindResult(NamedTuple):
@@ -115,8 +120,12 @@ class BlindSolver:
             self._levels[radius_deg] = build_quad_level(self.direction, radius_deg)
         return self._levels[radius_deg]
 
-    def solve(self, points: Points, focal: FocalRange) -> BlindResult:
-        """The attitude and lens with the most evidence."""
+    def solve(self, points: Points, focal: FocalRange, trials: int = 1) -> BlindResult:
+        """The attitude and lens with the most evidence.
+
+        Where it is one of several `trials` to explain one picture, it needs as many times the
+        odds of a single one.
+        """
         search = _Search(self, points, focal)
         best: Verified | None = None
         bounded = False
@@ -131,7 +140,7 @@ class BlindSolver:
                 break
         log_odds = -math.inf if best is None else best.log_odds
         return BlindResult(
-            best if log_odds > ACCEPT_LOG_ODDS else None,
+            best if log_odds > least_log_odds(trials) else None,
             *(log_odds, search.patterns, search.hits, search.verified, bounded),
         )
 

@@ -108,7 +108,7 @@ class Stars:
 
     def near(self, attitude: Matrix, lens: Lens, most: int) -> tuple[Rows, Vector, Vector]:
         """The brightest so many on a picture: rows, and where they stand (n)."""
-        reach = math.atan(lens.radius_px / lens.focal_px * (1.0 + abs(lens.bend))) + 0.002
+        reach = lens.reach_rad + 0.002
         # Before their places are known: a picture holds most of the cap about it.
         rows = self._brightest(attitude[2], reach, 3 * most)
         u, v = lens.places(self.direction[rows] @ attitude.T)

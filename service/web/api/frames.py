@@ -16,6 +16,7 @@ from service.contract.pictures import Picture
 from service.errors import BadBatch, Fault, shown_value
 from service.imaging.submit import FrameIn, read_known
 from service.missions.mission import mission_named
+from service.vectors import Projection
 from service.web.api.batches import answer_response
 from service.web.openapi import IDEMPOTENCY_KEY, LOCATION, REPLAYED, ApiRouter, Returns
 from service.web.requests.access import AppDep, CallerDep, MetricsDep, Policy, json_response
@@ -154,6 +155,10 @@ class PictureQuery(Query):
         float | None,
         Field(gt=0, lt=180, description="Along the longer side; may be wrong by a quarter."),
     ] = None
+    lens: Annotated[
+        Projection | None,
+        Field(description="How the lens projects the sky. Default: whatever fits."),
+    ] = None
     image: Annotated[str | None, Field(description="As of a frame.", examples=["SCI"])] = None
     overlay: Annotated[
         bool, Field(description="Whether the answer holds the picture with the stars.")
@@ -186,6 +191,7 @@ def solve_picture(
             file,
             spacecraft=query.spacecraft,
             field_of_view_deg=query.field_of_view_deg,
+            projection=query.lens,
             image=query.image,
             draws=query.overlay,
         )
