@@ -7,7 +7,7 @@ from service.web.console.page import PAGES, PageRoute
 
 
 def console_router() -> APIRouter:
-    """The routes of every registered page."""
+    """API router with the routes of every registered page."""
     router = APIRouter(include_in_schema=False, route_class=PageRoute)
     for name, page in PAGES.items():
         router.add_api_route(page.path, page.handler, name=name)

@@ -1,7 +1,7 @@
-"""How the console writes values: UTC with the day of the year, numbers with units, states as words.
+"""Text formats of the console: UTC with day of year, numbers with units, words for states.
 
-A state has a word and a shape, so that colour is never needed.  An unknown value is
-a dash, never a zero.
+A state has a word and a shape, so that no one depends on colour.  An unknown value is a dash, never
+a zero.
 """
 
 import math
@@ -45,7 +45,7 @@ STATES: Mapping[str, tuple[str, str]] = {
     "tracking": ("●", "tracking"),
     "lost": ("✕", "lost"),
 }
-"""Shape and word of every state there is."""
+"""Shape and word of every state."""
 
 
 _TYPED = re.compile(
@@ -56,9 +56,9 @@ _TYPED = re.compile(
 
 
 def completed_utc(text: str) -> str:
-    """A time as people type it in the form that `parse_utc` reads; any other text as it is.
+    """Complete a typed time to the form that `parse_utc` reads; other text is unchanged.
 
-    A blank may stand for `T`, and the time of day, its seconds and the zone may be missing.
+    A blank may replace `T`; the time of day, its seconds and the zone may be missing.
     """
     match = _TYPED.fullmatch(text.strip())
     if match is None:
@@ -68,24 +68,24 @@ def completed_utc(text: str) -> str:
 
 
 def present() -> Utc:
-    """This moment, to the second."""
+    """Current time, to the second."""
     return recorded_utc(utc_now().text[:19])
 
 
 def second_after(time: str) -> Utc:
-    """The whole second after a batch: a period that ends there holds the batch."""
+    """Whole second after a batch, so that a period that ends there contains the batch."""
     return shifted(recorded_utc(time[:19] + "Z"), 1.0)
 
 
 def with_day_of_year(moment: Utc | str, seconds: bool = True) -> str:
-    """UTC for reading: date, day of the year, time of day."""
+    """UTC text for readers: date, day of year, time of day."""
     moment = recorded_utc(moment) if isinstance(moment, str) else moment
     day, _, clock = moment.text.partition("T")
     return f"{day} ({moment.day_of_year:03d}) {clock[: 8 if seconds else 5]}"
 
 
 def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
-    """The same as an element that programs can read; a dash where there is none."""
+    """UTC text as an HTML `time` element; a dash without a time."""
     if moment is None:
         return Markup(DASH)
     moment = recorded_utc(moment) if isinstance(moment, str) else moment
@@ -95,14 +95,14 @@ def utc(moment: Utc | str | None, seconds: bool = True) -> Markup:
 
 
 def utc_short(moment: str) -> Markup:
-    """Month, day and time of day, for a narrow column; the element has all of it."""
+    """Month, day and time of day for a narrow column; the `time` element has the full time."""
     return Markup('<time datetime="{}" title="{} UTC">{}</time>').format(
         moment, with_day_of_year(moment), f"{moment[5:10]} {moment[11:16]}"
     )
 
 
 def age(seconds: float | None) -> str:
-    """A length of time in its two largest units, in days alone from a hundred of them on."""
+    """Duration in its two largest units, from a hundred days in days alone."""
     if seconds is None:
         return DASH
     whole = max(0, round(seconds))
@@ -122,7 +122,7 @@ def age(seconds: float | None) -> str:
 
 
 def share(part: float | None, whole: float | None = 1) -> str:
-    """Percent to two or three digits; without a whole there is no share."""
+    """Percentage to two or three digits; a dash without a whole."""
     if part is None or not whole:
         return DASH
     percent = 100 * part / whole
@@ -131,21 +131,21 @@ def share(part: float | None, whole: float | None = 1) -> str:
 
 
 def number(value: float | None, decimals: int = 2) -> str:
-    """A number with so many decimals, and a true minus sign."""
+    """Number with a fixed number of decimals, and a true minus sign."""
     if value is None or not math.isfinite(value):
         return DASH
     return f"{value:.{decimals}f}".replace("-", "−")
 
 
 def level(value: float) -> str:
-    """A number to four digits, without the exponent that small ones would have."""
+    """Number to four digits, without an exponent for small values."""
     if value == 0.0:
         return "0"
     return number(value, min(9, max(0, 3 - math.floor(math.log10(abs(value))))))
 
 
 def arcsec(value: float | None) -> str:
-    """Arcseconds to three digits; degrees where they become many."""
+    """Angle in arcseconds to three digits; from 3600 arcseconds in degrees."""
     if value is None or not math.isfinite(value):
         return DASH
     if abs(value) >= 3600:
@@ -155,27 +155,27 @@ def arcsec(value: float | None) -> str:
 
 
 def degrees(value: float | None, decimals: int = 3) -> str:
-    """Degrees."""
+    """Angle in degrees."""
     return DASH if value is None else f"{number(value, decimals)}°"
 
 
 def magnitude(value: float | None, decimals: int = 2) -> str:
-    """Magnitudes."""
+    """Magnitude with its unit."""
     return DASH if value is None else f"{number(value, decimals)}{THIN}mag"
 
 
 def count(value: int | None) -> str:
-    """A whole number in groups of three."""
+    """Whole number with digits in groups of three."""
     return DASH if value is None else f"{value:,}".replace(",", THIN)
 
 
 def plural(number: int, word: str) -> str:
-    """A count with its word."""
+    """Count with its noun."""
     return f"{count(number)} {word}{'' if number == 1 else 's'}"
 
 
 def microseconds(value: float | None) -> str:
-    """Microseconds, or milliseconds where they become many."""
+    """Duration in microseconds; long ones in milliseconds."""
     if value is None:
         return DASH
     if value >= 10_000:
@@ -184,7 +184,7 @@ def microseconds(value: float | None) -> str:
 
 
 def size(value: int) -> str:
-    """Bytes in kB and MB."""
+    """Size of a file or of memory with its unit."""
     for least, unit in ((1_000_000_000, "GB"), (1_000_000, "MB"), (1_000, "kB")):
         if value >= least:
             return f"{value / least:.1f}{THIN}{unit}"
@@ -192,7 +192,7 @@ def size(value: int) -> str:
 
 
 def sigmas(covariance_arcsec2: Sequence[Sequence[float]]) -> list[float]:
-    """One standard deviation about each body axis."""
+    """Standard deviations about the body axes."""
     return [math.sqrt(max(covariance_arcsec2[k][k], 0.0)) for k in range(3)]
 
 
@@ -203,16 +203,16 @@ REASONS: Mapping[str, str] = {
     "no_match": "no attitude explains three of the stars",
     "doubtful_match": "an attitude explains some stars, but chance may as well",
 }
-"""Why there is no attitude, in a sentence."""
+"""Explanations why there is no attitude, by reason code."""
 
 
 def reason(code: str | None) -> str:
-    """A reason for reading; a code of another version without its underscores."""
+    """Readable reason; a code of another version without its underscores."""
     return REASONS.get(code or "", plain(code))
 
 
 def warning(text: str) -> tuple[str, str]:
-    """The sentence and the code of a warning."""
+    """Sentence and code of a warning."""
     code, _, said = text.partition(":")
     said = said.strip()
     if said in REASONS:
@@ -221,7 +221,7 @@ def warning(text: str) -> tuple[str, str]:
 
 
 def typed_time(moment: Utc | str | None) -> str:
-    """A time as a field of a form has it: to the second where nothing follows."""
+    """Time for a form field: to the second if no fraction follows."""
     if moment is None or moment == "":
         return ""
     text = moment if isinstance(moment, str) else moment.text
@@ -229,12 +229,12 @@ def typed_time(moment: Utc | str | None) -> str:
 
 
 def plain(word: str | None) -> str:
-    """A word of the interface for reading: `no_attitude` without its underscore."""
+    """Readable word of the interface: `no_attitude` without its underscore."""
     return (word or "").replace("_", " ")
 
 
 def state(name: str | None, words: str | None = None) -> Markup:
-    """Shape and word of a state, or other words, with a class to colour it by."""
+    """Shape and word of a state, or another text, with a class for its colour."""
     name = name or "no_attitude"
     shape, word = STATES[name][0], words or STATES[name][1]
     return Markup('<span class="state {}"><span aria-hidden="true">{}</span> {}</span>').format(
@@ -256,7 +256,7 @@ def _in_percent(known: Quantity) -> bool:
 
 
 def quantity(value: float | None, name: str) -> str:
-    """A value of a quantity with its unit."""
+    """Value of a quantity with its unit."""
     if value is None:
         return DASH
     known = quantity_named(name)
@@ -268,20 +268,20 @@ def quantity(value: float | None, name: str) -> str:
 
 
 def unit_of(name: str) -> str:
-    """The unit in which a quantity is written and entered; shares are percent."""
+    """Unit in which a quantity is shown and entered; percent for shares."""
     known = quantity_named(name)
     return "%" if _in_percent(known) else ENTERED_UNITS.get(known.unit, known.unit)
 
 
 def entered(value: float | None, name: str) -> str:
-    """A bound of a quantity in `unit_of` it, as a field of a form has it; empty without one."""
+    """Bound of a quantity in its `unit_of` for a form field; empty without one."""
     if value is None:
         return ""
     return f"{100 * value if _in_percent(quantity_named(name)) else value:.6g}"
 
 
 def bounds(settings: Mapping[str, Any], name: str) -> str:
-    """The limits of a quantity in words."""
+    """Limits of a quantity in words."""
     if not settings["enabled"]:
         return "off"
     parts = [
@@ -304,11 +304,11 @@ _INVISIBLE = re.compile(
     r"\u2028-\u202e\u2060-\u206f\u2800\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb"
     r"\U000e0000-\U000e0fff]"
 )
-"""Characters that show nothing, or that change the order of what is shown."""
+"""Invisible characters, and those that change the direction of text."""
 
 
 def name(text: str) -> str:
-    """A name with the code of each character that nobody would see: two names never look alike."""
+    """Name with the codes of its invisible characters, so that no two names look alike."""
     if text.isspace() or text != text.strip():
         text = re.sub(r"^\s+|\s+$", lambda found: "".join(map(_code, found[0])), text)
     return _INVISIBLE.sub(lambda found: _code(found[0]), text)

@@ -1,7 +1,7 @@
 """Options from the fields of a form, and the fields to show.
 
-A form sends every field; only a changed value is an option.  Names are those of the
-mission file, in a query string dotted and prefixed: `b.tolerances.separation_deg`.
+A form sends every field; only a changed value is an option.  Names are those of the mission file,
+dotted and prefixed in a query string: `b.tolerances.separation_deg`.
 """
 
 from collections.abc import Iterable, Mapping
@@ -26,14 +26,14 @@ SYMBOLS: Mapping[str, str] = {
     "pole_difference_deg": "BANTOL1",
     "pole_angle_deg": "BANTOL2",
 }
-"""The paper's symbols (Fink & Shoup 1994, Table 1)."""
+"""Symbols of the settings in the paper (Fink & Shoup 1994, Table 1)."""
 
 SWITCH = {"on": True, "off": False}
 
 
 @dataclass(frozen=True)
 class FormField:
-    """One setting in a form: its name in the query, its value now, and the value it had."""
+    """Form field of one setting: its name in the query, current value, and previous value."""
 
     name: str
     label: str
@@ -51,9 +51,9 @@ class FormField:
 
 
 def asked_options(query: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
-    """The options in a query string, nested as in the API; empty fields are left out.
+    """Options of a query string, nested as in the API; empty fields are left out.
 
-    Raises `BadBatch` for an unknown name and an impossible value.
+    Raises `BadBatch` for unknown names and impossible values.
     """
     nested: dict[str, Any] = {}
     for name, text in query.items():
@@ -83,7 +83,7 @@ def _value(name: str, group: str, leaf: str, text: str) -> Any:
 
 
 def faults_of_form(error: ValidationError, prefix: str = "") -> list[Fault]:
-    """The faults of a form, by the names of its fields."""
+    """Faults of a form, by field name."""
     return [
         Fault(
             prefix + ".".join(str(part)[:80] for part in each["loc"]),
@@ -95,7 +95,7 @@ def faults_of_form(error: ValidationError, prefix: str = "") -> list[Fault]:
 
 
 def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
-    """The requested options that differ from the settings in force."""
+    """Requested options that differ from the current settings."""
     held = batch_settings(choices)
     changed: dict[str, Any] = {}
     for name, value in asked.items():
@@ -109,12 +109,12 @@ def changed_options(asked: Mapping[str, Any], choices: Choices) -> OptionsIn:
 
 
 def batch_settings(choices: Choices) -> dict[str, Any]:
-    """The settings in force for a batch, nested like options."""
+    """Current settings for a batch, nested like options."""
     return _nested(choices, choices.zone_grid_deg)
 
 
 def settings_of_mission(mission: Mission) -> dict[str, Any]:
-    """The settings in force where neither batch nor form has others."""
+    """Settings that apply if neither batch nor form has others."""
     return _nested(mission, mission.zone.grid_deg)
 
 
@@ -134,9 +134,9 @@ def fields_of(
     prefix: str = "",
     mission: Mission | None = None,
 ) -> list[FormField]:
-    """The fields of a form; without settings `before`, they start empty.
+    """Fields of a form; without settings `before` they start empty.
 
-    With a mission, those that change nothing under the form's identifier and tests are left out.
+    With a mission, fields without effect under the form's identifier and tests are left out.
     """
     held = before or {}
     in_force = before or ({} if mission is None else settings_of_mission(mission))
@@ -170,7 +170,7 @@ def fields_of(
 
 
 def toml_of(fields: Iterable[FormField]) -> str:
-    """The changed settings as lines of a mission file, each with the value that it replaces."""
+    """Changed settings as lines of a mission file, each with the value that it replaces."""
     tables: dict[str, list[str]] = {"": [], "tests": [], "tolerances": []}
     for each in fields:
         if not each.changed:

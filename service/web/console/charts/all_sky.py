@@ -1,4 +1,4 @@
-"""The whole sky in an equal-area projection, with where the trackers looked and what came of it.
+"""Whole sky in an equal-area projection, with boresights of trackers by outcome.
 
 The projection is Hammer's (Hammer 1892; FITS calls it AIT): an ellipse in which equal
 areas of the sky have equal areas.  Right ascension grows to the left, as seen from
@@ -24,7 +24,7 @@ STEP_DEG = 2.0
 GRID_DEG = 30
 SUN_POINTS = 24
 JOINED_DEG = 20.0
-"""Boresights of neighbouring batches that are farther apart are not joined."""
+"""Greatest angle between the boresights of neighbouring batches that a line joins."""
 
 Place = tuple[float, float]
 Path = str
@@ -32,7 +32,7 @@ Path = str
 
 @dataclass(frozen=True)
 class ZoneEdge:
-    """The edges of the zone of a tracker's latest batch."""
+    """The edges of the search zone of a tracker's latest batch."""
 
     tracker: str
     path: Path
@@ -40,7 +40,7 @@ class ZoneEdge:
 
 @dataclass(frozen=True)
 class Track:
-    """The directions of one tracker: a line through its boresights, and marks by outcome."""
+    """Boresights of one tracker on the sky: a line, and marks by outcome."""
 
     tracker: str
     line: Path
@@ -57,7 +57,7 @@ class Track:
 
 @dataclass(frozen=True)
 class GridLabel:
-    """A right ascension or a declination at its line."""
+    """Label of a right ascension or a declination beside its grid line."""
 
     text: str
     x: float
@@ -66,7 +66,7 @@ class GridLabel:
 
 @dataclass(frozen=True)
 class AllSkyChart:
-    """The chart: grid, galactic plane, Sun, zones and tracks."""
+    """Chart of the whole sky: grid, galactic plane, Sun, zones and tracks."""
 
     outline: Path
     grid: Path
@@ -78,13 +78,13 @@ class AllSkyChart:
     zones: tuple[ZoneEdge, ...]
     tracks: tuple[Track, ...]
     points: tuple[tuple[int, int, str], ...]
-    """Each batch in order of time: its place in pixels, and its time."""
+    """Position in pixels and time of each batch, ordered by time."""
     width: float = WIDTH + 2 * EDGE
     height: float = HEIGHT + 2 * EDGE
 
 
 def hammer(direction: Vector) -> Vector:
-    """Places (n, 2) in pixels of inertial directions (n, 3); x to the right, y downwards."""
+    """Positions (n, 2) in pixels of inertial directions (n, 3); x to the right, y downwards."""
     ra_deg, dec_deg = to_ra_dec(direction)
     return _hammer(np.radians(ra_deg - MIDDLE_RA_DEG), np.radians(dec_deg))
 
@@ -100,7 +100,7 @@ def _hammer(longitude_rad: Vector, latitude_rad: Vector) -> Vector:
 
 
 def all_sky_chart(period: PeriodStars, shown: list[TrackerStarsOfPeriod]) -> AllSkyChart:
-    """The chart of a period with the tracks of some of its trackers."""
+    """Chart of a period with the tracks of some of its trackers."""
     longitudes = np.radians(np.arange(0.0, 360.0 + STEP_DEG, STEP_DEG))
     plane = from_ra_dec(*np.degrees(erfa.g2icrs(longitudes, np.zeros_like(longitudes))))
     centre = from_ra_dec(*np.degrees(erfa.g2icrs(0.0, 0.0)))
@@ -123,7 +123,7 @@ def all_sky_chart(period: PeriodStars, shown: list[TrackerStarsOfPeriod]) -> All
 def _points(
     period: PeriodStars, shown: list[TrackerStarsOfPeriod]
 ) -> Iterator[tuple[int, int, str]]:
-    """The places of the first tracker that has one in a batch."""
+    """Positions and times of batches, each from the first tracker with a known boresight."""
     for number, time in enumerate(period.attitudes.time):
         known = [each for each in shown if np.isfinite(each.boresight[number, 0])]
         if known:
@@ -160,7 +160,7 @@ def _track(period: PeriodStars, tracker: TrackerStarsOfPeriod) -> Track:
 
 
 def _marks(places: Vector, shape: str) -> Path:
-    """A mark at every place; of marks on one pixel there is one."""
+    """Path with a mark at every position, but only one per pixel."""
     whole = np.unique(np.round(places), axis=0).astype(int).tolist()
     return "".join(f"M{x} {y}{shape}" for x, y in whole)
 
@@ -173,13 +173,13 @@ def _joined(direction: Vector) -> Path:
 
 
 def _edges(region: SearchRegion) -> Path:
-    """The bounds of a zone: one circle for a cap, two for a band."""
+    """Path of the bounds of a zone: one circle for a cap, two for a band."""
     bounds = (region.least_deg, region.most_deg)
     return "".join(_line(_circle(region.axis, each)) for each in bounds if 0.0 < each < 180.0)
 
 
 def _circle(axis: Vector, angle_deg: float) -> Vector:
-    """Directions at an angle from an axis, all about it."""
+    """Directions of the circle at an angle from an axis."""
     first = unit(np.cross(axis, np.eye(3)[int(np.argmin(np.abs(axis)))]))
     second = np.cross(axis, first)
     turn = np.radians(np.arange(0.0, 360.0 + STEP_DEG, STEP_DEG))[:, None]
@@ -218,9 +218,9 @@ def _place(point: Vector) -> Place:
 
 
 def _line(direction: Vector, breaks: npt.NDArray[np.bool_] | None = None) -> Path:
-    """A line through directions, broken at the seam of the projection and where it is said.
+    """Path through directions, broken at the seam of the projection and at given places.
 
-    `breaks` says for every direction but the first whether the line begins anew there.
+    `breaks` tells for every direction but the first whether the line begins anew there.
     """
     if len(direction) < 2:
         return ""

@@ -1,4 +1,4 @@
-"""Attitude, rate and their standard deviations about the body axes over a period, in panels."""
+"""Charts of attitude, rate and standard deviations about the body axes over a period."""
 
 from dataclasses import dataclass
 
@@ -12,18 +12,18 @@ from service.web.console.charts.panels import HEIGHT, WIDTH, Mask, Scale, TimeAx
 
 AXES = ("x", "y", "z")
 LARGEST_STEP_S = 600.0
-"""A rate is formed of attitudes that are no farther apart."""
+"""Greatest time between the two attitudes from which a rate is computed."""
 GAP = 3.0
-"""Attitudes farther apart than so many times their usual distance are not joined."""
+"""Greatest time between joined attitudes, as a multiple of their median time."""
 LEAST_BAND = 1.5
-"""Units; a band of one sigma to either side that is narrower cannot be seen."""
+"""Width in units of the narrowest visible band of one sigma to either side."""
 SMALL_DEG, SMALL_DEG_PER_S = 0.05, 0.005
-"""Values that are all below these are given in arcseconds."""
+"""Limits below which a chart of attitudes or rates uses arcseconds."""
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One axis of a chart: line, band of one sigma to either side, dots, marks where suspect."""
+    """Panel for one axis: line, band of one sigma to either side, dots, marks if suspect."""
 
     axis: str
     line: str
@@ -37,7 +37,7 @@ class Panel:
 
 @dataclass(frozen=True)
 class AttitudeChart:
-    """Three panels with one unit; `has_band` says whether a band is wide enough to be seen."""
+    """Chart of three panels; `has_band` is true if a band is wide enough to be seen."""
 
     id: str
     title: str
@@ -51,7 +51,7 @@ class AttitudeChart:
 
 @dataclass(frozen=True, eq=False)
 class _Values:
-    """Values (n, 3) of moments with sigmas; `joins` says which are joined with the one before."""
+    """Values (n, 3) with times and sigmas; `joins` marks those joined with the previous one."""
 
     time_ns: npt.NDArray[np.int64]
     value: Vector
@@ -61,9 +61,9 @@ class _Values:
 
 
 def attitude_charts(attitudes: PeriodAttitudes, start: Utc, end: Utc) -> list[AttitudeChart]:
-    """The charts of attitude, rate and sigma; without those that have no value.
+    """Charts of attitude, rate and sigma, without those that have no value.
 
-    The attitude is the turn from the first good one; the rate that between neighbouring
+    The attitude is the rotation from the first good one.  The rate is that between neighbouring
     attitudes, at the middle of their time.
     """
     axis = TimeAxis(start, end)
@@ -95,7 +95,7 @@ def _sigma_rad(covariance_arcsec2: Vector) -> Vector:
 
 
 def _is_near(time_ns: npt.NDArray[np.int64], follows: Mask) -> Mask:
-    """Marks of the moments as near to the one before as is usual among neighbours."""
+    """Mask of the times that follow the previous one as closely as is usual."""
     step = np.diff(time_ns, prepend=time_ns[0])
     usual = float(np.median(step[follows])) if follows.any() else 0.0
     return np.asarray(step <= GAP * usual)
@@ -143,7 +143,7 @@ def _chart(id: str, values: _Values, time: TimeAxis) -> AttitudeChart:
 
 
 def _unit(id: str, values: Vector) -> tuple[str, float]:
-    """The unit of a chart, and what a radian is in it."""
+    """Unit of a chart, and the value of one radian in it."""
     degrees = float(np.degrees(np.max(np.abs(values))))
     if id == "sigma":
         return "″", ARCSEC_PER_RADIAN

@@ -1,4 +1,4 @@
-"""Residuals of a tracker over its focal plane in a period."""
+"""Map of a tracker's residuals over its focal plane in a period."""
 
 import math
 from dataclasses import dataclass
@@ -10,23 +10,23 @@ from service.vectors import Vector
 
 SIZE = 420.0
 CELLS = 8
-"""Cells along each side of the square about the field of view."""
+"""Number of cells along each side of the square about the field of view."""
 LEAST_STARS = 5
-"""Fewer stars have no mean that is worth an arrow."""
+"""Least number of stars in a cell whose mean residual gets an arrow."""
 LONGEST = 1.1
-"""The length of the longest arrow, in cells."""
+"""Length of the longest arrow, in cells."""
 CLEAR = 3.3
-"""Standard errors.  Of cells without any distortion one in 300 has so long a mean residual."""
+"""Least clear mean residual in standard errors; without distortion one cell in 300 has it."""
 STEPS = (1.25, 1.5, 2.0, 3.0)
-"""Spread over what is expected, from which on a cell has the next shade."""
+"""Ratios of spread to expected spread at which a cell gets the next shade."""
 ROUND = (1.0, 2.0, 5.0)
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One cell: its centre, its stars, their mean residual, and its spread over the expected.
+    """Cell of the map: centre, stars, mean residual, and ratio of the spread to the expected one.
 
-    `is_clear` says whether the mean is certainly not that of noise alone.
+    `is_clear` is true if the mean is certainly not from noise alone.
     """
 
     h_deg: float
@@ -39,12 +39,12 @@ class Cell:
     y: float
     shade: int
     arrow: str
-    """A path; empty for too few stars."""
+    """SVG path; empty with too few stars."""
 
 
 @dataclass(frozen=True)
 class FocalPlaneMap:
-    """The map; `key_px` is the length of an arrow of `key_arcsec`."""
+    """Map of residuals; `key_px` is the length of an arrow of `key_arcsec`."""
 
     tracker: str
     cells: tuple[Cell, ...]
@@ -59,7 +59,7 @@ class FocalPlaneMap:
 
 
 def focal_plane_map(tracker: TrackerStarsOfPeriod) -> FocalPlaneMap | None:
-    """The map of a tracker; None where no star has a residual."""
+    """Map of a tracker's residuals; None if no star has a residual."""
     known = np.isfinite(tracker.residual_arcsec[:, 0]) & np.isfinite(tracker.expected_arcsec).all(
         axis=1
     )
@@ -95,7 +95,7 @@ _Found = tuple[int, tuple[float, float], float, bool]
 
 
 def _of_cell(residual: Vector, expected: Vector) -> _Found:
-    """Stars, mean residual, spread over the expected, and whether the mean is clear."""
+    """Stars of a cell, mean residual, spread over expected, and whether the mean is clear."""
     mean = residual.mean(axis=0)
     error = np.sqrt(np.mean(expected**2, axis=0) / len(residual))
     spread = _spread(residual, expected)
@@ -106,7 +106,7 @@ def _of_cell(residual: Vector, expected: Vector) -> _Found:
 
 
 def _spread(residual: Vector, expected: Vector) -> float:
-    """The root mean square of residuals over what is expected of them; 1 is normal."""
+    """Root mean square of residuals divided by their expected sigmas; normally 1."""
     return float(np.sqrt(np.mean((residual / expected) ** 2)))
 
 
@@ -131,7 +131,7 @@ def _drawn(number: int, found: _Found, radius_deg: float, px_per_arcsec: float) 
 
 
 def arrow(x: float, y: float, along: float, down: float) -> str:
-    """The path of an arrow with its head."""
+    """SVG path of an arrow with its head."""
     length = math.hypot(along, down)
     if length < 1.0:
         return f"M{x:.1f} {y:.1f}h0"
@@ -146,7 +146,7 @@ def arrow(x: float, y: float, along: float, down: float) -> str:
 
 
 def round_below(longest: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is not longer; 0 for nothing."""
+    """Greatest of 1, 2 and 5 times a power of ten up to `longest`; 0 if that is not positive."""
     if longest <= 0.0:
         return 0.0
     power = 10.0 ** math.floor(math.log10(longest))

@@ -1,4 +1,4 @@
-"""Histograms of stars: residuals over their expected sigma, observed against catalog magnitude."""
+"""Histograms of star residuals over expected sigma, and of observed against catalog magnitude."""
 
 import math
 from dataclasses import dataclass
@@ -14,13 +14,13 @@ REACH, STEP = 5.0, 0.5
 
 
 def robust_spread(values: Vector) -> float:
-    """The standard deviation of a normal distribution with the same median absolute deviation."""
+    """Standard deviation of a normal distribution with the same median absolute deviation."""
     return 1.4826 * float(np.median(np.abs(values - np.median(values))))
 
 
 @dataclass(frozen=True)
 class Bar:
-    """One bar: its bounds, the residuals in it, and how many the unit normal would have."""
+    """Bar of a histogram: bounds, count of residuals, and expected count of the unit normal."""
 
     low: float
     high: float
@@ -34,7 +34,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Both components of every residual; `below` and `above` lie beyond the bars."""
+    """Histogram of both components of all residuals; `below` and `above` lie beyond the bars."""
 
     bars: tuple[Bar, ...]
     curve: str
@@ -46,7 +46,7 @@ class Histogram:
     """Sigma of a normal distribution with the same median absolute deviation."""
     mean: float
     spread: float
-    """The standard deviation; 1 where the sigmas are right."""
+    """Standard deviation of the residuals over sigma; 1 with correct sigmas."""
     ticks: tuple[tuple[float, str], ...]
     width: float = WIDTH
     height: float = HEIGHT + FOOT
@@ -54,7 +54,7 @@ class Histogram:
 
 
 def residual_histogram(tracker: TrackerStarsOfPeriod) -> Histogram | None:
-    """The histogram of a tracker; None where no star has a residual."""
+    """Histogram of a tracker's residuals; None if no star has a residual."""
     values = (tracker.residual_arcsec / tracker.expected_arcsec).ravel()
     values = values[np.isfinite(values)]
     if not len(values):
@@ -104,12 +104,12 @@ SIZE = 300.0
 LEFT, PLANE_FOOT = 28.0, 24.0
 CELLS = 40
 SHADES = (1, 2, 4, 8, 16)
-"""Stars in a cell, from which on it has the next shade."""
+"""Numbers of stars at which a cell gets the next shade."""
 
 
 @dataclass(frozen=True)
 class MagnitudeRow:
-    """Stars of one catalog magnitude: their mean offset, observed minus catalog, and spread."""
+    """Stars of one catalog magnitude: mean offset, observed minus catalog, and spread."""
 
     low_mag: float
     stars: int
@@ -119,7 +119,7 @@ class MagnitudeRow:
 
 @dataclass(frozen=True)
 class MagnitudeChart:
-    """The chart; `shades` are paths of cells, from few stars to many."""
+    """Chart of observed against catalog magnitude; `shades` are paths, from few stars to many."""
 
     shades: tuple[str, ...]
     equal: str
@@ -137,7 +137,7 @@ class MagnitudeChart:
 
 
 def magnitude_chart(tracker: TrackerStarsOfPeriod) -> MagnitudeChart | None:
-    """The chart of a tracker; None where no unique star came with a magnitude."""
+    """Magnitude chart of a tracker; None if no unique star has an observed magnitude."""
     known = np.isfinite(tracker.observed_mag)
     observed, catalog = tracker.observed_mag[known], tracker.catalog_mag[known]
     if not len(observed):

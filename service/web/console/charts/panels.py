@@ -1,4 +1,4 @@
-"""Panels of one axis: traces, a band, marks, on a linear or logarithmic scale; strips."""
+"""Panels of one axis of a chart: traces, a band and marks on a linear or logarithmic scale."""
 
 import math
 from collections.abc import Sequence
@@ -14,10 +14,10 @@ from service.vectors import Vector
 
 Mask = npt.NDArray[np.bool_]
 WIDTH, HEIGHT = 1280, 176
-"""Units of a panel, which is drawn half as large."""
+"""Width and height of a panel in units, two per pixel."""
 PAD = 10
 FINE_HEIGHT = 10 * HEIGHT
-"""The height of panels whose values are read to a thousandth of their range."""
+"""Height of panels whose values can be read to a thousandth of their range."""
 TIME_STEPS_S = (
     *(1, 2, 5, 10, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 3 * 3600, 6 * 3600, 12 * 3600),
     *(days * DAY_S for days in (1, 2, 7, 14, 28, 56, 91, 182)),
@@ -25,12 +25,12 @@ TIME_STEPS_S = (
 MOST_TICKS = 4
 EDGE_PERCENT = 5.0
 ROOM = 0.04
-"""Above the greatest and below the least value, of the height."""
+"""Space above the greatest and below the least value, as a part of the height."""
 
 
 @dataclass(frozen=True)
 class Trace:
-    """A path of one kind, such as a grade: `line` for joined values, `dots` for lone ones."""
+    """SVG path of one kind of values: `line` for joined values, `dots` for lone ones."""
 
     kind: str
     line: str
@@ -39,19 +39,19 @@ class Trace:
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """The period that a chart shows."""
+    """Time axis of a chart: its period."""
 
     start: Utc
     end: Utc
 
     def x(self, time_ns: Integers) -> Integers:
-        """Units from the left edge (n,)."""
+        """Units (n,) from the left edge."""
         length = max(self.end.tai_ns - self.start.tai_ns, 1)
         along = np.clip((time_ns - self.start.tai_ns) / length, 0.0, 1.0)
         return np.asarray(np.rint(PAD + along * (WIDTH - 2 * PAD)).astype(np.int64))
 
     def ticks(self) -> list[tuple[float, str]]:
-        """Round times of the period: percent from the left, and their text in UTC."""
+        """Round times of the period: percent from the left, and text in UTC."""
         length_s = (self.end.tai_ns - self.start.tai_ns) * 1e-9
         step_s = next((step for step in TIME_STEPS_S if length_s <= MOST_TICKS * step), None)
         if step_s is None or length_s <= 0.0:
@@ -69,7 +69,7 @@ class TimeAxis:
 
 @dataclass(frozen=True)
 class Scale:
-    """A scale from values to heights; logarithmic or linear, between `low` and `high`."""
+    """Scale from values to heights, logarithmic or linear, between `low` and `high`."""
 
     low: float
     high: float
@@ -77,7 +77,7 @@ class Scale:
     height: int = HEIGHT
 
     def ticks(self) -> list[float]:
-        """Two to five round values of the scale; powers of ten of a logarithmic one."""
+        """Two to five round values of the scale; for a logarithmic one, powers of ten."""
         low, high = self.low, self.high
         if self.is_log:
             powers = range(math.ceil(math.log10(low)), math.floor(math.log10(high)) + 1)
@@ -91,11 +91,11 @@ class Scale:
 
     @property
     def range_with_room(self) -> float:
-        """The range of values from the upper to the lower edge of a linear scale."""
+        """Range of values between the upper and the lower edge of a linear scale."""
         return self.high - self.low + 2.0 * (ROOM * (self.high - self.low) or 1.0)
 
     def y(self, value: Vector) -> Integers:
-        """Units from the top (n,); values beyond an edge are at it."""
+        """Units (n,) from the top; values beyond an edge are placed at it."""
         low, high = self.low, self.high
         if self.is_log:
             value, low, high = np.log(np.maximum(value, low)), np.log(low), np.log(high)
@@ -107,14 +107,14 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Values:
-    """Values of one axis at moments; `joins` (n,): whether each is joined with the one before."""
+    """Values of one axis with times; `joins` (n,) marks those joined with the previous one."""
 
     time_ns: Integers
     value: Vector
     joins: Mask = field(default_factory=lambda: np.zeros(0, dtype=bool))
 
     def trace(self, kind: str, axis: TimeAxis, scale: Scale) -> Trace:
-        """The path of the values; of those that are unknown there is none."""
+        """SVG paths of the values; unknown ones are left out."""
         known = np.isfinite(self.value)
         joins = self.joins if len(self.joins) else np.zeros(len(known), dtype=bool)
         # One that follows an unknown one begins a part.
@@ -129,13 +129,13 @@ class Values:
 
 
 def line_path(x: Integers, y: Integers) -> str:
-    """A path in whole units, each step from the point before."""
+    """SVG path in whole units, each step relative to the previous point."""
     steps = zip(np.diff(x).tolist(), np.diff(y).tolist(), strict=True)
     return f"M{x[0]} {y[0]}" + "".join(f"l{a} {b}" for a, b in steps)
 
 
 def band_path(x: Integers, upper: Integers, lower: Integers, parts: Sequence[Integers]) -> str:
-    """The area between two lines; a bar where a part has one point."""
+    """SVG path of the area between two lines; a bar for a part of one point."""
     text = []
     for part in parts:
         if len(part) == 1:
@@ -149,7 +149,7 @@ def band_path(x: Integers, upper: Integers, lower: Integers, parts: Sequence[Int
 
 
 def parts_of(joins: Mask) -> list[Integers]:
-    """The places of each joined part."""
+    """Indices of each joined part."""
     if not len(joins):
         return []
     return np.split(np.arange(len(joins)), np.flatnonzero(~joins[1:]) + 1)
@@ -158,7 +158,7 @@ def parts_of(joins: Mask) -> list[Integers]:
 def band_of(
     time_ns: Integers, low: Vector, high: Vector, joins: Mask, axis: TimeAxis, scale: Scale
 ) -> str:
-    """The area between two lines, where both are known."""
+    """SVG path of the area between two lines where both are known."""
     known = np.isfinite(low) & np.isfinite(high)
     joins = (joins & np.append(False, known[:-1])[: len(known)])[known]
     if not len(joins):

@@ -1,4 +1,4 @@
-"""The geometry of the picture of a star field: places, sizes, arrows and labels in pixels.
+"""Geometry of the picture of a star field: positions, sizes, arrows and labels in pixels.
 
 The picture is the tracker's tangent plane, h to the right and v upwards, as
 the tracker sees the sky.
@@ -13,13 +13,13 @@ import numpy as np
 from service.storage.queries.star_field import Boresight, ObservedStarPlace, TrackerField
 
 SIZE = 640
-"""Width and height of the picture."""
+"""Width and height of the picture, in pixels."""
 FIELD_MARGIN = 1.12
 LONGEST_ARROW = 70.0
-"""Pixels of the longest residual arrow."""
+"""Length of the longest residual arrow, in pixels."""
 ROUND = (1.0, 2.0, 5.0)
 MARK_RADIUS = 13.0
-"""The radius of the mark about an observed star; a triangle's corners reach a little farther."""
+"""Radius of the mark about an observed star; a triangle's corners reach slightly farther."""
 RIVAL_MARGIN = 6.0
 
 
@@ -30,29 +30,29 @@ RIVAL_MARGIN = 6.0
 
 Place = tuple[float, float]
 Box = tuple[float, float, float, float]
-"""Left, top, right, bottom."""
+"""Left, top, right and bottom of a box."""
 Circle = tuple[float, float, float]
-"""Centre and radius."""
+"""Centre and radius of a circle."""
 
 GAPS = (14.0, 22.0, 32.0, 44.0, 60.0)
-"""Pixels from a star to its text, the nearest first."""
+"""Distances in pixels from a star to its label, the nearest first."""
 ASIDE = 0.75
-"""The share of the gap, where the text stands diagonally from its star."""
+"""Part of the gap used if the label is placed diagonally from its star."""
 ABOUT_NUMBERS = ((-1, -1), (1, -1), (-1, 1), (1, 1), (-1, 0), (1, 0), (0, -1), (0, 1))
 ABOUT_NAMES = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0), (0, 1), (0, -1))
-"""Directions from a star, to the right and downwards, the best first."""
+"""Directions from a star for its label, to the right and downwards, the best first."""
 ANCHORS = {-1: "end", 0: "middle", 1: "start"}
 EDGE = 3.0
-"""Pixels that a text stays away from the edge of the picture."""
+"""Least distance in pixels of a label from the edge of the picture."""
 MOST = 200
-"""Labels for which a place is looked for: more fill the picture, and would take seconds."""
+"""Greatest number of placed labels: more would fill the picture, and take seconds."""
 CELL = 2.0
-"""Pixels of a cell of the map of what is taken."""
+"""Size in pixels of the cells of the map of occupied places."""
 
 
 @dataclass(frozen=True)
 class Font:
-    """The size of a text, in pixels."""
+    """Size of a font in pixels."""
 
     character: float
     height: float
@@ -64,7 +64,7 @@ NAME = Font(7.2, 14.5)
 
 @dataclass(frozen=True)
 class Label:
-    """A text with the place of its baseline; `anchor` as SVG's `text-anchor`."""
+    """Placed text with the position of its baseline; `anchor` as SVG's `text-anchor`."""
 
     text: str
     x: float
@@ -74,7 +74,7 @@ class Label:
 
 
 class Labels:
-    """The labels of one picture, placed one after the other.
+    """Labels of one picture, placed one after the other on a map of occupied cells.
 
     What is taken is kept as a map of the picture.
     """
@@ -82,7 +82,7 @@ class Labels:
     def __init__(
         self, size: float, marks: Iterable[Circle], taken: Iterable[Box], lines: Iterable[Place]
     ) -> None:
-        """Labels keep off the `marks` and what is `taken`, and off the `lines` if possible."""
+        """Keep labels off the `marks` and the `taken` boxes, and off the `lines` if possible."""
         self._size = size
         self._count = 0
         cells = math.ceil(size / CELL)
@@ -99,12 +99,12 @@ class Labels:
             self._lines[_cells((x, y, x, y))] = True
 
     def number(self, text: str, at: Place) -> Label:
-        """The place of a number, which must stand somewhere: over another one if all is full."""
+        """Place a number, over another one if all places are occupied."""
         first = next(_places(text, at, NUMBER, ABOUT_NUMBERS))
         return self._take(self._free(_places(text, at, NUMBER, ABOUT_NUMBERS)) or first)
 
     def name(self, text: str, at: Place) -> Label | None:
-        """The place of a name; None where there is none, since the table has it by its number."""
+        """Place a name; None if there is no room, since the table has the name by its number."""
         found = self._free(_places(text, at, NAME, ABOUT_NAMES))
         return found and self._take(found)
 
@@ -130,13 +130,13 @@ class Labels:
 
 
 def text_box(text: str, x: float, y: float, font: Font = NAME) -> Box:
-    """The box of a text that begins at the place of its baseline."""
+    """Box of a text that begins at the position of its baseline."""
     top = y - 0.8 * font.height
     return x, top, x + font.character * len(text), top + font.height
 
 
 def points_along(start: Place, end: Place, step: float = 5.0) -> list[Place]:
-    """Points of a line."""
+    """Points along a line at most one step apart."""
     (x1, y1), (x2, y2) = start, end
     count = 1 + int(max(abs(x2 - x1), abs(y2 - y1)) / step)
     return [(x1 + (x2 - x1) * k / count, y1 + (y2 - y1) * k / count) for k in range(count + 1)]
@@ -158,7 +158,7 @@ def _places(
 
 
 def _cells(box: Box) -> tuple[slice, slice]:
-    """The cells that a box lies in, those that it touches included; none beyond the edge."""
+    """Cells that a box touches, up to the edge of the picture."""
     left, top, right, bottom = (max(0, math.floor(each / CELL)) for each in box)
     return slice(top, bottom + 1), slice(left, right + 1)
 
@@ -167,12 +167,12 @@ AXES: tuple[Box, ...] = (
     (SIZE - 30.0, SIZE / 2 - 20.0, SIZE, SIZE / 2 - 2.0),
     (SIZE / 2, 0.0, SIZE / 2 + 34.0, 18.0),
 )
-"""The boxes of the names of the axes."""
+"""Boxes of the axis names."""
 
 
 @dataclass(frozen=True)
 class CatalogStar:
-    """A star of the zone; `role` is chosen, rival or none."""
+    """Catalog star of the zone; `role` is chosen, rival or none."""
 
     id: str
     magnitude: float
@@ -184,7 +184,7 @@ class CatalogStar:
 
 @dataclass(frozen=True)
 class ChartLine:
-    """A line from one place to another."""
+    """Straight line between two positions of the picture."""
 
     x1: float
     y1: float
@@ -194,7 +194,7 @@ class ChartLine:
 
 @dataclass(frozen=True)
 class ObservedStar:
-    """An observed star with its number, its residual arrow and its lines to rivals."""
+    """Observed star with its number, residual arrow, and lines to rivals."""
 
     number: int
     outcome: str
@@ -210,20 +210,20 @@ class ObservedStar:
 
 @dataclass(frozen=True)
 class Ring:
-    """A circle of the grid with its label."""
+    """Circle of the grid with its label."""
 
     radius: float
     label: str
 
     @property
     def label_at(self) -> tuple[float, float]:
-        """The point where the label begins: at the top of the circle."""
+        """Position where the label begins: at the top of the circle."""
         return SIZE / 2 + 3, SIZE / 2 - self.radius - 3
 
 
 @dataclass(frozen=True)
 class SkyChart:
-    """One tracker's picture; `key_px` is the length of the arrow that stands for `key_arcsec`."""
+    """Picture of one tracker's field; an arrow of `key_px` represents `key_arcsec`."""
 
     tracker: str
     boresight: Boresight
@@ -242,29 +242,29 @@ class SkyChart:
 
 @dataclass(frozen=True)
 class _Projection:
-    """The gnomonic projection of a chart, whose radius is `radius_deg`, to pixels."""
+    """Gnomonic projection to the pixels of a chart with the radius `radius_deg`."""
 
     radius_deg: float
 
     @property
     def scale(self) -> float:
-        """Pixels of the tangent of an angle of 45 degrees."""
+        """Length in pixels of the tangent of 45 degrees."""
         return SIZE / 2 / math.tan(math.radians(self.radius_deg))
 
     def place(self, h_deg: float, v_deg: float) -> Place:
-        """The pixel of a direction: x to the right, y downwards."""
+        """Pixel position of a direction: x to the right, y downwards."""
         x = SIZE / 2 + self.scale * math.tan(math.radians(h_deg))
         return x, SIZE / 2 - self.scale * math.tan(math.radians(v_deg))
 
     def ring(self, radius_deg: float) -> Ring:
-        """A circle about the boresight."""
+        """Circle about the boresight."""
         return Ring(self.scale * math.tan(math.radians(radius_deg)), f"{radius_deg:g}°")
 
 
 def sky_chart(tracker: TrackerField, through: str, view: str = "all") -> SkyChart:
-    """The chart of one tracker of a star field (see `star_field.star_field_of`).
+    """Chart of one tracker of a star field (see `star_field.star_field_of`).
 
-    `view` is "all", which shows everything that the answer names, or "field" of view.
+    `view` is "all", for everything that the answer names, or "field" of view.
     """
     field_deg = tracker.field_of_view_radius_deg
     limit_mag = tracker.magnitude_limit_mag
@@ -367,12 +367,12 @@ def _arrow(
 
 
 def star_radius(magnitude_mag: float, limit_mag: float) -> float:
-    """Pixels of a star's disc: a magnitude brighter is 0.9 px more, the faintest are still seen."""
+    """Radius of a star's disc in pixels: 0.9 px more per magnitude; the faintest stay visible."""
     return min(9.0, 1.3 + 0.9 * max(0.0, limit_mag - magnitude_mag))
 
 
 def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
-    """Pixels per arcsecond, and a round length for the key that is no longer than the longest."""
+    """Pixels per arcsecond, and a round length for the key, at most the longest residual."""
     longest = max(lengths_arcsec, default=0.0)
     if longest <= 0.0:
         return 0.0, None
@@ -382,14 +382,14 @@ def _arrow_scale(lengths_arcsec: Sequence[float]) -> tuple[float, float | None]:
 
 
 def _rings(radius_deg: float, field_deg: float) -> list[float]:
-    """Two or three round radii within the picture, other than the field of view's own."""
+    """Two or three round radii within the picture, apart from the edge of the field of view."""
     step = next(s for s in (0.25, 0.5, 1.0, 2.0, 5.0, 10.0) if radius_deg / s <= 4.0)
     count = int(radius_deg / step)
     return [step * k for k in range(1, count + 1) if abs(step * k - field_deg) > step / 4]
 
 
 def _head(arrow: ChartLine) -> str:
-    """The corners of an arrow's head."""
+    """Corner points of an arrow's head."""
     length = math.hypot(arrow.x2 - arrow.x1, arrow.y2 - arrow.y1)
     if length == 0.0:
         return ""

@@ -1,4 +1,4 @@
-"""Shares over time: the geometry of a sparkline, and a heat map that the browser draws."""
+"""Shares over time: geometry of a sparkline, and bytes of a heat map that the browser draws."""
 
 import base64
 from collections.abc import Mapping
@@ -11,12 +11,12 @@ from service.vectors import Matrix, Vector
 WIDTH, HEIGHT = 152, 38
 PAD = 2
 TOPS = (0.05, 0.1, 0.25, 0.5, 1.0)
-"""Values for the top of a sparkline: a handful of stars shall not look like a lot."""
+"""Possible top values of a sparkline, so that few stars do not look like many."""
 
 
 @dataclass(frozen=True)
 class SparklineDrawing:
-    """A path for each quantity; a lone cell is a dot, drawn as a line without length."""
+    """SVG path for each quantity; a lone cell is a dot, drawn as a line of zero length."""
 
     paths: Mapping[str, str]
     width: int
@@ -24,20 +24,20 @@ class SparklineDrawing:
 
 
 def common_top(greatest: float) -> float:
-    """The share that the top of every sparkline of a page stands for."""
+    """Share at the top of every sparkline of a page."""
     return next(top for top in TOPS if greatest <= top or top == TOPS[-1])
 
 
 def sparkline(
     shares: Mapping[str, Vector], top: float, width: int = WIDTH, height: int = HEIGHT
 ) -> SparklineDrawing:
-    """The picture of shares in cells of equal width; NaN where there was no batch."""
+    """Sparkline of shares in cells of equal width; NaN marks a cell without a batch."""
     paths = {name: _path(values, top, width, height) for name, values in shares.items()}
     return SparklineDrawing(paths, width, height)
 
 
 def _path(values: Vector, top: float, width: int, height: int) -> str:
-    """Whole pixels, relative to the point before: a fleet's page has thousands of points."""
+    """SVG path in whole, relative pixels: a fleet's page has thousands of points."""
     known = np.isfinite(values)
     step = (width - 2 * PAD) / max(len(values) - 1, 1)
     xs = np.rint(PAD + step * np.arange(len(values))).astype(int).tolist()
@@ -59,17 +59,17 @@ def _path(values: Vector, top: float, width: int, height: int) -> str:
 
 
 def _level(length: int, is_end: bool, text: list[str]) -> list[str]:
-    """A level line of that length; none of no length, but a dot where a part has one point."""
+    """Horizontal step of a length: none of zero length, except the dot of a lone point."""
     is_lone = is_end and bool(text) and text[-1].startswith("M")
     return [f"h{length}"] if length or is_lone else []
 
 
 LEVELS = 254
-"""Steps of a share; a cell of 0 had no batch, one of 1 has the share 0."""
+"""Number of levels of a share; level 0 means no batch, level 1 the share 0."""
 
 
 def packed(shares: Matrix) -> str:
-    """A byte for each cell, row by row, as base64; NaN where there was no batch."""
+    """Shares as one byte per cell, row by row, in base64; NaN marks a cell without a batch."""
     known = np.isfinite(shares)
     levels = 1 + np.rint(np.clip(np.where(known, shares, 0.0), 0.0, 1.0) * LEVELS)
     return base64.b64encode(np.where(known, levels, 0).astype(np.uint8).tobytes()).decode()

@@ -1,4 +1,4 @@
-"""The page about the service: whether it is well, versions, catalog, missions, credits."""
+"""Page about the service: health, versions, catalog, missions, credits."""
 
 import resource
 import shutil
@@ -24,16 +24,16 @@ from service.web.console.page import (
 from service.web.requests.access import Policy
 
 LEAST_FREE = 0.1
-"""The share of the disk, and of the memory, below which there is little room left."""
+"""Free part of the disk, and of the memory, below which the page warns."""
 MEMORY, OWN_MEMORY = Path("/proc/meminfo"), Path("/proc/self/statm")
-"""Files of Linux alone; elsewhere the page has no line about memory."""
+"""Files that exist on Linux only; elsewhere the page has no line about memory."""
 SLOW_QUEUE_S = 5.0
 ENDS_SOON_S = 30 * 86_400.0
 
 
 @dataclass(frozen=True)
 class Check:
-    """One thing that must be well: what it is, how it is, and what to do where it is not."""
+    """Health check: its subject, its state, and the remedy for a fault."""
 
     name: str
     value: str
@@ -43,7 +43,7 @@ class Check:
 
 @console_page("/about", "Service", Policy("read", "nothing"), position=80)
 def about_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """The service's health, version, catalog, missions, database and credits."""
+    """Page with the service's health, version, catalog, missions, database and credits."""
     about = context.app.service.about(context.caller.spacecraft)
     # Queues, machine and cache tell what others send: a token of some spacecraft sees none.
     sees_all = context.caller.spacecraft is None

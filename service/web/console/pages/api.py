@@ -1,4 +1,4 @@
-"""The API's description for people, and what the `type` of each problem means."""
+"""Pages that describe the API and each `type` of problem."""
 
 import html
 import json
@@ -28,7 +28,7 @@ from service.web.requests.problems import types_with_pages
 
 @console_page("/docs", "API", OPEN)
 def api_page(request: Request, query: FromQuery[PageQuery]) -> Response:
-    """Every route of the API with its parameters, answers and examples."""
+    """Page with every route of the API: parameters, answers and examples."""
     layout = open_layout(query.run, "API", "/docs")
     shown = _operations(request.app)
     return rendered("api.html.jinja", layout, heading="API", reference=shown)
@@ -36,7 +36,7 @@ def api_page(request: Request, query: FromQuery[PageQuery]) -> Response:
 
 @console_page("/docs/shapes", "API shapes", OPEN, section="/docs")
 def api_shapes_page(request: Request, query: FromQuery[PageQuery]) -> Response:
-    """The shapes of requests and answers, field by field."""
+    """Page with the schemas of requests and answers, field by field."""
     layout = open_layout(query.run, "API shapes", "/docs")
     shown = _shapes(request.app)
     return rendered("api.html.jinja", layout, heading="API: shapes", reference=shown)
@@ -71,7 +71,7 @@ def _shapes(app: FastAPI) -> Markup:
 
 @console_page("/problems", "Problems", OPEN, section="/docs")
 def problems_page(query: FromQuery[PageQuery]) -> Response:
-    """Every type of problem."""
+    """Page with every type of problem."""
     kinds = list(types_with_pages().values())
     return rendered(
         "problems.html.jinja",
@@ -83,7 +83,7 @@ def problems_page(query: FromQuery[PageQuery]) -> Response:
 
 @console_page("/problems/{slug}", "Problem", OPEN, section="/docs")
 def problem_page(slug: str, query: FromQuery[PageQuery]) -> Response:
-    """One type of problem."""
+    """Page about one type of problem."""
     kind = types_with_pages().get(slug)
     if kind is None:
         known = ", ".join(types_with_pages())
@@ -107,12 +107,12 @@ _HIGH = {"maximum": "to ", "exclusiveMaximum": "below ", "maxLength": "length to
 
 
 def prose(text: str) -> Markup:
-    """A description, with what stands between backticks as code."""
+    """HTML of a description, with code for texts between backticks."""
     return Markup(_CODE.sub(r"<code>\1</code>", str(escape(text))))
 
 
 def kind_of(schema: Json) -> Markup:
-    """A schema in words, with links to the shapes that it names."""
+    """HTML that describes a schema in words, with links to the schemas that it names."""
     if "$ref" in schema:
         name = schema["$ref"].removeprefix(SCHEMAS)
         return Markup('<a href="/docs/shapes#{0}">{0}</a>').format(name)

@@ -1,4 +1,4 @@
-"""The page of missions: their settings with history."""
+"""Page of missions: their settings with history."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from service.web.console.page import ContextDep, FromQuery, PageQuery, console_p
 from service.web.requests.access import Policy
 
 MOST_SHOWN = 8
-"""Missions whose settings are shown whole without being asked for."""
+"""Greatest number of missions whose settings are all shown without a choice."""
 
 
 @dataclass(frozen=True)
 class SettingDifference:
-    """One setting that changed; None where it did not exist."""
+    """Setting that changed; None on the side where it did not exist."""
 
     name: str
     before: Any
@@ -27,7 +27,7 @@ class SettingDifference:
 
     @property
     def factor(self) -> float | None:
-        """How many times the old number the new one is; None where either is no number."""
+        """Ratio of the new number to the old one; None unless both are numbers."""
         numbers = [
             each
             for each in (self.before, self.after)
@@ -38,7 +38,7 @@ class SettingDifference:
 
 @dataclass(frozen=True)
 class SettingsEntry:
-    """Settings that came into force, and how they differ from those before them."""
+    """Version of a mission's settings, and its differences from the previous one."""
 
     digest: str
     since: str
@@ -47,14 +47,14 @@ class SettingsEntry:
 
 
 class MissionsQuery(PageQuery):
-    """Whose settings are shown whole; an empty field stands for every mission."""
+    """Mission whose settings are shown in full; an empty field selects every mission."""
 
     spacecraft: Key | Literal[""] = ""
 
 
 @console_page("/missions", "Missions", Policy("read", "nothing"), position=70)
 def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Response:
-    """Settings with their history: of a few missions all, of many those of the chosen one."""
+    """Page with settings and their history, for all of a few missions, or for the chosen one."""
     if query.spacecraft:
         context.caller.require(query.spacecraft)
         context.app.context.mission(query.spacecraft)
@@ -95,7 +95,7 @@ def missions_page(query: FromQuery[MissionsQuery], context: ContextDep) -> Respo
 
 
 def _sections(settings: Mapping[str, Any]) -> Iterator[tuple[str, list[tuple[str, Any]]]]:
-    """Titles with their settings, flat: a tracker is a section of its own."""
+    """Titles with flat settings; each tracker is a section of its own."""
     plain = [(k, v) for k, v in settings.items() if not isinstance(v, dict | list)]
     yield "general", [each for each in plain if each[0] not in ("name", "description")]
     for name, value in settings.items():

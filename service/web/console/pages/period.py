@@ -1,4 +1,4 @@
-"""The pages of a period of a spacecraft: stars and attitudes, and the definitive attitude."""
+"""Pages for a period of a spacecraft: stars and attitudes, and the definitive attitude."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ from service.web.requests.access import Policy
 
 @dataclass(frozen=True)
 class TrackerCharts:
-    """The charts of one tracker; None where it has no data for one."""
+    """Charts of one tracker; None for each without data."""
 
     tracker: str
     sigma_arcsec: float
@@ -39,7 +39,7 @@ class TrackerCharts:
     "/spacecraft/{name}/period", "Sky, residuals, rates", Policy("read", "path"), section="/"
 )
 def period_page(name: str, query: FromQuery[SpacecraftQuery], context: ContextDep) -> Response:
-    """Pointing of each tracker, fit of its stars, and rates of the spacecraft."""
+    """Page with pointing of each tracker, fit of its stars, and rates of the spacecraft."""
     mission = context.app.context.mission(name)
     retired = context.app.context.retired.trackers.get(name, ())
     if query.tracker is not None and query.tracker not in retired:
@@ -81,7 +81,7 @@ def _tracker_charts(tracker: TrackerStarsOfPeriod) -> TrackerCharts:
 
 
 def without_gyro(context: PageContext, name: str, run: str, shown: ShownPeriod) -> str:
-    """What a filter lacks in a period, and what that means; empty where it has gyro data."""
+    """Missing inputs of a filter in a period, with their effect; empty with gyro data."""
     if context.app.gyro.page(name, run=run, start=shown.start, end=shown.end, limit=1).items:
         return ""
     mission = context.app.context.known[name]

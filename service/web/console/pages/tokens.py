@@ -1,4 +1,4 @@
-"""The pages of operators: tokens, the audit list of changes, and signing in."""
+"""Pages for operators: tokens, the audit list of changes, and sign-in."""
 
 from typing import Annotated
 
@@ -21,7 +21,7 @@ ROWS = 100
 
 
 class AuditPageQuery(PageQuery):
-    """Which changes, and where the page of the list begins."""
+    """Query that selects changes and the beginning of the list's page."""
 
     person: Annotated[str, Field(max_length=80)] = ""
     action: Annotated[str, Field(max_length=64)] = ""
@@ -31,7 +31,7 @@ class AuditPageQuery(PageQuery):
 
 @console_page("/audit", "Audit list", OPERATE, section="/about")
 def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Response:
-    """Who changed what and when, the newest first."""
+    """Page of the audit list: who changed what and when, the newest first."""
     with context.app.context.reading() as connection:
         page = list_entries(
             connection,
@@ -47,7 +47,7 @@ def audit_page(query: FromQuery[AuditPageQuery], context: ContextDep) -> Respons
 
 @console_page("/tokens", "Tokens", OPERATE, section="/about")
 def tokens_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
-    """Every token without its secret."""
+    """Page of all tokens, without secrets."""
     return context.rendered(
         "tokens.html.jinja",
         query.run,
@@ -60,16 +60,16 @@ def tokens_page(query: FromQuery[PageQuery], context: ContextDep) -> Response:
 
 
 OWN_PATH = r"^/([^/\\\x00-\x20][^\\\x00-\x20]*)?$"
-"""A second slash, or a backslash that browsers take for one, would name another host."""
+"""Pattern of a path of this service; a second slash or a backslash would name another host."""
 
 
 class SignInQuery(Query):
-    """The page to open after sign-in: a path of this service, never another host's address."""
+    """Path of this service to open after sign-in; never another host's address."""
 
     next: Annotated[str, Field(max_length=2000, pattern=OWN_PATH)] = "/"
 
 
 @console_page("/sign-in", "Sign in", OPEN)
 def sign_in_page(query: FromQuery[SignInQuery]) -> Response:
-    """Ask for a token."""
+    """Page that asks for a token."""
     return rendered("sign-in.html.jinja", EMPTY_LAYOUT, next=query.next)
