@@ -1,1 +1,1 @@
-"""HTTP: the API, the console, and the server."""
+"""HTTP layer of the service: the API, the console, and the server."""

@@ -1,4 +1,4 @@
-"""The app, put together in one place."""
+"""Assembly of the web application: routes, middleware, lifespan, error handlers."""
 
 import asyncio
 import json
@@ -48,7 +48,7 @@ from service.web.requests.request_body import DEFAULT_LIMITS, BodyBudget, BodyLi
 log = logging.getLogger(__name__)
 
 WORKER_THREADS = 64
-"""Handlers run in threads; those of repeated frames wait there for the first."""
+"""Number of threads for request handlers; handlers of repeated frames wait in them."""
 
 ROUTERS: tuple[APIRouter, ...] = (
     batches.router,
@@ -66,17 +66,17 @@ ROUTERS: tuple[APIRouter, ...] = (
 )
 
 COMPRESS_LEVEL = 4
-"""The level of gzip: a third of the time of its default, for 7 % more bytes of a list."""
+"""gzip compression level: a third of the default's time, for 7 % more bytes of a list."""
 
 COMPRESSED = (*DEFAULT_EXCLUDED_CONTENT_TYPES, TABLE_FORMATS["parquet"].media_type)
-"""Media types that are compressed by themselves, or are streams of events."""
+"""Media types that are sent uncompressed: compressed formats and event streams."""
 
 DIRECT = (batches.submit_batch,)
-"""Handlers that are asked by the thousand a second: see `AroundRequests`."""
+"""Handlers called thousands of times per second, without routing: see `AroundRequests`."""
 
 
 def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
-    """The web app over an open `App`, which it closes after its last request."""
+    """Create the web application of an open `App`, which is closed after the last request."""
 
     @asynccontextmanager
     async def lifespan(web_app: FastAPI) -> AsyncIterator[None]:
@@ -138,7 +138,7 @@ def create_app(app: App, limits: BodyLimits = DEFAULT_LIMITS) -> FastAPI:
 
 
 def bare_app(features_off: str = "") -> FastAPI:
-    """The app without anything behind it: enough to describe it."""
+    """Web application without a service behind it, sufficient for its OpenAPI description."""
     feature_modules("pages", features_off)
     features = feature_modules("routes", features_off)
     of_features = [router for each in features for router in each.ROUTERS]
@@ -182,10 +182,10 @@ TRY_AGAIN_S = 1.0
 
 
 async def report_to_supervisor(app: App) -> None:
-    """Report ready once the service is, and then that it is alive as often as is asked.
+    """Report readiness to systemd, and then liveness as often as the watchdog requires.
 
-    It runs until it is cancelled.  A loop that stands, or a writer's thread that does not
-    go on, sends nothing more: systemd then restarts the service (`WatchdogSec`).
+    Runs until cancelled.  A blocked event loop or writer thread stops the reports: systemd then
+    restarts the service (`WatchdogSec`).
     """
     if "NOTIFY_SOCKET" not in os.environ:
         return
@@ -206,7 +206,7 @@ async def report_to_supervisor(app: App) -> None:
 
 
 def notify_supervisor(message: str) -> None:
-    """Send lines such as `READY=1`; nothing where no socket is named."""
+    """Send lines such as `READY=1` to the supervisor's socket, if the environment names one."""
     address = os.environ.get("NOTIFY_SOCKET", "")
     if not address:
         return
@@ -231,7 +231,7 @@ def _is_ready(app: App) -> bool:
 
 
 class _Dumper(yaml.SafeDumper):
-    """Writes text of several lines as it stands."""
+    """YAML writer that keeps multi-line texts as literal blocks."""
 
 
 def _text(dumper: yaml.SafeDumper, text: str) -> yaml.ScalarNode:
@@ -243,7 +243,7 @@ _Dumper.add_representer(str, _text)
 
 
 def openapi_yaml() -> str:
-    """The text of `openapi.yaml`, made without a running service."""
+    """Text of `openapi.yaml`, made without a running service."""
     # Once through JSON: YAML would mark what is shared between places.
     plain = json.loads(json.dumps(bare_app().openapi()))
     return str(yaml.dump(plain, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=100))

@@ -1,4 +1,4 @@
-"""Live events: recorded events, sent to every listener without a gap.
+"""Distribution of recorded events to all listeners of event streams, without gaps.
 
 One task reads new events, at once when they were recorded and every second, should another
 process not have been heard.  The latest are held in memory; each listener takes them
@@ -25,13 +25,13 @@ HELD = 2_000
 READ_AT_ONCE = 500
 POLL_S = 1.0
 GATHER_S = 0.05
-"""The wait after a commit: under load many are read at once."""
+"""Delay after a commit in seconds, so that many events are read at once under load."""
 HEARTBEAT_S = 15.0
 LONGEST_S = 900.0
-"""The duration of one stream; the listener then connects again, and is authenticated anew."""
+"""Duration of one stream in seconds; the listener then connects and authenticates again."""
 MAX_LISTENERS = 100
 MAX_OF_ONE_TOKEN = 10
-"""Streams at a time: some pages in some browsers, and no more that would keep out others."""
+"""Greatest number of simultaneous event streams of one token, so that others have room."""
 ADMITTED_EVERY_S = 1.0
 """Interval of checks in the database that listeners of events still have access, in seconds."""
 RETRY_MS = 2_000
@@ -43,7 +43,7 @@ T = TypeVar("T")
 
 @dataclass(eq=False)
 class Listener:
-    """A client of a stream, and the token or session that it presented."""
+    """A client of an event stream, with the token or session that it presented."""
 
     caller: Caller
     token: str | None = None
@@ -52,7 +52,7 @@ class Listener:
 
 
 class Live:
-    """The events of the records, for any number of listeners up to a bound."""
+    """Reads recorded events and serves them to a bounded number of listeners."""
 
     def __init__(self, app: App) -> None:
         self._app = app
@@ -66,7 +66,7 @@ class Live:
         self._threads = CapacityLimiter(4)
 
     async def start(self) -> None:
-        """Begin to follow the records."""
+        """Start to follow recorded events."""
         self._poke = self._app.store.writer.bell.subscribe()
         self._last = await self._read(self._app.events.last)
         self._tasks = [
@@ -74,12 +74,12 @@ class Live:
         ]
 
     def stop(self) -> None:
-        """End every stream; new ones are refused."""
+        """End all event streams, and refuse new ones."""
         self._stopping = True
         self._tell()
 
     async def close(self) -> None:
-        """Stop following."""
+        """Stop to follow recorded events, and end all streams."""
         self.stop()
         if self._tasks:
             self._app.store.writer.bell.unsubscribe(self._poke)
@@ -121,7 +121,7 @@ class Live:
         return self._lines(listener, begin, last, run, spacecraft)
 
     def leave(self, listener: Listener) -> None:
-        """Make room for another listener."""
+        """Remove a listener, which makes room for another."""
         self._listeners.discard(listener)
 
     async def _lines(
@@ -184,7 +184,7 @@ class Live:
                 log.warning("events could not be read: %s", error)
 
     async def _end_what_is_revoked(self) -> None:
-        """End the streams of tokens and sessions that were revoked or are past their time."""
+        """End the streams of revoked or expired tokens and sessions."""
         while True:
             await asyncio.sleep(ADMITTED_EVERY_S)
             asked = {(each.token, each.session) for each in self._listeners}

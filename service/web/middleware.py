@@ -41,7 +41,7 @@ _NO_SNIFF = (b"x-content-type-options", b"nosniff")
 
 
 class AroundRequests:
-    """Times every request, answers HEAD as GET without its body, and forbids type guessing.
+    """Outermost middleware: times requests, answers HEAD as GET without body, forbids sniffing.
 
     While access is open, a request for a host of another name is refused: the
     page of another site could otherwise resolve its own name to this machine.
@@ -65,7 +65,7 @@ class AroundRequests:
         body_budget: BodyBudget,
         direct: Mapping[tuple[str, str], APIRoute],
     ) -> None:
-        """`direct` has routes by method and path; their handlers take only the request."""
+        """Keep `direct`, routes by method and path whose handlers take only the request."""
         self.app = app
         self.metrics = metrics
         self.access = access
@@ -73,7 +73,7 @@ class AroundRequests:
         self.direct = direct
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request; pass on other events."""
+        """Serve one HTTP request; pass on other ASGI events."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -183,7 +183,7 @@ class AroundRequests:
 
 
 class BelowPath:
-    """Serves the app below a path of a proxy, whether the proxy takes that path off or not.
+    """Middleware that serves the app below a proxy's path, stripped by the proxy or not.
 
     The app itself does not know the path: it is put before every path in the headers of an
     answer.  `service.web.console.rendering` does the same for pages.
@@ -195,7 +195,7 @@ class BelowPath:
         self._prefix = root_path.encode()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request; pass on other events."""
+        """Serve one HTTP request below the path; pass on other ASGI events."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
@@ -222,13 +222,13 @@ class BelowPath:
 
 
 class ProbesOnly:
-    """The app of the probe port: it serves the paths of probes and answers 404 to all others."""
+    """ASGI app of the probe port: answers the paths of probes, and 404 for all others."""
 
     def __init__(self, app: ASGIApp) -> None:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request.  The other port's app is opened and closed with the server."""
+        """Serve one request to the probe port."""
         if scope["path"] in PROBES:
             await self.app(scope, receive, send)
             return
@@ -244,14 +244,14 @@ def _header(scope: Scope, name: bytes) -> bytes | None:
 
 
 def _request_id(scope: Scope) -> str:
-    """The id that a client or a proxy gave a request, where it is a plain word; else a new one."""
+    """Request id given by a client or proxy if it is a plain word; otherwise a new one."""
     # Not by `secrets`: its system call gives up the interpreter's lock, and an id may be guessed.
     sent = _header(scope, b"x-request-id") or b""
     return sent.decode() if _SANE_ID.fullmatch(sent) else f"{getrandbits(64):016x}"
 
 
 def _run(scope: Scope) -> str | None:
-    """The run that a query names."""
+    """Run named in the query of a request, None without one."""
     query: bytes = scope["query_string"]
     if b"run=" not in query:
         return None
@@ -260,7 +260,7 @@ def _run(scope: Scope) -> str | None:
 
 
 def _host(scope: Scope) -> str | None:
-    """The name that a request is for, without its port; None where it names none."""
+    """Host name of a request without the port; None without a Host field."""
     text = _header(scope, b"host")
     if text is None:
         return None
@@ -271,7 +271,7 @@ def _host(scope: Scope) -> str | None:
 
 
 WARM_REQUEST = "service.warm_request"
-"""Key in the scope of the request that `warm_request` makes; metrics and logs leave it out."""
+"""Key in the scope of the warm-up request, which metrics and logs leave out."""
 
 _PATH = "/api/v1/batches"
 # Its form is right, but there is no such spacecraft.
@@ -288,10 +288,10 @@ _BODY = json.dumps(_BATCH).encode()
 
 
 async def warm_request(app: ASGIApp) -> int:
-    """Send the app a batch of an unknown spacecraft; gives the status of the answer.
+    """Send the app a batch of an unknown spacecraft to warm it up; returns the HTTP status.
 
-    It is checked, queued and refused by the writer's thread; where tokens are
-    required, by the check of access.
+    The batch is checked, queued and refused by the writer's thread, or by the access check if
+    tokens are required.
     """
     head = (
         ("host", "localhost"),
@@ -329,11 +329,11 @@ async def warm_request(app: ASGIApp) -> int:
 API = "/api/"
 DIGEST_BYTES = 16
 KEPT_ON_304 = frozenset({b"cache-control", b"content-location", b"etag", b"link", b"vary"})
-"""Headers that an answer without a body repeats."""
+"""Headers that a 304 answer without a body repeats."""
 
 
 class ConditionalAnswers:
-    """Gives the answers to GET under `/api/` an ETag, and answers 304 where the client has it.
+    """Middleware that adds ETags to GET answers under `/api/`, and answers 304 if unchanged.
 
     Only whole answers in one piece have one: streams are passed on.  The ETag is weak, for it is
     the same whether the answer is compressed or not.
@@ -343,7 +343,7 @@ class ConditionalAnswers:
         self.app = app
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Serve one request; HEAD comes as GET (`AroundRequests`)."""
+        """Serve one request; HEAD arrives as GET (`AroundRequests`)."""
         if scope["type"] != "http" or scope["method"] != "GET" or not scope["path"].startswith(API):
             await self.app(scope, receive, send)
             return
@@ -364,7 +364,7 @@ class ConditionalAnswers:
 
 
 def _is_whole(message: Message) -> bool:
-    """True if a message begins an answer that comes in one piece; streams tell no length."""
+    """True if a message begins an answer in one piece; streams have no content length."""
     return (
         message["type"] == "http.response.start"
         and message["status"] == 200
@@ -373,7 +373,7 @@ def _is_whole(message: Message) -> bool:
 
 
 def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, Message]:
-    """The answer with its ETag, or without its body where the client names that ETag."""
+    """Answer with its ETag, or without its body if the client already has that ETag."""
     digest = blake2b(message.get("body", b""), digest_size=DIGEST_BYTES).hexdigest()
     headers = MutableHeaders(raw=list(start["headers"]))
     headers["ETag"] = tag = f'W/"{digest}"'
@@ -386,7 +386,7 @@ def _tagged(start: Message, message: Message, asked: Headers) -> tuple[Message, 
 
 
 def _names(asked: Headers, tag: str) -> bool:
-    """True if `If-None-Match` names a tag; weak and strong ones of one name are the same."""
+    """True if `If-None-Match` contains a tag; weak and strong tags compare equal."""
     opaque = tag.removeprefix("W/")
     named = [each.strip() for line in asked.getlist("if-none-match") for each in line.split(",")]
     return any(each == "*" or each.removeprefix("W/") == opaque for each in named)

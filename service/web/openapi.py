@@ -1,4 +1,4 @@
-"""The API's reference as OpenAPI 3.1: routes with their descriptions, schemas, examples.
+"""OpenAPI 3.1 description of the API: routes with descriptions, schemas and examples.
 
 Handlers return finished bytes, so the framework cannot derive their schema.
 """
@@ -33,9 +33,9 @@ Handler = TypeVar("Handler", bound=Callable[..., Any])
 
 SCHEMAS = "#/components/schemas/"
 FORMATS = "x-formats"
-"""Marks a response in several formats until the document is made."""
+"""Key that marks a response with several formats until the document is made."""
 FORMATS_OF: dict[str, Callable[[], Mapping[str, OutputFormat]]] = {"tables": lambda: TABLE_FORMATS}
-"""The formats of an answer, by what it holds; features add theirs."""
+"""Output formats of an answer by kind of content; features add theirs."""
 
 
 def _header(name: str, description: str, **schema: Any) -> dict[str, Any]:
@@ -97,26 +97,26 @@ AUTH_STATUSES = (401, 403, 429)
 EVENT_STREAM = "text/event-stream"
 
 _REQUESTS: set[type[BaseModel]] = set()
-"""The models of the bodies that routes take."""
+"""Models of all request bodies."""
 
 
 @dataclass(frozen=True)
 class Returns:
-    """A response of a route that is not a problem; without a shape it is plain text or bytes."""
+    """Successful response of a route; without a shape it is plain text or bytes."""
 
     description: str
     shape: type[Record] | None = None
     headers: Mapping[str, Any] = field(default_factory=dict)
     media_type: str = JSON
     also: str | None = None
-    """Another media type that the client can ask for, as plain text or bytes."""
+    """Alternative media type that the client can request, as plain text or bytes."""
     formats: str | None = None
-    """The key in `FORMATS_OF` of the formats that the client can ask for."""
+    """Key in `FORMATS_OF` of the formats that the client can request."""
     status: int = 200
 
 
 class ApiRouter(APIRouter):
-    """Routes of the API on one subject, with their descriptions."""
+    """Router for the API routes of one subject, with their descriptions."""
 
     def __init__(self, subject: str, prefix: str = "/api/v1") -> None:
         super().__init__(prefix=prefix, tags=[subject])
@@ -136,7 +136,7 @@ class ApiRouter(APIRouter):
         dependencies: Sequence[Any] = (),
         may_create: bool = False,
     ) -> Callable[[Handler], Handler]:
-        """Register the decorated handler; one that declares no query parameter refuses any.
+        """Register the decorated handler; one without query parameters refuses any.
 
         `policy` is the access that it requires.
         What a path names may not be there, so 404 is described, unless the route creates it.
@@ -203,7 +203,7 @@ def _takes_query(declared: Dependant) -> bool:
 
 
 def auth_responses() -> dict[str, Any]:
-    """The OpenAPI responses of `AUTH_STATUSES`."""
+    """OpenAPI responses for the statuses of missing or refused access."""
     return {str(each): _problem(_PROBLEMS[each]) | _HEADERS.get(each, {}) for each in AUTH_STATUSES}
 
 
@@ -227,7 +227,7 @@ def _answer(doc: Returns) -> dict[str, Any]:
 
 
 def add_formats(response: dict[str, Any]) -> None:
-    """Add the media types of the output formats that are registered by now."""
+    """Add the media types of all registered output formats to a response."""
     if (held := response.pop(FORMATS, None)) is None:
         return
     for each in FORMATS_OF[held]().values():
@@ -288,7 +288,7 @@ SECURITY = {
 
 
 class _Plain(GenerateJsonSchema):
-    """Schemas without titles made up from field names."""
+    """JSON schema generator without titles derived from field names."""
 
     def field_title_should_be_set(self, schema: Any) -> bool:
         return False
@@ -296,19 +296,19 @@ class _Plain(GenerateJsonSchema):
 
 @cache
 def examples() -> dict[str, Any]:
-    """Requests and answers of a real run: by operation, then `request` or status."""
+    """Examples from a real run: by operation, then `request` or status."""
     text = (files("service.web") / "examples.json").read_text(encoding="utf-8")
     found: dict[str, Any] = json.loads(text)
     return found
 
 
 def add_reference(app: FastAPI) -> None:
-    """Let the app describe itself as `openapi.yaml` does."""
+    """Make the app serve the same description as `openapi.yaml`."""
     app.openapi = cache(lambda: reference_of(app))  # type: ignore[method-assign]
 
 
 def reference_of(app: FastAPI) -> dict[str, Any]:
-    """The whole description of an app's routes."""
+    """Complete OpenAPI description of an app's routes."""
     root = getattr(app.state, "root_path", "")
     described = get_openapi(
         title="Attitude acquisition",
@@ -334,7 +334,7 @@ def reference_of(app: FastAPI) -> dict[str, Any]:
 
 
 def _place(path: tuple[str, Mapping[str, Any]]) -> tuple[int, str]:
-    """The place of a path in the document: by the first tag of its operations, then by name."""
+    """Sort key of a path in the document: the first tag of its operations, then the name."""
     address, methods = path
     (tag,) = next(iter(methods.values()))["tags"]
     known = list(TAGS)
@@ -342,7 +342,7 @@ def _place(path: tuple[str, Mapping[str, Any]]) -> tuple[int, str]:
 
 
 def _webhook(kind: str, data: type[Record]) -> dict[str, Any]:
-    """The body that a webhook sends for an event; the event stream has the same data."""
+    """OpenAPI description of the message that a webhook sends for an event."""
     text = {"type": ["string", "null"]}
     fields = {
         "type": {"const": kind},
@@ -385,7 +385,7 @@ def _records(kind: type[Record]) -> Iterator[type[Record]]:
 
 
 def _add_conditional(operation: dict[str, Any]) -> None:
-    """Describe what `ConditionalAnswers` adds to the answers that come in one piece."""
+    """Describe ETag and 304 of answers that are sent in one piece."""
     responses = operation["responses"]
     held = responses["200"].get(FORMATS)
     # All formats but those of tables are always streamed.

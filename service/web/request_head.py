@@ -1,4 +1,4 @@
-"""Checks of a request's head that RFC 9112 demands and the HTTP parser does not make."""
+"""Checks of a request's head that RFC 9112 requires and the HTTP parser omits."""
 
 import re
 from collections.abc import Iterable
@@ -15,7 +15,7 @@ Refusal = tuple[HTTPStatus, str]
 def refusal_of(
     target: bytes, http_version: str, fields: Iterable[tuple[bytes, bytes]]
 ) -> Refusal | None:
-    """The status and reason to refuse a request with; None where its head is right.
+    """Status and reason to refuse a request with; None if its head is valid.
 
     The names of `fields` are in lower case.
     """
@@ -39,7 +39,7 @@ def refusal_of(
 
 
 def _coding_refusal(codings: list[bytes], http_version: str) -> Refusal | None:
-    """RFC 9112, 6.1 and 6.3: a body whose end cannot be told is not read."""
+    """Refusal of a Transfer-Encoding with unknown body length (RFC 9112, 6.1 and 6.3), or None."""
     if http_version == "1.0":
         return HTTPStatus.BAD_REQUEST, "Transfer-Encoding: HTTP/1.0 has none"
     if any(each != b"chunked" for each in codings):

@@ -1,4 +1,4 @@
-"""Serving the app with uvicorn: on the loopback address alone, until there are tokens."""
+"""HTTP server (uvicorn) of the app, on loopback only until there are tokens."""
 
 import asyncio
 import os
@@ -26,7 +26,7 @@ from service.web.slow_clients import Admission, Connection, SharedState
 
 MAX_FILES = 4096
 KEPT_FILES = 96
-"""Files that the service opens later: readers of the database, maps of the sky, pipes of workers.
+"""Number of files kept free for later: database readers, sky maps, pipes of workers.
 
 A service on SQLite with a replay in two processes had 41 more than at its start.
 """
@@ -34,11 +34,11 @@ LEAST_CONNECTIONS = 32
 
 START_FAILED = 3
 SWITCH_INTERVAL_S = 0.001
-"""The longest that one thread keeps the interpreter while others, such as the event loop, wait."""
+"""Longest time in seconds that a thread holds the interpreter while others wait."""
 GRACE_S = 10
-"""How long running requests may still take when the server is told to stop."""
+"""Seconds that running requests may take after the server is told to stop."""
 PROBE_CONNECTIONS = 64
-"""Connections of the port for probes: they are outside the bound of all others."""
+"""Greatest number of connections of the probe port, apart from the limit of all others."""
 
 
 def serve(settings: Settings) -> None:
@@ -56,7 +56,7 @@ def serve(settings: Settings) -> None:
 
 
 def _opened(settings: Settings) -> tuple[App, socket.socket | None]:
-    """The open app, and the socket for probes."""
+    """Open the app, and the socket for probes."""
     with ExitStack() as on_failure:
         app = open_app(settings, serving=True)
         on_failure.callback(app.close)
@@ -74,7 +74,7 @@ def _opened(settings: Settings) -> tuple[App, socket.socket | None]:
 
 
 def configuration(settings: Settings, web_app: ASGIApp) -> uvicorn.Config:
-    """How uvicorn serves an app."""
+    """Configuration of uvicorn for an app."""
     return uvicorn.Config(
         web_app,
         host=settings.host,
@@ -106,9 +106,9 @@ def _run(settings: Settings, web_app: FastAPI, probes: socket.socket | None) -> 
 
 
 class Server(uvicorn.Server):
-    """uvicorn's server with bounds for its connections and, where wanted, a port for probes.
+    """uvicorn server with connection limits and an optional port for probes.
 
-    It ends the event streams before it waits for connections to end.
+    Event streams end before the server waits for connections to close.
     """
 
     def __init__(
@@ -123,11 +123,11 @@ class Server(uvicorn.Server):
         self._probes: tuple[socket.socket, uvicorn.Config] | None = None
 
     def add_probes(self, listening: socket.socket, config: uvicorn.Config) -> None:
-        """Serve the app of another configuration on a socket of its own."""
+        """Serve another app on a socket of its own, for probes."""
         self._probes = listening, config
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Open the app and listen."""
+        """Open the app and listen on all ports."""
         await super().startup(sockets)
         if self._probes is None:
             return
@@ -144,14 +144,14 @@ class Server(uvicorn.Server):
         self.servers.append(await loop.create_server(connect, sock=listening))
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End the streams, then everything else."""
+        """End the event streams, then the connections."""
         self._stop_streams()
         await super().shutdown(sockets)
         logs.finish()
 
 
 def _listening(host: str, port: int | None) -> socket.socket | None:
-    """A socket on which probes are answered; None without a port for them."""
+    """Listening socket for probes; None without a probe port."""
     if port is None:
         return None
     try:
@@ -165,10 +165,10 @@ def _listening(host: str, port: int | None) -> socket.socket | None:
 
 
 def _connections() -> int:
-    """How many connections may be open at once.
+    """Greatest number of simultaneous connections.
 
-    Without a bound idle connections would use up the files that the process may open, and it
-    could accept none.  Raises `BadConfiguration` where too few files are left for connections.
+    Without a limit idle connections would use up the process's open files, and no more could be
+    accepted.  Raises `BadConfiguration` if too few files are left for connections.
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     wanted = MAX_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_FILES)

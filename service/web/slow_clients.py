@@ -30,20 +30,20 @@ from service.settings import Network, is_loopback
 from service.web.request_head import refusal_of
 
 RESERVED_FOR_LOOPBACK = 16
-"""Connections that only clients on this machine may take, such as an operator's probes."""
+"""Number of connections reserved for clients on this machine, such as probes."""
 IPV6_SITE_BITS = 64
 """Prefix length (bits) of an IPv6 network counted as one client, which usually owns all of it."""
 
 
 class Closable(Protocol):
-    """A connection that can be closed at once."""
+    """Interface of a connection that can be closed at once."""
 
     def abort(self) -> None:
         """Close the connection, whatever is still to be sent."""
 
 
 class Client:
-    """The connections of one client address."""
+    """Connections of one client address."""
 
     def __init__(self, origin: str, local: bool, shared: bool) -> None:
         self.origin = origin
@@ -54,7 +54,7 @@ class Client:
 
 
 class Admission:
-    """Counts connections and closes idle ones where a bound is reached."""
+    """Counts connections, and closes idle ones at a limit."""
 
     def __init__(
         self,
@@ -78,9 +78,9 @@ class Admission:
         self._remote_idle: OrderedDict[Closable, None] = OrderedDict()
 
     def admit(self, connection: Closable, host: str) -> bool:
-        """Take a new connection from a client's address; it is idle.
+        """Admit a new, idle connection from a client address.
 
-        False where a bound is reached and no connection under that bound is idle.
+        False if a limit is reached and no connection under that limit is idle.
         """
         client = self._client(host)
         if client.has_share and client.count >= self._per_address:
@@ -101,17 +101,17 @@ class Admission:
         return True
 
     def set_idle(self, connection: Closable) -> None:
-        """No request of the connection is being answered from now on."""
+        """Mark a connection as idle: no request of it is being answered."""
         for idle in self._idle_lists(self._admitted.get(connection)):
             idle[connection] = None
 
     def set_busy(self, connection: Closable) -> None:
-        """A request of the connection is being answered from now on."""
+        """Mark a connection as busy: a request of it is being answered."""
         for idle in self._idle_lists(self._admitted.get(connection)):
             idle.pop(connection, None)
 
     def remove(self, connection: Closable) -> None:
-        """The connection is closed."""
+        """Remove a closed connection from the counts."""
         client = self._admitted.get(connection)
         if client is None:
             return
@@ -130,7 +130,7 @@ class Admission:
         return client.idle, self._idle, self._remote_idle
 
     def _close_oldest(self, idle: OrderedDict[Closable, None]) -> bool:
-        """Make room; False where none of these connections is idle."""
+        """Close the connection that was idle longest; False if none is idle."""
         if not idle:
             return False
         connection = next(iter(idle))
@@ -174,20 +174,20 @@ def _origin(host: str) -> str:
 
 
 MAX_PIPELINED = 128
-"""Requests that wait on one connection until the one before them is answered."""
+"""Greatest number of requests that wait on one connection."""
 PIPELINED_PAUSE_S = 0.01
-"""The pause before each of them begins: a connection full of requests leaves time for others."""
+"""Delay in seconds before a waiting request begins, so that other connections get time."""
 READ_BYTES = 16 << 10
-"""The most that is read at a time: a connection holds no more that the app has not asked for."""
+"""Greatest number of bytes read at a time from a connection."""
 
 FIRST_BYTE_S = 5
-"""How long a client may be connected before it sends its first byte."""
+"""Seconds within which a client must send its first byte."""
 HEAD_S = 30
-"""How long a client may take from the end of a request to the end of the next head."""
+"""Seconds from the end of a request to the end of the next head."""
 UNREAD_S = 60
-"""A connection whose client reads nothing of an answer for this long is closed."""
+"""Seconds without reading after which a client's connection is closed."""
 LINGER_S = 1
-"""How long the answer to a refused head can still be read before the connection is closed."""
+"""Seconds in which the answer to a refused head can still be read."""
 
 DISCARDED_PER_S = 50e6
 """Bytes of bodies that are answered already, over all connections.
@@ -211,7 +211,7 @@ class SharedState(ServerState):
 
 
 class Connection(asyncio.BufferedProtocol):
-    """Reads a connection in small pieces.
+    """Protocol that reads a connection in small pieces.
 
     uvloop would otherwise read up to 256 KiB at a time; with hundreds of connections that is
     too much memory, and parsing it takes too long in one turn of the event loop.
@@ -225,38 +225,38 @@ class Connection(asyncio.BufferedProtocol):
         _loop: asyncio.AbstractEventLoop | None = None,
         admission: Admission | None = None,
     ) -> None:
-        """`admission` counts the connection in place of the server's own."""
+        """Connect the protocol; `admission` replaces the server's own."""
         self._buffer = server_state.buffer
         self._http = _Http(config, server_state, app_state, _loop)
         self._http.shared = server_state
         self._http.admission = admission or server_state.admission
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """A client has connected."""
+        """Handle a new connection of a client."""
         self._http.connection_made(cast(asyncio.Transport, transport))
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """The connection is closed."""
+        """Handle the end of the connection."""
         self._http.connection_lost(exc)
 
     def pause_writing(self) -> None:
-        """More is to be sent than the client has read."""
+        """Handle a full send buffer: the client reads more slowly than the app sends."""
         self._http.pause_writing()
 
     def resume_writing(self) -> None:
-        """The client has read most of it."""
+        """Handle a drained send buffer."""
         self._http.resume_writing()
 
     def eof_received(self) -> None:
-        """The client sends nothing more."""
+        """Handle the end of the client's data."""
         self._http.eof_received()
 
     def get_buffer(self, sizehint: int) -> memoryview:
-        """The buffer of all connections: what it holds is copied before the next read."""
+        """Receive buffer shared by all connections; its content is copied before the next read."""
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:
-        """Bytes have arrived."""
+        """Handle received bytes."""
         self._http.data_received(bytes(self._buffer[:nbytes]))
 
 
@@ -345,7 +345,7 @@ class _Http(HttpToolsProtocol):
         self.transport.abort()
 
     def _disconnect(self) -> None:
-        """Tell the handlers at work that their client is gone: what they send is dropped."""
+        """Tell running handlers that their client has left; their output is dropped."""
         for cycle in (self._answering, self.cycle, *(each for each, _ in self.pipeline)):
             if cycle is not None and not cycle.response_complete:
                 cycle.disconnected = True
@@ -364,7 +364,7 @@ class _Http(HttpToolsProtocol):
             self._count(data, discarded, begun_s)
 
     def _count(self, data: bytes, discarded: bool, begun_s: float) -> None:
-        """Hold what was read against the bounds; `discarded` began at a processor time."""
+        """Check received data against the limits; `discarded` began at a processor time."""
         if self._is_over:
             return
         if self._in_body:
@@ -460,7 +460,7 @@ class _Http(HttpToolsProtocol):
     # ---- what is refused -----------------------------------------------------------------------
 
     def _refuse(self, response: bytes | None = None) -> None:
-        """Answer where an answer can still be given, by default 431, and close."""
+        """Refuse a request, by default with 431 if an answer is still possible, and close."""
         if self._is_over:
             return
         self._is_over = True
@@ -477,13 +477,13 @@ class _Http(HttpToolsProtocol):
         self._close_timer = self.loop.call_later(LINGER_S, self.abort)
 
     def _can_interrupt(self) -> bool:
-        """True if nothing was sent of the answer to the request whose body is being read."""
+        """True if the request being read has no answer yet."""
         return self._in_body and not self.pipeline and not self.cycle.response_started
 
     # ---- bodies that are answered already ------------------------------------------------------
 
     def _hold(self, seconds: float) -> None:
-        """Read nothing until it is this connection's turn; its client is not silent meanwhile."""
+        """Pause reading until this connection's turn to discard data."""
         now = self.loop.time()
         turn_s = max(self.shared.discarding_until_s, now) + seconds
         self.shared.discarding_until_s = turn_s
@@ -514,12 +514,12 @@ class _Http(HttpToolsProtocol):
             self._head_timer = self.loop.call_later(longest_s - waited_s, self._check_head_deadline)
 
     def pause_writing(self) -> None:
-        """More is to be sent than the client has read."""
+        """Handle a full send buffer: the client reads more slowly than the app sends."""
         super().pause_writing()
         self._start_unread_timer()
 
     def resume_writing(self) -> None:
-        """The client has read most of it."""
+        """Handle a drained send buffer."""
         self._stop_unread_timer()
         super().resume_writing()
 
@@ -540,9 +540,9 @@ class _Http(HttpToolsProtocol):
 
 
 MAX_HEAD_BYTES = 64 << 10
-"""The bytes of a request line with its header fields, and of the trailers after a chunked body."""
+"""Greatest size in bytes of a request head, and of the trailers after a chunked body."""
 MAX_FIELDS = 100
-"""Header fields of a head, or trailer fields."""
+"""Greatest number of header fields, or trailer fields."""
 
 
 def _raw_response(status: HTTPStatus, detail: str, *headers: str) -> bytes:
@@ -572,4 +572,4 @@ RAW_RESPONSES = {
         ),
     )
 }
-"""Whole responses by status, as bytes."""
+"""Complete raw responses by status."""

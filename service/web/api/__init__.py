@@ -1,1 +1,1 @@
-"""The HTTP API: one module for the routes of each subject."""
+"""HTTP API: one module for the routes of each subject."""

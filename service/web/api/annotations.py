@@ -1,4 +1,4 @@
-"""Annotations: notes on times and periods."""
+"""API routes for annotations: notes on times and periods of telemetry."""
 
 from typing import Annotated, Self
 
@@ -40,7 +40,7 @@ NoteText = Annotated[
 
 
 class AnnotationIn(Wire):
-    """A new annotation."""
+    """Request body with a new annotation."""
 
     text: NoteText
     start: Annotated[Time, Field(description="Telemetry time that the note is about.")]
@@ -63,7 +63,7 @@ class AnnotationIn(Wire):
 def list_annotations(
     request: Request, query: FromQuery[params.AnnotationQuery], app: AppDep
 ) -> Response:
-    """Notes that touch a period, the latest written first."""
+    """Annotations that touch a period, the latest written first."""
     return page_response(request, app.annotations.page(**query.asked()))
 
 
@@ -74,7 +74,7 @@ def list_annotations(
     body=AnnotationIn,
 )
 def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
-    """Write a note on a time or a period; the name of its author is stored with it."""
+    """Write an annotation on a time or a period; the name of its author is stored with it."""
     asked = read_model(AnnotationIn, body)
     _require(change.caller, asked.spacecraft)
     written = app.annotations.add(
@@ -98,7 +98,7 @@ def add_annotation(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
 def delete_annotation(
     id: AnnotationId, query: FromQuery[params.AuthorQuery], app: AppDep, change: ChangeDep
 ) -> Response:
-    """Delete a note; the audit list keeps its text, and who deleted it."""
+    """Delete an annotation; the audit list keeps its text, and who deleted it."""
     change.author(query.who)
     found = app.annotations.get(id)
     if found.spacecraft is not None and not change.caller.may_see(found.spacecraft):
@@ -108,7 +108,7 @@ def delete_annotation(
 
 
 def _require(caller: Caller, spacecraft: str | None) -> None:
-    """Raise `Forbidden` where a caller that is bound to spacecraft writes about others."""
+    """Raise `Forbidden` if a caller bound to spacecraft writes about others."""
     if spacecraft is None:
         require_all_spacecraft(caller)
     else:

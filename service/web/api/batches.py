@@ -1,4 +1,4 @@
-"""Batches and gyro blocks: submit, list, look at one, try a batch with other options, compare."""
+"""API routes for batches and gyro blocks: submit, list, read, process again, compare."""
 
 from typing import Annotated
 
@@ -52,7 +52,7 @@ ResultId = Annotated[str, Path(description="The `id` of a recorded result.")]
 
 
 class WhatIfIn(Wire):
-    """The same batch with other options."""
+    """Request body to process a batch again with other options."""
 
     options: Annotated[
         OptionsIn, Field(description="Options that replace those of the result.")
@@ -69,7 +69,7 @@ class WhatIfIn(Wire):
 
 
 def answer_response(answered: Answered, recorded: bool = True) -> Response:
-    """An answer to a batch: new and recorded, recorded before, or not recorded at all."""
+    """HTTP response to a batch: newly recorded, recorded before, or not recorded."""
     if not recorded:
         return Response(answered.body, media_type=JSON)
     if answered.replayed:
@@ -193,7 +193,7 @@ def what_if(
 compare_router = ApiRouter("batches")
 
 COMPARISON_S = 10.0
-"""The duration of one comparison; the rest is left out, and the answer says so."""
+"""Time limit of a comparison in seconds; the rest is left out, and the answer says so."""
 
 SideOptions = Annotated[OptionsIn, Field(description="Options that replace each batch's own.")]
 SampleSize = Annotated[
@@ -203,7 +203,7 @@ SampleSize = Annotated[
 
 
 class CompareIn(Wire):
-    """A choice of batches, and two sets of options; an omitted option stays as recorded."""
+    """Request body that selects batches and two sets of options; omitted ones stay as recorded."""
 
     spacecraft: Key
     run: RunName = "live"

@@ -1,4 +1,4 @@
-"""Live events, as a stream that a browser's EventSource follows."""
+"""API route for live events, as a stream for a browser's EventSource."""
 
 from collections.abc import AsyncIterator, Callable
 from functools import partial
@@ -21,12 +21,12 @@ from service.web.requests.query_parameters import FromQuery, Query, SpacecraftFi
 router = ApiRouter("events")
 
 SEND_S = 30.0
-"""A client that reads nothing for this long is disconnected; it reconnects and continues."""
+"""Seconds after which a client that reads nothing is disconnected; it may reconnect."""
 HEADERS = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
 
 
 class EventQuery(Query):
-    """Which events."""
+    """Query that selects events by run and spacecraft, and the last one received."""
 
     run: Annotated[RunName | None, Field(description="Only events of this run.")] = None
     spacecraft: SpacecraftFilter = None
@@ -39,7 +39,7 @@ class EventQuery(Query):
 
 
 class EventStream(Response):
-    """A response that lasts until the client leaves, the events end, or nothing is read."""
+    """HTTP response that lasts until the client leaves, the events end, or nothing is read."""
 
     def __init__(self, lines: AsyncIterator[bytes], leave: Callable[[], object]) -> None:
         super().__init__(None, 200, HEADERS, EVENT_STREAM)
@@ -48,7 +48,7 @@ class EventStream(Response):
         self._leave = leave
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the lines as they come."""
+        """Send lines of the event stream as they are produced."""
         async with anyio.create_task_group() as group:
 
             async def leave() -> None:

@@ -1,4 +1,4 @@
-"""Frames of star trackers: submit one, or solve a picture of any camera without a record."""
+"""API routes for frames of star trackers, and for pictures of any camera."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -29,7 +29,7 @@ _A_PRIORI = '{"quaternion": [0.1, 0.2, 0.3, 0.9273618495495703]}'
 
 
 class FrameQuery(Query):
-    """The fields of a frame's batch, as JSON where they are not plain text."""
+    """Query with the fields of a frame's batch, as JSON unless plain text."""
 
     batch: Annotated[
         str | None, Field(description="The batch id. Default: made from the digest of the frame.")
@@ -79,7 +79,7 @@ class FrameQuery(Query):
     options: Annotated[str | None, Field(description="JSON, as in a batch.")] = None
 
     def known(self) -> FrameIn:
-        """The same, checked as a batch's fields are; raises `BadBatch` with every fault."""
+        """Checked fields of the frame's batch; raises `BadBatch` with every fault."""
         texts = {name: text for name, text in self.asked().items() if text is not None}
         return read_known({name: _value(name, text) for name, text in texts.items()})
 
@@ -98,14 +98,14 @@ def _value(name: str, text: str) -> Any:
 
 @dataclass(frozen=True)
 class FrameUpload:
-    """A frame's file and the fields of its batch."""
+    """An uploaded frame: its file and the fields of its batch."""
 
     known: FrameIn
     file: IO[bytes]
 
     @contextmanager
     def opened(self) -> Iterator[IO[bytes]]:
-        """The file, which is deleted afterwards."""
+        """Context manager of the uploaded file, which is deleted afterwards."""
         with self.file:
             yield self.file
 
@@ -143,7 +143,7 @@ def submit_frame(
 
 
 class PictureQuery(Query):
-    """What is known of a picture's camera."""
+    """Query with known properties of a picture's camera."""
 
     spacecraft: Annotated[
         str | None,

@@ -1,4 +1,4 @@
-"""Probes: alive, ready, and the metrics."""
+"""API routes for probes: liveness, readiness, and metrics."""
 
 import asyncio
 import logging
@@ -18,21 +18,21 @@ router = ApiRouter("probes", prefix="")
 
 TEXT = "text/plain"
 READY_WAIT_S = 1.5
-"""The answer is due within two seconds, whatever the database does."""
+"""Seconds to wait for readiness; the probe must answer within two seconds."""
 
 log = logging.getLogger(__name__)
 
 
 @router.serves("GET /livez", OPEN, Returns("Alive.", media_type=TEXT))
 async def livez(app: AppDep) -> Response:
-    """Tell that the process answers and works on what is submitted."""
+    """Liveness: the process answers and works on submissions."""
     app.submissions.require_alive()
     return PlainTextResponse("alive\n")
 
 
 @router.serves("GET /readyz", OPEN, Returns("Ready.", media_type=TEXT), problems=(503,))
 async def readyz(request: Request, app: AppDep) -> Response:
-    """Tell that the service is ready: catalog loaded, database reachable, last write succeeded."""
+    """Readiness: catalog loaded, database reachable, last write succeeded."""
     state = request.app.state
     if getattr(state, "getting_ready", None) is None or state.getting_ready.done():
         # A thread apart from those of handlers, which may all be busy; one for all probes:
@@ -58,7 +58,7 @@ async def readyz(request: Request, app: AppDep) -> Response:
 
 
 def _ready(app: App) -> Lag:
-    """How far projections are behind, once the service is ready."""
+    """Wait until the service is ready; returns the lag of projections."""
     app.service.ready()
     return app.store.progress.lag()
 

@@ -1,4 +1,4 @@
-"""Named runs, and replays of telemetry files into them."""
+"""API routes for named runs, and for replays of telemetry files into them."""
 
 from dataclasses import dataclass
 from functools import partial
@@ -33,7 +33,7 @@ ReplayId = Annotated[str, Path(description="The `id` of a replay.")]
 
 
 class RunIn(Wire):
-    """Settings of a run."""
+    """Request body with the settings of a run."""
 
     alarms: Annotated[
         StrictBool,
@@ -42,7 +42,7 @@ class RunIn(Wire):
 
 
 class ForgetIn(Wire):
-    """What is removed from a run."""
+    """Request body that selects batches and gyro blocks to remove from a run."""
 
     spacecraft: Annotated[Key | None, Field(description="Only of this one; null: of all.")] = None
     batches: Annotated[
@@ -59,7 +59,7 @@ class ForgetIn(Wire):
 
 
 class _ReplayQuery(Query):
-    """The run that a replay records into, and the spacecraft of an archive of packets."""
+    """Query of a replay: the run to record into, and the spacecraft of a packet archive."""
 
     run: Annotated[
         RunName, Field(description="The run for every batch, in place of the batch's own.")
@@ -79,7 +79,7 @@ ReplayQuery = FromQuery[_ReplayQuery]
 
 @dataclass(frozen=True)
 class ReplayUpload:
-    """A telemetry file and the run it goes to."""
+    """An uploaded telemetry file with the query of its replay."""
 
     query: _ReplayQuery
     body: request_body.Spooled
@@ -104,7 +104,7 @@ async def _telemetry(
 
 @router.serves("GET /runs", Policy("read", "nothing"), Returns("Every run.", RunList))
 def list_runs(app: AppDep, caller: CallerDep) -> Response:
-    """Every run with batches; of a token that is bound to spacecraft, with theirs."""
+    """All runs with batches; for a token bound to spacecraft, runs with their batches."""
     return json_response({"items": app.runs.all(caller.spacecraft)})
 
 
@@ -132,7 +132,7 @@ def watch_run(
 def forget_run(
     run: RunPath, body: request_body.JsonBody, app: AppDep, change: ChangeDep
 ) -> Response:
-    """Remove what was recorded wrongly, with its trends and archived batches; it cannot be undone.
+    """Remove wrongly recorded batches with trends and archived batches; it cannot be undone.
 
     The same batches can be recorded again afterwards. Alarms, events, notes and the audit list
     stay.
@@ -202,7 +202,7 @@ def start_replay(
     Returns("The replay.", Replay),
 )
 def get_replay(id: ReplayId, app: AppDep) -> Response:
-    """A replay and its progress."""
+    """State and progress of a replay."""
     return json_response(app.replays.get(id))
 
 

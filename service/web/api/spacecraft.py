@@ -1,4 +1,4 @@
-"""Spacecraft: settings, state, attitude history, star rates, and all at a glance."""
+"""API routes for spacecraft: settings, state, attitudes, star rates, and overview."""
 
 from starlette.requests import Request
 from starlette.responses import Response

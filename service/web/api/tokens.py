@@ -1,4 +1,4 @@
-"""Access: tokens, a token exchanged for a browser's session, and the list of what was changed."""
+"""API routes for access: tokens, browser sessions, and the audit list."""
 
 from typing import Annotated
 
@@ -30,7 +30,7 @@ router = ApiRouter("access")
 
 
 class SignIn(Wire):
-    """The token for a browser's session."""
+    """Request body with the token for a browser session."""
 
     token: Annotated[str, Field(min_length=1, max_length=200)]
 
@@ -55,13 +55,13 @@ def sign_in(request: Request, body: SessionBody, app: AppDep) -> Response:
 
 @router.serves("GET /session", Policy("read", "nothing"), Returns("The caller.", Session))
 def session(caller: CallerDep) -> Response:
-    """The caller and its scopes."""
+    """Name, scopes and spacecraft of the caller."""
     return json_response(_shown(caller))
 
 
 @router.serves("DELETE /session", OPEN, Returns("The session has ended.", Session), problems=(401,))
 def sign_out(request: Request, app: AppDep) -> Response:
-    """End the browser's session."""
+    """End the browser session of the caller."""
     cookie = request.cookies.get(COOKIE)
     if cookie is None:
         raise Unauthenticated("there is no session to end")
@@ -72,7 +72,7 @@ def sign_out(request: Request, app: AppDep) -> Response:
 
 
 class TokenIn(Wire):
-    """A new token."""
+    """Request body with a new access token."""
 
     name: Annotated[
         str,
@@ -100,7 +100,7 @@ TokenName = Annotated[str, Path(max_length=64, description="The `name` of a toke
 
 @router.serves("GET /tokens", OPERATE, Returns("All tokens, without their secrets.", TokenList))
 def list_tokens(app: AppDep) -> Response:
-    """Every token, with its scopes, spacecraft, end and state."""
+    """All tokens, with scopes, spacecraft, expiry and state."""
     return json_response(TokenList(items=app.tokens.all()))
 
 
@@ -112,7 +112,7 @@ def list_tokens(app: AppDep) -> Response:
     problems=(409,),
 )
 def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
-    """Make a token; the first one ends open access."""
+    """Create an access token; the first one ends open access."""
     asked = read_model(TokenIn, body)
     made = app.tokens.add(**asked.model_dump(), entry=change.entry(201))
     app.access.forget()
@@ -126,7 +126,7 @@ def add_token(body: JsonBody, app: AppDep, change: ChangeDep) -> Response:
     problems=(503,),
 )
 def revoke_token(token: TokenName, app: AppDep, change: ChangeDep) -> Response:
-    """Revoke a token at once, with the browser sessions that were begun with it."""
+    """Revoke a token at once, with the browser sessions begun with it."""
     revoked = app.tokens.revoke(token, change.entry())
     app.access.forget()
     return json_response(revoked)

@@ -1,4 +1,4 @@
-"""Zones: what is cached; build some ahead; drop them."""
+"""API routes for the zone cache: state, building in advance, dropping."""
 
 from typing import Annotated
 
@@ -18,7 +18,7 @@ MAX_WARMED = 1000
 
 
 class WarmIn(Wire):
-    """Zones to build before a batch needs them."""
+    """Request body that selects zones to build before a batch needs them."""
 
     spacecraft: Key
     time: Annotated[
@@ -28,14 +28,14 @@ class WarmIn(Wire):
 
 
 class DropQuery(Query):
-    """Which zones to drop."""
+    """Query that selects cached zones to drop."""
 
     spacecraft: SpacecraftFilter = None
 
 
 @router.serves("GET /zones", READ, Returns("The cache.", ZoneCache))
 def list_zones(app: AppDep) -> Response:
-    """The cached zones, their size, hits, misses and build times.
+    """Cached zones with sizes, hits, misses and build times.
 
     The worker processes for replays have their own caches, which are not included.
     """

@@ -1,1 +1,1 @@
-"""Shared by the handlers of API and console: access, bodies, parameters, responses, problems."""
+"""Shared parts of API and console handlers: access, bodies, parameters, responses, problems."""

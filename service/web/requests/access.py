@@ -1,4 +1,4 @@
-"""Access to routes: which scope each requires, and for which spacecraft; what handlers depend on.
+"""Access control of routes: required scope and spacecraft, and dependencies of handlers.
 
 A handler declares its policy with its address.  A route without one is refused to every
 caller, so a new route cannot be forgotten.
@@ -40,7 +40,7 @@ SpacecraftPlace = Literal["nothing", "path", "query", "result", "body", "every"]
 
 @dataclass(frozen=True)
 class Policy:
-    """The access that a route requires of its caller.
+    """Access that a route requires of its caller: scope, and spacecraft named in the request.
 
     `spacecraft_in` says which part of the request names the spacecraft, for tokens
     bound to some: the `path`; the `query`, which must then name it; the recorded
@@ -61,7 +61,7 @@ class Policy:
 
     @property
     def scopes(self) -> tuple[Scope, ...]:
-        """The scopes of which the caller must have one."""
+        """Scopes of which the caller must have at least one."""
         return (self.scope,) if self.or_scope is None else (self.scope, self.or_scope)
 
 
@@ -69,24 +69,24 @@ READ, OPERATE = Policy("read"), Policy("operate")
 OPEN = Policy("read", "nothing", open=True)
 
 POLICIES: dict[str, Policy] = {}
-"""The policy of every route by its name: its handler declares it with its address."""
+"""Policies of all routes by name, declared by their handlers."""
 
 _LINK_NAVIGATION = (
     ("sec-fetch-mode", "navigate"),
     ("sec-fetch-dest", "document"),
     ("sec-fetch-user", "?1"),
 )
-"""Sent by a browser when its user follows a link; scripts and frames send other values."""
+"""Headers that a browser sends if its user follows a link; scripts and frames send others."""
 
 _CALLER_THREADS = CapacityLimiter(8)
-"""Apart from those of handlers, which may wait for a commit: looking up a caller must not."""
+"""Threads for looking up callers, apart from handlers' threads, which may wait for a commit."""
 _OWNER_THREADS = CapacityLimiter(8)
 _LOOK_UP_S = 1.5
-"""The longest look-up of a caller in the database: probes are due within 2 s."""
+"""Time limit in seconds for looking up a caller in the database: probes are due within 2 s."""
 
 
 async def authorize(request: Request) -> None:
-    """Let a request through to its handler, or raise what it lacks.
+    """Check the access of a request; raises the error for missing access.
 
     What a caller with the scope `operate` changes, and what a policy marks as `audited`, gets
     its audit entry with the change (`ChangeDep`), or once it is answered
@@ -136,14 +136,14 @@ async def authorize(request: Request) -> None:
 
 
 async def is_open(access: Access) -> bool:
-    """`Access.is_open`, without waiting for the database in the event loop."""
+    """True if access is open, asked without blocking the event loop on the database."""
     if access.cached_is_open is not None:
         return access.cached_is_open
     return await _within_deadline(access, lambda: access.is_open)
 
 
 async def _within_deadline(access: Access, ask: Callable[..., T], *arguments: object) -> T:
-    """Run a look-up in a thread; raises `Busy` where it takes too long, or just did."""
+    """Run a database look-up in a thread; raises `Busy` on a timeout, or shortly after one."""
     access.require_database()
     try:
         with fail_after(_LOOK_UP_S):
@@ -164,7 +164,7 @@ CallerDep = Annotated[Caller, Depends(_caller)]
 
 
 def entry_of(scope: HttpScope, access: Access, status: int) -> Entry:
-    """The entry in the audit list of a request that is answered with this status."""
+    """Audit entry of a request that is answered with a status."""
     state = scope["state"]
     query = scope["query_string"].decode("latin-1")
     about = scope["path"] + (f"?{query}" if query else "")
@@ -174,20 +174,20 @@ def entry_of(scope: HttpScope, access: Access, status: int) -> Entry:
 
 
 class Change:
-    """What a handler stores with a change: its author, and its entry in the audit list."""
+    """Author and audit entry of a change, which its handler stores."""
 
     def __init__(self, request: Request) -> None:
         self._request = request
         self.caller: Caller = request.state.caller
 
     def author(self, named: str | None) -> str:
-        """The name of the token; without tokens, the name that the request gives."""
+        """Name of the caller's token; without tokens, the name given in the request."""
         return author(self.caller, named)
 
     def entry(self, status: int = 200) -> Entry:
-        """The entry for a change that is answered with this status.
+        """Audit entry for a change that is answered with `status`.
 
-        The handler stores it with the change; no other entry is made then.
+        The handler stores it with the change; the middleware then makes no other entry.
         """
         request = self._request
         request.state.noted = True
@@ -211,13 +211,13 @@ def require_scope(caller: Caller, *scopes: Scope) -> None:
 
 
 def require_all_spacecraft(caller: Caller) -> None:
-    """Raise `Forbidden` where a caller is bound to spacecraft."""
+    """Raise `Forbidden` if a caller is bound to spacecraft."""
     if caller.spacecraft is not None:
         raise Forbidden(f"{caller.name} is bound to spacecraft; this request is about all of them")
 
 
 def author(caller: Caller, named: str | None) -> str:
-    """The name of the token; without tokens, the name that the request gives."""
+    """Name of the caller's token; without tokens, the name given in the request."""
     if caller.token_id is not None:
         return caller.name
     if named is None:
@@ -226,7 +226,7 @@ def author(caller: Caller, named: str | None) -> str:
 
 
 def credentials(request: Request) -> tuple[str | None, str | None]:
-    """The token and the session that a request shows, each None where there is none."""
+    """Token and session of a request, each None if absent."""
     kind, _, token = request.headers.get("authorization", "").partition(" ")
     is_bearer = kind.lower() == "bearer"
     return token.strip() if is_bearer else None, request.cookies.get(COOKIE)
@@ -238,7 +238,7 @@ def _is_page(request: Request) -> bool:
 
 
 def _site(request: Request) -> str | None:
-    """The site of the page that sent the request, as in `Sec-Fetch-Site`; None: unknown."""
+    """Relation of the sending page's site to the service, as in `Sec-Fetch-Site`; None: unknown."""
     site = request.headers.get("sec-fetch-site")
     if site is None and (origin := request.headers.get("origin")) is not None:
         host = request.headers.get("host")
@@ -247,7 +247,7 @@ def _site(request: Request) -> str | None:
 
 
 def _require_same_origin(request: Request) -> None:
-    """Refuse changes from pages of other sites: a browser sends its cookie by itself."""
+    """Refuse changes from pages of other sites, since a browser sends its cookie to any."""
     if _site(request) != "same-origin":
         raise Forbidden("with a session, only the service's own pages can change something")
 
@@ -310,12 +310,12 @@ MetricsDep = Annotated[Metrics, Depends(_metrics)]
 def json_response(
     content: Any, status: int = 200, headers: dict[str, str] | None = None
 ) -> Response:
-    """An answer of plain values."""
+    """HTTP response with plain values as JSON."""
     return Response(_JSON.encode(content), status, headers, media_type=JSON)
 
 
 def page_response(request: Request, page: Page[Any]) -> Response:
-    """A page; where there is another, `Link` leads to it with the same filters."""
+    """HTTP response with a page of a list; `Link` leads to the next page with the same filters."""
     headers = None
     if page.next_cursor is not None:
         following = request.url.include_query_params(cursor=page.next_cursor)

@@ -1,4 +1,4 @@
-"""Exports: files that are written as they are sent, a bounded number at a time."""
+"""Export responses: files written while they are sent, a limited number at a time."""
 
 from collections import Counter
 from collections.abc import Callable, Generator, Iterator
@@ -19,12 +19,12 @@ from service.table_files.table import Table
 
 MAX_OF_ONE_TOKEN = 2
 MAX_EXPORTS = 8
-"""The most exports at a time, of all callers: each occupies a thread while it is written."""
+"""Greatest number of simultaneous exports; each occupies a thread while it is written."""
 RETRY_AFTER_S = 5
 
 
 class Exports:
-    """Counts the exports that are under way."""
+    """Limits and counts the exports in progress."""
 
     def __init__(self) -> None:
         self._under_way: Counter[str | None] = Counter()
@@ -37,10 +37,10 @@ class Exports:
         media_type: str,
         headers: dict[str, str] | None = None,
     ) -> Response:
-        """The response that sends what `write` gives.
+        """HTTP response that sends the output of `write`.
 
-        Raises `RateLimited` where the caller's token has as many exports as it may, `Busy`
-        where there are too many of all callers, and what `write` raises.
+        Raises `RateLimited` if the caller's token has too many exports in progress, `Busy` if all
+        callers together have, and any exception of `write`.
         """
         self._begin(caller)
         try:
@@ -67,7 +67,7 @@ class Exports:
 
 
 class FileResponse(StreamingResponse):
-    """A file that is written as it is sent; `leave` is called at the end, however it comes."""
+    """Streaming response of a file written while sent; `leave` is called at the end in any case."""
 
     def __init__(
         self,
@@ -80,7 +80,7 @@ class FileResponse(StreamingResponse):
         self._written, self._leave = content, leave
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send the file; what it was written with is closed also where the client has left."""
+        """Send the file; its generator is closed also if the client has left."""
         try:
             await super().__call__(scope, receive, send)
         finally:
@@ -108,7 +108,7 @@ THINNED = {
 
 
 def history_file(table: Table, format: str, name: str, *, is_thinned: bool) -> Response:
-    """A short table as a file of that name."""
+    """HTTP response with a short table as a file."""
     media_type = TABLE_FORMATS[format].media_type
     content = b"".join(write_table(format, table))
     headers = history_headers(name, format, is_thinned=is_thinned)
@@ -116,16 +116,16 @@ def history_file(table: Table, format: str, name: str, *, is_thinned: bool) -> R
 
 
 def thinned_header(is_thinned: bool) -> dict[str, str]:
-    """The header that says whether a history has less than was recorded."""
+    """HTTP header that tells if a history was thinned."""
     return {"Thinned": "true" if is_thinned else "false"}
 
 
 def history_headers(name: str, format: str, *, is_thinned: bool) -> dict[str, str]:
-    """The headers of a history as a file of that name."""
+    """HTTP headers of a history file."""
     return attached_as(name, TABLE_FORMATS[format].suffix or format) | thinned_header(is_thinned)
 
 
 def attached_as(name: str, suffix: str) -> dict[str, str]:
-    """The header that names the file that an answer is saved as."""
+    """HTTP header with the name under which a file is saved."""
     file = f"{name}.{suffix}".replace(":", "_")
     return {"Content-Disposition": f'attachment; filename="{file}"'}

@@ -1,4 +1,4 @@
-"""Counters for Prometheus, in a registry of the app's own: no state is shared between apps."""
+"""Prometheus metrics of the service, in a registry of each app."""
 
 import logging
 import threading
@@ -33,17 +33,16 @@ from service.times import recorded_utc, unix_seconds
 log = logging.getLogger(__name__)
 
 WAIT_S = 1.0
-"""The deadline of all reads: the scrape is due within two seconds."""
+"""Time limit in seconds of all reads for a scrape, which is due within two seconds."""
 RESULTS = ("attitude", "no_attitude")
 _METHODS = ("GET", "POST", "DELETE", "PUT", "PATCH", "OPTIONS")
 _SECONDS = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 0.5, 1.0, 2.5, 5.0, 10.0)
 
 
 class _TimedReads:
-    """Reads values in threads, all at once, with a deadline.
+    """Reads values in parallel threads with a deadline.
 
-    A read that has not returned yet is not repeated: while the database hangs, threads
-    would pile up.
+    An unfinished read is not repeated: threads would pile up while the database hangs.
     """
 
     def __init__(self, **asked: Callable[[], Any]) -> None:
@@ -53,7 +52,7 @@ class _TimedReads:
         self._answers: dict[str, Future[Any]] = {}
 
     def __call__(self) -> dict[str, Any]:
-        """The values that arrived within `WAIT_S`, by name."""
+        """Values that arrived within `WAIT_S`, by name."""
         with self._lock:
             for name, ask in self._asked.items():
                 before = self._answers.get(name)
@@ -73,12 +72,12 @@ class _TimedReads:
         return found
 
     def close(self) -> None:
-        """Let the threads end; one that waits for a hanging database is not waited for."""
+        """Stop the threads without waiting for one that a hanging database blocks."""
         self._threads.shutdown(wait=False, cancel_futures=True)
 
 
 class _GaugeCollector(Collector):
-    """Gauges that are read from other threads when the metrics are scraped."""
+    """Prometheus collector of gauges that are read when the metrics are scraped."""
 
     def __init__(self, app: App) -> None:
         self._app = app
@@ -188,7 +187,7 @@ def _unix_s(moment: str) -> float:
 
 
 class Metrics:
-    """The counters, and their text form."""
+    """Counters of requests, batches and stars, and their text for Prometheus."""
 
     def __init__(self, app: App) -> None:
         self.registry = CollectorRegistry()
@@ -237,7 +236,7 @@ class Metrics:
                 self._batches.labels(name, LIVE, result)
 
     def _count_recorded(self) -> None:
-        """Bring the counters up to what the submissions count."""
+        """Update the counters from the counts of the submission service."""
         with self._counting:
             now, before = self._counts.copy(), self._counted
             for (spacecraft, is_live, has_attitude), count in now.batches.items():
@@ -252,11 +251,11 @@ class Metrics:
             self._counted = now
 
     def count_repeat(self) -> None:
-        """Count one submission that was recorded before."""
+        """Count one repeated submission."""
         self._repeats.inc()
 
     def count_request(self, scope: Scope, status: int, seconds: float) -> None:
-        """Count one request under its route's template, so that ids make no new series."""
+        """Count one request under the path template of its route; ids make no new series."""
         if getattr(scope.get("route"), "name", None) == "events":
             return  # the duration of a stream says nothing
         method = scope["method"] if scope["method"] in _METHODS else "other"
@@ -268,6 +267,6 @@ class Metrics:
         histogram.observe(seconds)
 
     def text(self) -> bytes:
-        """The exposition text."""
+        """Text of all metrics in the Prometheus format."""
         self._count_recorded()
         return generate_latest(self.registry)

@@ -1,7 +1,7 @@
-"""Errors as problems (RFC 9457): the one place that gives an error its status and its explanation.
+"""Conversion of errors to problem answers (RFC 9457) with status and explanation.
 
-A client's error names the field and the value.  An internal error is logged, and
-its answer tells nothing about the inside of the service.
+A client's error names the field and the value.  An internal error is logged, and its answer reveals
+nothing about the service.
 """
 
 import json
@@ -27,9 +27,9 @@ from service.missions.faults import causes, plain_message
 
 @dataclass(frozen=True)
 class ProblemType:
-    """The common part of all problems of one type; a `slug` gives the type a page of its own.
+    """Common part of all problems of one type; a `slug` gives the type a page of its own.
 
-    The page says what the problem means and what the client should do.
+    The page explains the problem and its remedy.
     """
 
     status: int
@@ -40,12 +40,12 @@ class ProblemType:
 
     @property
     def type(self) -> str:
-        """The problem's `type`; without a slug the status says all."""
+        """URI of the problem's `type`; `about:blank` without a page."""
         return "about:blank" if self.slug is None else f"/problems/{self.slug}"
 
 
 class NotJson(errors.BadInput):
-    """A body that is not JSON: truncated, empty, or in another encoding."""
+    """Raised for a body that is not JSON: truncated, empty, or in another encoding."""
 
 
 PROBLEM_TYPES: dict[type[errors.AcquisitionError], ProblemType] = {
@@ -170,7 +170,7 @@ INTERNAL_ERROR = ProblemType(500, HTTPStatus(500).phrase)
 
 
 def problem_type_of(error: errors.AcquisitionError) -> ProblemType:
-    """The problem type of an error: that of its class, or of the nearest base class."""
+    """Problem type of an error, by its class or the nearest base class."""
     return next(
         (PROBLEM_TYPES[each] for each in type(error).__mro__ if each in PROBLEM_TYPES),
         INTERNAL_ERROR,
@@ -178,7 +178,7 @@ def problem_type_of(error: errors.AcquisitionError) -> ProblemType:
 
 
 def types_with_pages() -> dict[str, ProblemType]:
-    """Every type that has a page, by its slug, in the order of their statuses."""
+    """Problem types with a page, by slug, in the order of their statuses."""
     kinds = sorted((*PROBLEM_TYPES.values(), WRONG_HOST), key=lambda kind: kind.status)
     return {kind.slug: kind for kind in kinds if kind.slug is not None}
 
@@ -197,7 +197,7 @@ def problem_response(
     details: Mapping[str, Any],
     headers: dict[str, str] | None = None,
 ) -> Response:
-    """The response for a problem: its type, the address, and `details` with its `detail`."""
+    """HTTP response for a problem: its type, the path, and `details`."""
     content = _content(request, kind, details)
     # ASCII only: a client's text may hold lone surrogates, which UTF-8 cannot carry.
     body = json.dumps(content, ensure_ascii=True, separators=(",", ":"))
@@ -205,7 +205,7 @@ def problem_response(
 
 
 def root_path(request: Request) -> str:
-    """The path below which a proxy serves the service; empty without one."""
+    """Path below which a proxy serves the service; empty without one."""
     path: str = getattr(request.app.state, "root_path", "") if "app" in request.scope else ""
     return path
 
@@ -222,7 +222,7 @@ def _content(request: Request, kind: ProblemType, details: Mapping[str, Any]) ->
 
 
 def problem_within(request: Request, error: BaseException) -> Problem:
-    """The problem of a part of a request whose other parts are answered."""
+    """Problem of one part of a request whose other parts are answered."""
     if not isinstance(error, errors.AcquisitionError) or problem_type_of(error) is INTERNAL_ERROR:
         log.error("%s %s failed in part", request.method, request.url.path, exc_info=error)
         return convert(_content(request, INTERNAL_ERROR, FAILED), Problem)
@@ -246,7 +246,7 @@ def _headers_of(error: errors.AcquisitionError) -> dict[str, str] | None:
 
 
 def faults_in_query(error: RequestValidationError) -> list[errors.Fault]:
-    """The faults of a query, parameter by parameter."""
+    """Faults of the query parameters of a request."""
     return [
         errors.Fault(
             # Below the parameter, `loc` names the form of it that was tried.
@@ -268,7 +268,7 @@ async def _on_query_fault(request: Request, error: Exception) -> Response:
 
 
 async def on_http_error(request: Request, error: Exception) -> Response:
-    """The problem of an address or a method that there is not."""
+    """Problem answer to an unknown address or method."""
     assert isinstance(error, HTTPException)
     phrase = HTTPStatus(error.status_code).phrase
     headers = dict(error.headers or {})
@@ -315,13 +315,13 @@ _HANDLERS: Mapping[type[Exception], Callable[[Request, Exception], Awaitable[Res
 
 
 def add_error_handlers(app: FastAPI) -> None:
-    """Answer every expected error as a problem."""
+    """Register handlers that answer every expected error as a problem."""
     for kind, handler in _HANDLERS.items():
         app.add_exception_handler(kind, handler)
 
 
 async def error_response(request: Request, error: Exception) -> Response:
-    """The response to an expected error; any other is raised again."""
+    """HTTP response to an expected error; others are raised again."""
     for kind in type(error).__mro__:
         if kind in _HANDLERS:
             return await _HANDLERS[kind](request, error)

@@ -1,4 +1,4 @@
-"""Parameters of requests: each is checked, unknown ones are refused."""
+"""Query parameters of requests, with checks; unknown ones are refused."""
 
 from typing import Annotated, Any, Literal, Self, TypeAlias, TypedDict, TypeVar
 
@@ -29,7 +29,7 @@ MAX_LIMIT = 500
 
 T = TypeVar("T")
 FromQuery: TypeAlias = Annotated[T, InQuery()]
-"""A model whose fields are the query parameters of a route."""
+"""Annotation of a model whose fields are the query parameters of a route."""
 
 
 def _time(value: object) -> Utc:
@@ -44,10 +44,10 @@ TIME_SCHEMA: dict[str, Any] = {
     "pattern": r"^\d{4}-(\d\d-\d\d|\d{3})T\d\d:\d\d:\d\d(\.\d{1,9})?(Z|[+-]\d\d(:?\d\d)?)?$",
     "examples": ["1996-01-10T12:00:00.000Z", "1996-010T12:00:00Z"],
 }
-"""UTC in calendar form or with the day of the year; `format: date-time` knows no leap second."""
+"""Schema of UTC, calendar or day-of-year; `format: date-time` has no leap seconds."""
 
 Time = Annotated[Utc, PlainValidator(_time), WithJsonSchema(TIME_SCHEMA)]
-"""UTC text, calendar or day-of-year, as the core's own type."""
+"""UTC text, calendar or day-of-year, parsed to the type `Utc`."""
 
 Run = Annotated[RunName, Field(description="The run; `live` for the batches of pipelines.")]
 RunOrAll = Annotated[
@@ -78,12 +78,12 @@ SpacecraftFilter = Annotated[Key | None, Field(description="Only items of this s
 
 
 class Query(BaseModel):
-    """The base of every query: unknown parameters are refused."""
+    """Base of all query models; refuses unknown parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     def asked(self) -> dict[str, Any]:
-        """Every parameter by its name, as the app's functions take them."""
+        """Parameters by name, as arguments of the app's functions."""
         return {name: getattr(self, name) for name in type(self).model_fields}
 
 
@@ -94,7 +94,7 @@ def require_order(start: Utc | None, end: Utc | None) -> None:
 
 
 class RunAndTimes(TypedDict):
-    """A run and a period."""
+    """Arguments for a run and a period."""
 
     run: str
     start: Utc | None
@@ -102,7 +102,7 @@ class RunAndTimes(TypedDict):
 
 
 class PeriodQuery(Query):
-    """A period and a run."""
+    """Query with a run and a period."""
 
     run: Run = "live"
     start: Start = None
@@ -110,7 +110,7 @@ class PeriodQuery(Query):
 
     @property
     def run_and_times(self) -> RunAndTimes:
-        """Its run and times by their names, as the app's functions take them."""
+        """Run and times by name, as arguments of the app's functions."""
         return {"run": self.run, "start": self.start, "end": self.end}
 
     @model_validator(mode="after")
@@ -120,14 +120,14 @@ class PeriodQuery(Query):
 
 
 class PeriodPageQuery(PeriodQuery):
-    """A page of what lies in a period."""
+    """Query for one page of a list within a period."""
 
     limit: PageLimit = 100
     cursor: Cursor = None
 
 
 class AuditQuery(Query):
-    """A page of changes."""
+    """Query for one page of the audit list, with filters."""
 
     limit: PageLimit = 100
     cursor: Cursor = None
@@ -137,7 +137,7 @@ class AuditQuery(Query):
 
 
 class BatchQuery(PeriodPageQuery):
-    """Which of the recorded batches."""
+    """Query that selects recorded batches by run, period, spacecraft, outcome and status."""
 
     run: RunOrAll = "live"
     spacecraft: SpacecraftFilter = None
@@ -161,19 +161,19 @@ class BatchQuery(PeriodPageQuery):
 
 
 class RunQuery(Query):
-    """A run."""
+    """Query that selects a run."""
 
     run: Run = "live"
 
 
 class RatesQuery(PeriodQuery):
-    """Star rates of a period, in buckets."""
+    """Query for star rates of a period, in buckets."""
 
     bucket: Annotated[Bucket, Field(description="The width of a bucket, in UTC.")] = "hour"
 
 
 class HistoryQuery(PeriodQuery):
-    """A history of quantities, thinned out."""
+    """Query for the history of quantities, thinned or complete."""
 
     quantity: Annotated[
         list[QuantityName],
@@ -208,7 +208,7 @@ class HistoryQuery(PeriodQuery):
 
     @property
     def of_every_batch(self) -> bool:
-        """True if a table of all batches of the period is asked for."""
+        """True if a table of all batches of the period is requested."""
         return self.format != JSON_FORMAT and self.size is None and self.strategy != "minmax"
 
     @field_validator("quantity")
@@ -221,7 +221,7 @@ class HistoryQuery(PeriodQuery):
 
 
 class WorstQuery(PeriodQuery):
-    """Which batches are worst, by what."""
+    """Query for the batches with the worst values of a quantity."""
 
     by: Annotated[
         RankedName, Field(description="The quantity. For an offset, its absolute value.")
@@ -231,7 +231,7 @@ class WorstQuery(PeriodQuery):
 
 
 class AnnotationQuery(Query):
-    """Which annotations."""
+    """Query that selects annotations by spacecraft and period."""
 
     spacecraft: Annotated[
         Key | None,
@@ -249,7 +249,7 @@ class AnnotationQuery(Query):
 
 
 def without_nul(text: str | None) -> str | None:
-    """The text; raises `ValueError` for a NUL character, which PostgreSQL does not store."""
+    """Check a text; raises `ValueError` for a NUL character, which PostgreSQL does not store."""
     if text is not None and "\x00" in text:
         raise ValueError("must have no NUL character")
     return text
@@ -271,19 +271,19 @@ Comment = Annotated[
 
 
 class AuthorQuery(Query):
-    """Who makes a change."""
+    """Query with the author of a change."""
 
     who: Who = None
 
 
 class StatementQuery(AuthorQuery):
-    """Who makes a change, and a comment on it."""
+    """Query with the author of a change, and a comment."""
 
     comment: Comment = None
 
 
 NO_QUERY = Depends(require_no_query)
-"""The dependency of a route that takes no parameter."""
+"""Dependency of routes that take no query parameter."""
 
 
 SpacecraftPath = Annotated[str, Path(description="The spacecraft's name, such as `XTE`.")]

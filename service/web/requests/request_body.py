@@ -1,4 +1,4 @@
-"""Request bodies: type checked, size and time bounded while they stream; and Idempotency-Key.
+"""Request bodies: media type, size and time limits while streaming; and Idempotency-Key.
 
 The server has no deadline for a body, and the framework would buffer a body
 of any size.  A body that is too large is refused as soon as
@@ -33,28 +33,28 @@ FRAMES = (
     *("application/fits", "image/fits", "image/tiff", "image/png", "image/jpeg"),
     "application/x-npy",
 )
-"""Media types of frames; the first bytes tell the format."""
+"""Media types of frames; the first bytes determine the format."""
 
 MAX_JSON_BYTES = 2 << 20
-"""Enough for ten thousand stars, so that the error names their number and not the size."""
+"""Greatest size of a JSON body, enough for ten thousand stars, so that the error names them."""
 
 Body = TypeVar("Body", bound=BaseModel)
 
 
 @dataclass(frozen=True)
 class BodyLimits:
-    """How large and how slow a body may be."""
+    """Limits on the size and the duration of request bodies."""
 
     json_bytes: int = MAX_JSON_BYTES
     session_bytes: int = 4 << 10
-    """The bytes of `POST /session`, which asks for no token."""
+    """Greatest size in bytes of the body of `POST /session`, which needs no token."""
     small_bytes: int = 8 << 10
     """Bytes of each body that `budget_bytes` leaves out: a batch of 60 stars is never
     refused because of others."""
     budget_bytes: int = 8 << 20
     replay_bytes: int = 1 << 30
     pause_s: float = 20.0
-    """The longest wait for the next piece of a body."""
+    """Longest wait in seconds for the next piece of a body."""
     json_s: float = 60.0
     replay_s: float = 3600.0
     frame_s: float = 120.0
@@ -62,14 +62,14 @@ class BodyLimits:
 
 DEFAULT_LIMITS = BodyLimits()
 COUNTED = "counted_bytes"
-"""Key in the state of a request: the bytes of its body that `BodyBudget` counts."""
+"""Key in the state of a request for the bytes that `BodyBudget` counts."""
 RETRY_S = 1
 TRIM_AFTER_BYTES, TRIM_AFTER_S = 4 << 20, 5.0
-"""Memory is returned this long after this many bytes of large bodies: it takes about 5 ms."""
+"""Freed bytes of large bodies, and delay in seconds, after which memory is returned."""
 
 
 class BodyBudget:
-    """Counts the bytes of all bodies that are held in memory."""
+    """Limits the total memory of all request bodies in progress."""
 
     def __init__(self, limits: BodyLimits) -> None:
         self._small_bytes = limits.small_bytes
@@ -78,7 +78,7 @@ class BodyBudget:
         self._is_trim_due = False
 
     def add(self, request: Request, received: int) -> None:
-        """Count the bytes that have arrived of a body; raises `Busy` beyond the bound."""
+        """Count the received bytes of a body; raises `Busy` beyond the limit."""
         state = request.scope.setdefault("state", {})
         counted = state.get(COUNTED, 0)
         more = max(received - self._small_bytes, 0) - counted
@@ -88,7 +88,7 @@ class BodyBudget:
         state[COUNTED] = counted + more
 
     def remove(self, scope: Scope) -> None:
-        """Release the body of an answered request, which its connection would keep."""
+        """Release the body of an answered request, which its connection would keep in memory."""
         state = scope.get("state", {})
         state.pop("body", None)
         counted = state.pop(COUNTED, 0)
@@ -106,14 +106,14 @@ class BodyBudget:
 
 
 def trim_memory() -> None:
-    """Return freed memory that the C library keeps to the system; only glibc can."""
+    """Return freed memory from the C library to the system; only glibc supports this."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
 
 
 def _require_type(request: Request, allowed: tuple[str, ...]) -> str:
-    """The media type of a body, which must be one of these."""
+    """Media type of a body; raises 415 unless it is among `allowed`."""
     # Also a protection: pages of other sites can send only form types without a preflight.
     sent = request.headers.get("content-type", "")
     kind, _, parameters = sent.partition(";")
@@ -168,17 +168,17 @@ async def _pieces(
 
 
 async def json_body(request: Request) -> bytes:
-    """The bytes of a JSON body."""
+    """Read a JSON body within the limits."""
     return await read_json(request, request.app.state.limits.json_bytes)
 
 
 async def session_body(request: Request) -> bytes:
-    """The bytes of a JSON body that begins a session; it needs no token."""
+    """Read the JSON body that begins a session; it needs no token."""
     return await read_json(request, request.app.state.limits.session_bytes)
 
 
 async def read_json(request: Request, max_bytes: int) -> bytes:
-    """The bytes of a JSON body, at most so many."""
+    """Read a JSON body of at most `max_bytes` bytes."""
     _require_type(request, (JSON,))
     _coding(request, ("identity",))
     limits: BodyLimits = request.app.state.limits
@@ -195,7 +195,7 @@ async def read_json(request: Request, max_bytes: int) -> bytes:
 
 @dataclass(frozen=True)
 class Spooled:
-    """A body in a rewound file, with its number of lines where that is known."""
+    """A body stored in a rewound file, with its number of lines if known."""
 
     file: IO[bytes]
     coding: Coding
@@ -209,9 +209,9 @@ async def telemetry_body(
     discard: Callable[[IO[bytes]], object],
     formats: Mapping[str, InputFormat],
 ) -> Spooled:
-    """A body in one of the formats in a new file; one that did not arrive is discarded.
+    """Read telemetry in one of the formats into a new file; an incomplete one is discarded.
 
-    One with a batch a line may be compressed.  `formats` are input formats by name.
+    Formats with one batch per line may be compressed.  `formats` are input formats by name.
     """
     kind = _require_type(request, sum((each.media_types for each in formats.values()), ()))
     form = next(name for name, each in formats.items() if kind in each.media_types)
@@ -243,7 +243,7 @@ async def telemetry_body(
 
 
 async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
-    """A frame in a rewound temporary file that closing deletes."""
+    """Read a frame into a rewound temporary file that is deleted when closed."""
     _require_type(request, FRAMES)
     _coding(request, ("identity",))
     limits: BodyLimits = request.app.state.limits
@@ -259,7 +259,7 @@ async def frame_body(request: Request, max_bytes: int) -> IO[bytes]:
 
 
 def read_model(model: type[Body], body: bytes) -> Body:
-    """The checked object of a body; an empty body gives every default."""
+    """Validated model of a body; an empty body gives the defaults."""
     try:
         return checked_by(model.model_validate_json, body or b"{}")
     except BadBatch as error:
@@ -267,7 +267,7 @@ def read_model(model: type[Body], body: bytes) -> Body:
 
 
 def refused(body: bytes, refusal: BadInput) -> BadInput:
-    """The error of a body: `NotJson` where its text is not JSON.
+    """Error for a refused body: `NotJson` if its text is not JSON.
 
     The text is parsed for this only after an error.
     """
@@ -279,7 +279,7 @@ def refused(body: bytes, refusal: BadInput) -> BadInput:
 
 
 async def optional_json_body(request: Request) -> bytes:
-    """`json_body` of an operation whose fields all have defaults: it may be absent."""
+    """Read a JSON body that may be absent, since all its fields have defaults."""
     has_none = request.headers.get("content-length", "0") == "0"
     if has_none and "transfer-encoding" not in request.headers:
         return b""
@@ -292,7 +292,7 @@ SessionBody = Annotated[bytes, Depends(session_body)]
 
 
 async def require_no_query(request: Request) -> None:
-    """Raise `BadBatch` for every parameter that a request brings."""
+    """Raise `BadBatch` for every query parameter of a request."""
     faults = [
         Fault(name[:80], "unknown parameter; this route has none", shown_value(value))
         for name, value in request.query_params.items()
@@ -302,7 +302,7 @@ async def require_no_query(request: Request) -> None:
 
 
 async def idempotency_key(request: Request) -> str | None:
-    """The request's key, None without one; raises `BadBatch` where there are several."""
+    """Idempotency key of a request, None without one; raises `BadBatch` for several."""
     keys = request.headers.getlist("Idempotency-Key")
     if not keys:
         return None
@@ -328,12 +328,12 @@ def _no_idempotency_key(message: str) -> Any:
 NO_IDEMPOTENCY_KEY = _no_idempotency_key(
     "belongs to new batches: a what-if that is recorded twice is there twice"
 )
-"""The dependency of a route where a repeat makes another result."""
+"""Dependency of a route that refuses idempotency keys, as a repeat makes another result."""
 NO_KEY_OF_MANY = _no_idempotency_key(
     "belongs to one batch: of an array, each batch is recognised by its own batch id"
 )
-"""The dependency of a route that takes several batches."""
+"""Dependency of a route for several batches, which refuses idempotency keys."""
 NO_KEY_OF_A_BLOCK = _no_idempotency_key(
     "belongs to batches: a gyro block is recognised by its own name"
 )
-"""The dependency of a route that takes gyro blocks."""
+"""Dependency of a route for gyro blocks, which refuses idempotency keys."""
