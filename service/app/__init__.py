@@ -1,1 +1,1 @@
-"""The app: what every entrance (web, command, replay, demo) uses, split by subject."""
+"""The app, split by subject: the functions behind web, commands, replay and demonstration."""

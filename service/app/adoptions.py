@@ -1,4 +1,4 @@
-"""The calibration in force of each spacecraft: adopted and taken back by an operator."""
+"""Adoption of calibrations by an operator, and the return to earlier ones."""
 
 import logging
 from collections.abc import Sequence
@@ -25,18 +25,18 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 EVENT_FIELDS = ("id", "spacecraft", "adopted", "who", "note", "calibration", "version", "mission")
-"""The fields of a change's event; the others are long."""
+"""Fields of an adoption that its event contains; the others are long."""
 
 
 class CalibrationAdoptions:
-    """Adopts calibrations, and says what held when."""
+    """Service that adopts calibrations for spacecraft, and lists earlier adoptions."""
 
     def __init__(self, context: Context, in_force: MissionsInForce) -> None:
         self._context, self._in_force = context, in_force
         self._ids = Ulids()
 
     def in_force(self, spacecraft: str) -> CalibrationInForce:
-        """The calibration that new batches use, and every change of it, newest first."""
+        """Calibration that new batches of a spacecraft use, and all adoptions, newest first."""
         mission = self._context.mission(spacecraft)
         with self._context.reading() as connection:
             history = adoptions.list_adoptions(connection, spacecraft)
@@ -64,9 +64,9 @@ class CalibrationAdoptions:
         note: str = "",
         entry: Entry | None = None,
     ) -> CalibrationAdoption:
-        """Let new batches be processed with these trackers, which the calibration of this id gave.
+        """Adopt the tracker settings that a calibration gave, for new batches of a spacecraft.
 
-        Raises `WrongState` where they are in force already, or the mission has others.
+        Raises `WrongState` where they are in force already, or the mission has other trackers.
         """
         file = self.file_of(spacecraft)
         if [each.name for each in trackers] != [each.name for each in file.trackers]:
@@ -76,9 +76,9 @@ class CalibrationAdoptions:
     def revert(
         self, spacecraft: str, to: str | None, who: str, note: str = "", entry: Entry | None = None
     ) -> CalibrationAdoption:
-        """Go back to an earlier adoption of this id, or with None to the mission file.
+        """Return to an earlier adoption of a calibration, or with None to the mission file.
 
-        Raises `NotFound` for another spacecraft's, `WrongState` where that is in force.
+        Raises `NotFound` for another spacecraft's adoption, `WrongState` where it is in force.
         """
         file = self.file_of(spacecraft)
         if to is None:
@@ -149,5 +149,6 @@ class CalibrationAdoptions:
         with self._in_force.replacing(mission):
             if mission_named(self._context.missions, name).digest == mission.digest:
                 raise WrongState("these settings are in force already")
-            # Results name the settings by their digest, which is recorded before the first.
+            # Results refer to the settings by digest, so record the settings before the first
+            # result.
             return self._context.change_audited(change, entry)

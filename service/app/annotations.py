@@ -1,4 +1,4 @@
-"""Annotations: notes that people write on times and periods."""
+"""Annotations: notes that people write about times and periods."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from service.times import Utc, utc_now
 
 
 class Annotations:
-    """Reads, writes and deletes annotations.  `entry` goes to the audit list with a change."""
+    """Service for annotations; an `entry` adds the change to the audit list."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -31,14 +31,14 @@ class Annotations:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Annotation]:
-        """Annotations of a period, the latest written first; see `list_annotations`."""
+        """Page of the annotations in a period, newest first; see `list_annotations`."""
         with self._context.reading() as connection:
             return events.list_annotations(
                 connection, spacecraft=spacecraft, start=start, end=end, limit=limit, cursor=cursor
             )
 
     def get(self, id: str) -> Annotation:
-        """Return the annotation with an id."""
+        """Return the annotation with an id; raises `NotFound`."""
         with self._context.reading() as connection:
             return events.read_annotation(connection, known_id(id, "annotation"))
 
@@ -52,7 +52,7 @@ class Annotations:
         spacecraft: str | None = None,
         entry: Entry | None = None,
     ) -> Annotation:
-        """Write an annotation; without an end about a moment, without a spacecraft about all.
+        """Write an annotation about a moment or a period, and about one spacecraft or all.
 
         Raises `BadInput` for a spacecraft without a mission file.
         """
@@ -74,7 +74,7 @@ class Annotations:
         )
 
     def delete(self, id: str, entry: Entry | None = None) -> Annotation:
-        """Delete an annotation; the audit list keeps what it said."""
+        """Delete an annotation; the audit list keeps its text."""
         known = known_id(id, "annotation")
 
         def change(connection: Connection) -> Annotation:

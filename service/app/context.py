@@ -1,4 +1,4 @@
-"""Shared by the parts of the app: settings, missions, sky and database."""
+"""Settings, missions, sky and database, shared by the parts of the app."""
 
 from collections import ChainMap
 from collections.abc import Callable, Mapping
@@ -28,7 +28,7 @@ from service.times import Utc, utc_now
 from service.trends.quantities import limited_trackers
 
 ALL_RUNS = "*"
-"""Stands for every run, the live one included, where the name of a run is expected."""
+"""Text accepted in place of a run's name for every run, the live one included."""
 
 _RUN_NAME = TypeAdapter(RunName)
 
@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 
 class PageOfPeriod(TypedDict, total=False):
-    """Which page of a list, of which period and run; without a run of the live one."""
+    """Options of a page of a list: period, run (the live one by default), size and cursor."""
 
     run: str | None
     start: Utc | None
@@ -57,43 +57,43 @@ class Context:
 
     @cached_property
     def known(self) -> Mapping[str, Mission]:
-        """The missions of the files, and the last settings of retired spacecraft."""
+        """Missions of the files, with the last settings of retired spacecraft."""
         return ChainMap(self.missions, self.retired.missions)
 
     def mission(self, name: str) -> Mission:
-        """The mission of a spacecraft, a retired one too; raises `NotFound`."""
+        """Mission of a spacecraft, including retired ones; raises `NotFound`."""
         return mission_named(self.known, name)
 
     def trackers(self, name: str) -> tuple[str, ...]:
-        """The trackers of a spacecraft that have values of their own, then its retired ones."""
+        """Trackers of a spacecraft that have values of their own, followed by retired ones."""
         return (*limited_trackers(self.mission(name)), *self.retired.trackers.get(name, ()))
 
     def has_feature(self, name: str) -> bool:
-        """True unless the settings leave this feature out."""
+        """True unless the settings switch a feature off."""
         return any(each.name == name for each in features_on(self.settings.features_off))
 
     def require_alarms(self, wanted: bool) -> None:
-        """Raise `BadBatch` if alarms are wanted from a service that leaves them out."""
+        """Raise `BadBatch` if alarms are requested while that feature is switched off."""
         if wanted and not self.has_feature("alarms"):
             message = f"are off in this service ({SETTING}): nothing would evaluate the limits"
             raise BadBatch(Fault("alarms", message, "true"))
 
     def reading(self) -> AbstractContextManager[Connection]:
-        """A connection that sees one moment of the record and its projections; see `Store`."""
+        """Provide a connection with one snapshot of the record and its projections; see `Store`."""
         return self.store.reading()
 
     def active_alarms(self, connection: Connection, run: str) -> list[Alarm]:
-        """The alarms of a run that are not cleared, the one that is worst now first."""
+        """Alarms of a run that are not cleared, the worst present severity first."""
         modules = feature_modules("state", self.settings.features_off)
         now = utc_now().text
         return [each for one in modules for each in one.active_alarms(connection, run, now)]
 
     def reading_record(self) -> AbstractContextManager[Connection]:
-        """A connection for what reads no projection, and so waits for none."""
+        """Provide a connection for reading recorded data, which need not wait for projections."""
         return self.store.reading_record()
 
     def reading_batch(self, id: str) -> AbstractContextManager[tuple[Connection, bool]]:
-        """A connection that has the batch of a result; see `Store.reading_batch`."""
+        """Provide a connection that holds the batch of a result; see `Store.reading_batch`."""
         return self.store.reading_batch(id)
 
     def page(
@@ -103,9 +103,10 @@ class Context:
         name: str,
         asked: PageOfPeriod,
     ) -> Page[T]:
-        """A page of what is recorded of a spacecraft; raises `NotFound` for an unknown one.
+        """Page of a list about a spacecraft; raises `NotFound` for an unknown one.
 
-        `listing` reads it, of what `selection` makes of run, spacecraft, start and end.
+        `listing` reads the page for the filter that `selection` builds from run, spacecraft, start
+        and end.
         """
         self.mission(name)
         selected = selection(
@@ -123,7 +124,7 @@ class Context:
         return self.store.writer.change(change)
 
     def change_audited(self, change: Callable[[Connection], T], entry: Entry | None) -> T:
-        """`change` with its entry in the audit list, in one transaction.
+        """Change the database with an entry in the audit list, in one transaction.
 
         The projector evaluates all earlier batches first: an operator acts on alarms as the page
         showed them, and a new limit holds from the next batch on.
@@ -140,7 +141,7 @@ class Context:
 
 
 def known_id(id: str, what: str) -> str:
-    """An id as it was given; raises `NotFound` for a text that cannot be one, such as `x`."""
+    """Check the form of an id and return it; raises `NotFound` for one such as `x`."""
     # A malformed id needs no query.
     if not is_ulid(id):
         raise NotFound(f"there is no {what} with the id {shown_value(id)}")
@@ -148,7 +149,7 @@ def known_id(id: str, what: str) -> str:
 
 
 def checked_run_name(text: str) -> str:
-    """The name of a run; raises `BadBatch` for a text that names none."""
+    """Check the name of a run; raises `BadBatch` for an invalid one."""
     try:
         return _RUN_NAME.validate_python(text)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""The app: every part of the service, put together in one place."""
+"""Construction of the app from all parts of the service."""
 
 import logging
 from typing import Protocol, TypeVar
@@ -42,17 +42,17 @@ T = TypeVar("T")
 
 
 class Part(Protocol):
-    """The part that a feature adds to an open app."""
+    """Interface of the part that a feature adds to an open app."""
 
     def close(self) -> None:
-        """Stop the work that a feature's part has begun."""
+        """Stop the work that the feature has started."""
 
 
 class App:
-    """Everything the service does, over one sky, one set of missions and one database.
+    """The app: all functions of the service over one sky, one set of missions and one database.
 
-    Its attributes are the parts by subject.  Where no run is named they read the
-    live one, so replays never show in live lists and rates.
+    Its attributes are the parts by subject.  Without a named run they read the live one, so replays
+    never show in live lists and rates.
     """
 
     def __init__(
@@ -109,13 +109,13 @@ class App:
             self._parts[type(part)] = part
 
     def part(self, kind: type[T]) -> T:
-        """The part of the open app, found by its class, that a feature added."""
+        """Part of the open app that a feature added, found by its class."""
         part = self._parts[kind]
         assert isinstance(part, kind)
         return part
 
     def close(self) -> None:
-        """Stop the replays, write and project what is queued, and close the database."""
+        """Stop the replays, write and project the queued work, and close the database."""
         self.single_projector.stop()
         for part in self._parts.values():
             part.close()
@@ -128,7 +128,7 @@ class App:
 
 
 def _signer_of(settings: Settings) -> Sign | None:
-    """The function that signs heads of the record; None without a key."""
+    """Function that signs heads of the record; None without a key."""
     if settings.record_key is None:
         return None
     return Signer(settings.record_key).sign
@@ -142,19 +142,18 @@ def open_app(
     serving: bool = False,
     reads_only: bool = False,
 ) -> App:
-    """Read missions and catalog, open the database, start writing.
+    """Open the app: read missions and catalog, open the database, start writing.
 
-    With `serving`, other services may share the database: one of them projects.
-    With `reads_only`, one may write to a SQLite file, too: nothing is recorded of this start.
+    With `serving`, other services may share the database: one of them projects.  With `reads_only`,
+    another process may write to a SQLite file: this start records nothing.
 
-    `mission`, where given, takes the place of the one of that name.  `create`
-    and `serving` are about the database; see `Store`.
-    Raises `BadConfiguration` for whatever of these cannot be used.
+    A given `mission` replaces the one of the same name.  `create` and `serving` are about the
+    database; see `Store`.  Raises `BadConfiguration` for an unusable mission, catalog or database.
     """
     missions = load_missions(*settings.mission_places, shipped=settings.ships_missions)
     if mission is not None:
         missions[mission.name] = mission
-    # A key that cannot be used is named before the database is opened.
+    # Check the key before the database is opened, so that an invalid one is reported first.
     head_maker = None if reads_only else HeadMaker(_signer_of(settings))
     catalog, cache = open_catalog(settings.catalog), LruCache(settings.shelf_mb << 20)
     kernels = KernelBuild() if serving else None
@@ -171,7 +170,7 @@ def open_app(
     with store.reading() as connection:
         context = Context(settings, missions, sky, store, retired(connection, missions))
     app = App(context, kernels, head_maker)
-    # A mission that is given takes the place of what was adopted, too.
+    # A given mission also replaces an adopted calibration.
     leave = mission.name if mission is not None else None
 
     try:
@@ -197,7 +196,7 @@ def open_app(
 
 
 def _register(context: Context) -> None:
-    """Record the missions and the catalog in use."""
+    """Record the settings of all missions and the catalog in use."""
     moment = utc_now().text
     mission_rows = [
         {
@@ -214,7 +213,7 @@ def _register(context: Context) -> None:
 
 
 def _end_left_work(app: App) -> None:
-    """Close replays of an earlier process, where this is the only service."""
+    """Close replays left by an earlier process, if this is the only service on the database."""
     moment = utc_now().text
     stored = Spool(app.settings.spool_folder).ids()
     app.context.change(lambda connection: mark_interrupted(connection, moment, stored))

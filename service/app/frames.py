@@ -1,4 +1,4 @@
-"""Frames of star trackers: submit one, and the overlay of a recorded one."""
+"""Frames of star trackers: submission, pictures, and overlays of recorded frames."""
 
 import base64
 import json
@@ -26,19 +26,19 @@ from service.times import utc_now
 from service.vectors import Projection
 
 FRAME_WAIT_S = 30.0
-"""The longest time that a frame waits for a thread: other frames may take seconds."""
+"""Longest wait of a frame for a thread in seconds: other frames may take seconds."""
 _COMMAND_OPTION = re.compile(r" \(--[^)]*\)")
 
 
 def _asks_for_last(known: FrameIn, mission: Mission) -> bool:
-    """True if the batch of a frame may ask for the last attitude."""
+    """True if the batch from a frame may ask for the last attitude."""
     prior, settings = known.a_priori, mission.tracking
     is_default = settings is not None and settings.default
     return isinstance(prior, FromLastIn) or (prior is None and is_default)
 
 
 class Frames:
-    """Finds the stars on frames, in the solver pool: a frame takes about twenty bytes a pixel."""
+    """Service that finds stars on frames, in the solver pool: about twenty bytes a pixel."""
 
     def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
@@ -53,12 +53,11 @@ class Frames:
         idempotency_key: str | None = None,
         caller: Caller | None = None,
     ) -> Answered:
-        """Find the stars on a frame, then `submit` the batch of them; see `imaging.submit`.
+        """Find the stars on a frame, then submit the batch made from them; see `imaging.submit`.
 
-        The same frame with the same fields is a repeat and is not searched again.
-        The file is closed at the end.
-        Raises `NotFound` for an unknown spacecraft, `BadInput` for a file that is no
-        frame of its tracker's, and whatever `submit` raises.
+        The same frame with the same fields is a repeat and is not searched again.  The file is
+        closed at the end.  Raises `NotFound` for an unknown spacecraft, `BadInput` for a file that
+        is no frame of its tracker, and the errors of `submit`.
         """
         self._submissions.require_kernels()
         with file:
@@ -67,7 +66,7 @@ class Frames:
             max_pixels = self._context.settings.frame_megapixels * 1_000_000
 
             def make() -> Submission:
-                # Importing this takes a third of the time that the service needs to start.
+                # Imported here, since the import takes a third of the service's starting time.
                 from service.acquire.frame_submission import submit_frame
 
                 catalog = self._context.sky.catalog
@@ -95,15 +94,15 @@ class Frames:
         image: str | None = None,
         draws: bool = False,
     ) -> Picture:
-        """The attitude and the lens of a picture of any camera; nothing is recorded.
+        """Solve the attitude and the lens of a picture from any camera; nothing is recorded.
 
         With a `spacecraft` the picture must have the size of its camera's frames, whose focal
-        length is the first guess.  The file is closed at the end.  One picture is solved at a
-        time.  Raises `Busy` if others take too long, `NotFound` for an unknown spacecraft, and
-        `BadInput` for a file that is no picture.
+        length is the first guess.  The file is closed at the end.  One picture is solved at a time.
+        Raises `Busy` if others take too long, `NotFound` for an unknown spacecraft, and `BadInput`
+        for a file that is no picture.
         """
         self._submissions.require_kernels()
-        # Importing this takes a third of the time that the service needs to start.
+        # Imported here, since the import takes a third of the service's starting time.
         from service.acquire.picture import blind_sky, overlay_of, solve_picture
         from service.acquire.picture_remarks import doubt_of_exposure
         from service.identify.blind.solver import focal_px_of
@@ -141,10 +140,10 @@ class Frames:
         )
 
     def overlay(self, id: str) -> bytes:
-        """A PNG of the frame that a result was made of, with its stars, names and residuals."""
+        """Draw the frame of a result with its stars, names and residuals; returns a PNG."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             row = frame_of_result(connection, id)
-        # The mission of that result, which may differ from the present file.
+        # The mission at the time of the result, which may differ from the present file.
         mission = Mission.model_validate_json(row["settings"])
         answer, batch = answer_from_json(row["answer"]), submission_from_json(row["input"]).batch
         tracker, camera = mission.camera_tracker(batch.observations[0].tracker, "tracker")

@@ -1,4 +1,4 @@
-"""Replays: telemetry files processed in the background."""
+"""Replays of telemetry files, processed in the background."""
 
 import logging
 import threading
@@ -34,10 +34,10 @@ from service.times import utc_now
 log = logging.getLogger(__name__)
 
 MAX_REPLAYS, MAX_OF_ONE_TOKEN = 8, 4
-"""Most replays at a time, in all and of one token; each needs a thread and a file."""
+"""Largest number of replays at a time, in all and by token; each needs a thread and a file."""
 REPLAY_RETRY_S = 30
 CANCEL_WAIT_S = 5.0
-"""The longest time that cancelling waits for the end of a replay."""
+"""Longest wait of a cancellation for the end of the replay, in seconds."""
 
 
 class ReplayOptions(TypedDict, total=False):
@@ -45,32 +45,32 @@ class ReplayOptions(TypedDict, total=False):
 
     name: str
     total: int | None
-    """The number of lines, if it is known."""
+    """Number of lines of the replay; None if not known."""
     check: Check
-    """Raises the `AcquisitionError` that refuses a line of that spacecraft."""
+    """Function that raises an `AcquisitionError` for lines of a refused spacecraft."""
     alarms: bool
-    """Evaluate limits for the run; see `Runs.watch`."""
+    """True to evaluate limits for the replay's run; see `Runs.watch`."""
     owner: str | None
-    """The token that starts the replay; see `cancel`."""
+    """Id of the token that starts the replay; see `cancel`."""
     entry: Entry | None
-    """The entry of the audit list that is stored with it."""
+    """Entry of the audit list that is stored with the replay."""
 
 
 @dataclass(frozen=True)
 class UploadForm:
-    """How an upload is written."""
+    """Form of an upload: its coding, format and size limit."""
 
     coding: Coding
     longest_bytes: int
-    """A line is cut there."""
+    """Largest number of bytes in a line, which is cut there."""
     form: str = NDJSON
-    """The name of an input format (`Replays.formats`)."""
+    """Name of the upload's format (`Replays.formats`)."""
     spacecraft: str | None = None
-    """The mission whose archive is read; None: the only one that reads archives."""
+    """Mission for an upload of archived packets; None: the only mission that reads them."""
 
 
 class Replays:
-    """Starts, cancels and reports replays."""
+    """Service that starts, cancels and reports replays."""
 
     def __init__(
         self,
@@ -97,22 +97,22 @@ class Replays:
         self._spool = Spool(context.settings.spool_folder)
         off = context.settings.features_off
         self._archives = {each.FORMAT: each for each in feature_modules("telemetry", off)}
-        """The features that read uploads of other forms than lines, by name of the format."""
+        """Modules of features that read uploads without lines, by name of the format."""
         self.formats = {k: each for k, each in input_formats(off).items() if each.media_types}
-        """The input formats of uploads, by name."""
+        """Input formats accepted for uploads, by name."""
         self._lock = threading.Lock()
         self._replays: list[RunningReplay] = []
         self._given_up: set[str] = set()
-        """The replays that this process could not continue: it does not try again."""
+        """Ids of replays that this process could not resume and will not try again."""
         self._closing = False
 
     @property
     def at_work(self) -> list[RunningReplay]:
-        """The replays that are not over."""
+        """Replays that have not ended."""
         return [each for each in self._replays if not each.is_over]
 
     def start(self, lines: Iterable[bytes], run: str, **options: Unpack[ReplayOptions]) -> str:
-        """Process NDJSON lines in the background; returns the id of the replay.
+        """Start a replay of NDJSON lines in the background; returns its id.
 
         Every batch goes to `run`.  Lines that can be closed are closed at the end.
         """
@@ -122,7 +122,7 @@ class Replays:
         return replay.id
 
     def new_upload(self, caller: Caller) -> IO[bytes]:
-        """A file for an upload; raises `Busy` if the caller cannot start a replay now."""
+        """Create a file for an upload; raises `Busy` if the caller cannot start a replay now."""
         self._require_slot(caller.token_id)
         self._require_memory()
         return self._spool.new_file()
@@ -135,10 +135,10 @@ class Replays:
         caller: Caller,
         **options: Unpack[ReplayOptions],
     ) -> str:
-        """`start` with the lines of an upload, which is stored until the replay is over.
+        """Start a replay of an uploaded file, which is stored until the replay is over.
 
-        Raises `BadInput` for an archive that the feature which reads it refuses, and for CSV
-        without the columns of a batch.
+        Raises `BadInput` for an archive that its feature refuses, and for CSV without the columns
+        of a batch.
         """
         bound = None if caller.spacecraft is None else sorted(caller.spacecraft)
         options |= {"check": caller.require, "owner": caller.token_id}
@@ -170,7 +170,7 @@ class Replays:
         return replay.id
 
     def resume(self) -> None:
-        """Continue the uploads that an earlier process has not finished."""
+        """Resume the uploads that an earlier process has not finished."""
         for about in self._spool.left():
             if about.id in self._given_up:
                 self._spool.release(about.id)
@@ -178,7 +178,7 @@ class Replays:
             try:
                 self._require_memory()
             except Busy as error:
-                # It stays in the spool: what ended the last process may have been this replay.
+                # Keep it in the spool: the replay itself may have ended the last process.
                 log.warning("replay %s is not continued yet: %s", about.id, error)
                 self._spool.release(about.id)
                 continue
@@ -203,7 +203,7 @@ class Replays:
         file = self._spool.open(about.id)
         form = UploadForm(about.coding, about.longest_bytes, about.form_name, about.packets)
         try:
-            # An archive that cannot be read any more must not leave a replay that never ends.
+            # An archive that has become unreadable must not leave a replay that never ends.
             archive = self._archive_lines(file, form)
             replay = self._new(stored.run, options, stored, self._spool.drop)
         except BaseException:
@@ -221,9 +221,9 @@ class Replays:
         return read_lines(self._spool.path(about.id), about.form_name)
 
     def _archive_lines(self, file: IO[bytes], form: UploadForm) -> CountedLines | None:
-        """The batches of an archive; None for an upload of lines.
+        """Open an uploaded archive as lines of batches; None for an upload of lines.
 
-        Raises `NotAvailable` where the feature that reads it has been switched off since.
+        Raises `NotAvailable` where the feature that reads it has been switched off.
         """
         if form.form not in self.formats:
             message = f"no feature reads it; see {SETTING}"
@@ -241,7 +241,7 @@ class Replays:
         stored: Replay | None = None,
         drop: Callable[[str], object] = lambda id: None,
     ) -> RunningReplay:
-        """A replay that takes a slot; `drop` is called at its end unless it can be resumed."""
+        """Create a replay in a free slot; `drop` is called at its end unless it can be resumed."""
         state = stored or _new_state(checked_run_name(run), options)
 
         def ended(end: str) -> None:
@@ -281,12 +281,12 @@ class Replays:
         require_memory_for_replay(max(0, workers.count - workers.up))
 
     def cancel(self, id: str, caller: Caller | None = None) -> Replay:
-        """End a replay; what it recorded stays.  Returns how far it came.
+        """Cancel a replay and return its progress; recorded batches stay.
 
-        Waits a few seconds for its end, until when its state is `running`.  A
-        replay that is cancelled already is left as it is.  Raises `NotFound`,
-        also where the caller is bound to spacecraft and the replay was not
-        started with their token, and `WrongState` where it has ended otherwise.
+        Waits a few seconds for its end, until when its state is `running`.  A replay that is
+        cancelled already is left unchanged.  Raises `NotFound`, also where the caller is limited to
+        spacecraft and the replay was not started with its token, and `WrongState` where it has
+        ended otherwise.
         """
         known = known_id(id, "replay")
         with self._lock:
@@ -307,12 +307,12 @@ class Replays:
         return cancelled
 
     def all(self, spacecraft: Collection[str] | None = None) -> list[Replay]:
-        """The latest replays, newest first; with `spacecraft`, see `list_replays`."""
+        """List the latest replays, newest first; for `spacecraft` see `list_replays`."""
         with self._context.reading() as connection:
             return replays.list_replays(connection, spacecraft)
 
     def get(self, id: str) -> Replay:
-        """A replay and how far it is, with the lines that were refused."""
+        """Read a replay with its progress and its refused lines."""
         with self._context.reading_record() as connection:
             return replays.read_replay(connection, known_id(id, "replay"))
 
@@ -321,7 +321,7 @@ class Replays:
         return self.bulk.workers.up
 
     def stop(self) -> None:
-        """Stop every replay; none starts from now on."""
+        """Stop all replays; no further one starts."""
         with self._lock:
             self._closing = True
         for replay in self._replays:
@@ -348,13 +348,13 @@ def _new_state(run: str, options: ReplayOptions) -> Replay:
 
 
 def discard_upload(file: IO[bytes]) -> None:
-    """Remove an upload for which no replay was started."""
+    """Delete an upload for which no replay was started."""
     file.close()
     Path(file.name).unlink(missing_ok=True)
 
 
 def _stored_with(run: str, options: ReplayOptions) -> Callable[[Connection], None]:
-    """A function that stores what belongs to a new replay, in its transaction."""
+    """Function that stores a new replay's alarm setting and audit entry, in its transaction."""
 
     def store(connection: Connection) -> None:
         if options.get("alarms"):

@@ -1,4 +1,4 @@
-"""Recorded results: one, a page of them, and a batch again with other options."""
+"""Recorded results: single ones, pages of lists, what-ifs, and comparisons of options."""
 
 import json
 import math
@@ -46,14 +46,14 @@ from service.times import Utc, utc_now
 
 
 class Results:
-    """Reads recorded results."""
+    """Service that reads recorded results, their charts, and their what-ifs."""
 
     def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
         self._submissions = submissions
 
     def get(self, id: str) -> Result:
-        """One result: `answer`, `input`, `current`, `parent`, and the `what_ifs` of its batch."""
+        """Read a result with its answer and input, and the what-ifs of its batch."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, archived):
             record = results.read_record(connection, id, archived=archived)
         if record.parent is None:
@@ -63,9 +63,9 @@ class Results:
         return structs.replace(record, signature=signature)
 
     def latest(self, spacecraft: str, run: str | None = None) -> Result:
-        """The newest current result of a spacecraft in a run, by batch time; as `get`.
+        """Read the newest current result of a spacecraft in a run, by batch time, as `get` does.
 
-        A live batch that is dated far in the future counts only where there is no other.
+        A live batch that is dated far in the future counts only if there is no other.
         """
         run = run or LIVE
         self._context.mission(spacecraft)
@@ -89,11 +89,11 @@ class Results:
         limit: int = 100,
         cursor: str | None = None,
     ) -> Page[Summary]:
-        """Current results, newest batch time first; see `results.list_batches`.
+        """Page of current results, newest batch time first; see `results.list_batches`.
 
-        The run `*` stands for every run, live batches included.  `batch` is a batch id, of
-        which there is one in each run of a spacecraft.
-        Raises `BadBatch` for a spacecraft that has neither batches nor a mission.
+        The run `*` stands for every run, live batches included.  `batch` is a batch id, which
+        occurs once in each run of a spacecraft.  Raises `BadBatch` for a spacecraft that has
+        neither batches nor a mission.
         """
         stretch = ResultFilter(None if run == ALL_RUNS else run or LIVE, spacecraft, start, end)
         with self._context.reading_record() as connection:
@@ -113,24 +113,24 @@ class Results:
         return page
 
     def neighbours(self, id: str) -> Neighbours:
-        """The results before and after one in time: `earlier` and `later`, or None."""
+        """Results before and after a result in time: `earlier` and `later`, or None."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             place = place_of(connection, id)
         with self._context.reading_record() as connection:
             return neighbours(connection, self._context.store.archive, place)
 
     def around(self, moment: Utc, run: str, spacecraft: str | None = None) -> Neighbours:
-        """The latest result of a run until a time, and the first one after it."""
+        """Latest result of a run up to a time, and the first one after that time."""
         # One nanosecond later, so that a batch at the time itself is `earlier`.
         place = ResultPlace(spacecraft, run, moment.tai_ns + 1, None)
         with self._context.reading_record() as connection:
             return neighbours(connection, self._context.store.archive, place)
 
     def star_field(self, id: str, answer: Answer | None = None) -> StarField:
-        """The data of the chart of a result's stars; see `star_field.star_field_of`.
+        """Data for the star charts of a result; see `star_field.star_field_of`.
 
-        An `answer` in place of the recorded one, such as that of a what-if, is
-        drawn over the same batch.
+        An `answer` in place of the recorded one, such as that of a what-if, is drawn over the same
+        batch.
         """
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             batch, recorded = recorded_batch(connection, id)
@@ -139,10 +139,10 @@ class Results:
         return star_field_of(batch, mission, self._context.sky, answer)
 
     def trackers(self, id: str, answer: Answer | None = None) -> list[Row]:
-        """The trackers of a result side by side; see `tracker_comparison`.
+        """Values of a result's trackers for a comparison; see `tracker_comparison`.
 
-        Empty for a result of one tracker.  An `answer` in place of the recorded one, such
-        as that of a what-if, is compared over the same batch.
+        Empty for a result of one tracker.  An `answer` in place of the recorded one, such as that
+        of a what-if, is compared over the same batch.
         """
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             batch, recorded = recorded_batch(connection, id)
@@ -155,9 +155,9 @@ class Results:
     def period(
         self, spacecraft: str, *, run: str | None = None, start: Utc, end: Utc
     ) -> PeriodStars:
-        """The stars and attitudes of a period, of some batches where there are many.
+        """Stars and attitudes of a period, from a sample of its batches if there are many.
 
-        See `period.sample_period`, which also bounds what is read.
+        See `period.sample_period`, which also bounds the number of batches read.
         """
         self._context.mission(spacecraft)
         span = BucketFilter(spacecraft, run or LIVE, start, end)
@@ -166,13 +166,13 @@ class Results:
         return period_stars(sample, self._context.sky)
 
     def settings_for(self, id: str) -> Choices:
-        """The settings that a what-if of a result changes."""
+        """Settings of a result that a what-if can change."""
         with self._context.reading_batch(known_id(id, "batch")) as (connection, _):
             batch, _ = recorded_batch(connection, id)
         return choices_of(batch, self._context.mission(batch.spacecraft))
 
     def spacecraft_of(self, id: str) -> str | None:
-        """The spacecraft that a recorded result belongs to; None where there is no such result."""
+        """Spacecraft of a recorded result; None for an unknown result."""
         if not is_ulid(id):
             return None
         with self._context.reading_record() as connection:
@@ -186,11 +186,10 @@ class Results:
         adopt: bool = False,
         entry: Entry | None = None,
     ) -> Answered:
-        """Process a recorded batch again; `options` replace those of the result that they name.
+        """Process a recorded batch again; `options` override those of its result.
 
-        The answer names its parent.  It is kept only where `record` or `adopt`
-        asks for that; adopted, it becomes what lists, histories and rates show.
-        `entry` goes to the audit list with it.
+        The answer names its parent.  It is stored only if `record` or `adopt` is set; an adopted
+        one appears in lists, histories and rates.  `entry` goes to the audit list with it.
         """
         known = known_id(id, "batch")
         self._submissions.require_kernels()
@@ -202,7 +201,7 @@ COMPARE_SAMPLE, COMPARE_RETRY_S = 100, 10
 
 @dataclass(frozen=True)
 class Stretch:
-    """The batches to compare with: at most `sample` of a period."""
+    """Period whose batches are compared, at most `sample` of them."""
 
     spacecraft: str
     run: str | None = None
@@ -212,7 +211,7 @@ class Stretch:
 
 
 class Comparisons:
-    """Compares sets of options, or settings, for one caller at a time."""
+    """Service that compares two sets of options or settings, for one caller at a time."""
 
     def __init__(self, context: Context, submissions: SubmissionService) -> None:
         self._context = context
@@ -231,22 +230,22 @@ class Comparisons:
         sample: int = COMPARE_SAMPLE,
         limit_s: float = math.inf,
     ) -> Comparison:
-        """Run recorded batches again with two sets of options and show where they differ.
+        """Run recorded batches again with two sets of options, and list the differences.
 
-        Raises `BadBatch` for a setting that changes nothing for any of them.
-        Of a stretch at most `sample` batches, fewer where `limit_s` seconds run
-        out.  Settings that the options do not name stay as they were for a batch.  Raises
-        `Busy` while the service is computing another comparison.
+        Raises `BadBatch` for a setting that changes nothing for any batch.  At most `sample`
+        batches of the period are compared, fewer where `limit_s` seconds run out.  Settings that
+        the options do not name stay as they were for a batch.  Raises `Busy` while the service is
+        computing another comparison.
         """
         mission = mission_named(self._context.missions, name)
         again = self._submissions.run_again_many
-        # Most batches have the same options.
+        # Cached, since most batches have the same options.
         merged = cache(lambda own, side: merged_options(json.loads(own), (a, b)[side]).to_options())
 
         def pair_of(row: Row) -> Pair:
             sent = submission_from_json(row["input"]).batch
             if sent.measurement is not None:
-                # Such a batch has no stars to identify: options do not change its answer.
+                # A measured attitude has no stars to identify: options do not change its answer.
                 return Pair(row["id"], sent, sent)
             options = (merged(row["options"], side) for side in (0, 1))
             return Pair(row["id"], *(structs.replace(sent, options=each) for each in options))
@@ -265,7 +264,7 @@ class Comparisons:
     def of_missions(
         self, stretch: Stretch, a: Mission, b: Mission, limit_s: float = math.inf
     ) -> Comparison:
-        """The same with two settings of the mission, and every batch's own options."""
+        """Run recorded batches again with two settings of the mission; see `of_options`."""
 
         def pair_of(row: Row) -> Pair:
             batch = batch_with_options(row["input"], row["options"])

@@ -1,4 +1,4 @@
-"""Named runs: lists, alarms on or off, comparisons, and reprocessing into one."""
+"""Named runs: lists, evaluation of limits, comparisons, removal, and reprocessing."""
 
 import hashlib
 import os
@@ -25,28 +25,28 @@ from service.storage.upkeep.reprocessing import Reprocessing, reprocessings
 from service.times import Utc, utc_now
 
 MOST_COMPARED = 2_000
-"""Batches of one page of two runs: to compare them takes less than a second."""
+"""Largest number of batches compared for a page, which takes less than a second."""
 MOST_CHANGED = 50
 
 
 class Runs:
-    """Reads and compares runs."""
+    """Service that lists, compares, reprocesses and removes runs."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
 
     def all(self, spacecraft: Collection[str] | None = None) -> list[runs.Run]:
-        """Every run with batches; with `spacecraft`, of these, as if there were no others."""
+        """List all runs with batches; with `spacecraft`, only batches of these count."""
         with self._context.reading() as connection:
             return histories.list_runs(connection, spacecraft)
 
     def default(self) -> str:
-        """The run to show first: live, or the newest while that is empty."""
+        """Run to show first: the live one, or the newest while that is empty."""
         with self._context.reading() as connection:
             return fleet.default_run(connection)
 
     def watch(self, run: str, alarms: bool = True, entry: Entry | None = None) -> runs.RunState:
-        """Turn the evaluation of limits on or off for the batches that a run gets from now on."""
+        """Switch the evaluation of limits for future batches of a run on or off."""
         name = checked_run_name(run)
         if name == LIVE and not alarms:
             raise BadBatch(Fault("alarms", "alarms are always on for live batches", "False"))
@@ -69,7 +69,7 @@ class Runs:
         )
 
     def would_forget(self, selected: ForgetFilter) -> runs.Forgotten:
-        """The data that `forget` would remove."""
+        """Count the data that `forget` would remove."""
         checked_run_name(selected.run)
         with self._context.reading() as connection:
             return found(connection, selected)
@@ -82,7 +82,7 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
     ) -> runs.RunComparison:
-        """The outcomes of the same stars in two runs, and the angles between their attitudes."""
+        """Compare the outcomes of the same stars in two runs, and their attitudes."""
         with self._context.reading() as connection:
             return compare_runs(
                 connection,
@@ -99,7 +99,7 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
     ) -> tuple[runs.RunComparison, list[runs.RunChange]]:
-        """Compare two runs over a spacecraft's latest batches of a period; list what differs."""
+        """Compare two runs over a spacecraft's latest batches of a period; list differences."""
         self._context.mission(spacecraft)
         place, archive = ResultFilter(run, spacecraft, start, end), self._context.store.archive
         with self._context.reading() as connection:
@@ -117,7 +117,7 @@ class Runs:
         start: Utc | None = None,
         end: Utc | None = None,
     ) -> runs.RatesOfRuns | None:
-        """The rates of all batches of a spacecraft in both runs; None without a common period."""
+        """Rates of stars by outcome of a spacecraft in both runs; None without a common period."""
         with self._context.reading() as connection:
             return run_rates(connection, spacecraft, (run, other), start, end)
 
@@ -133,12 +133,11 @@ class Runs:
         track: bool = False,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
     ) -> ReprocessProgress:
-        """Process the batches of a run again into another run.
+        """Process the batches of a run again into another run, with the settings of this app.
 
-        The settings are those of this app.  Without `run` the name is derived from the
-        settings.  Batches that the run already has are not processed again.
-        With `track` they are searched about the last attitude of the run, one after another.
-        Raises `BadBatch` if the run has results of other settings.
+        Without `run` the name is derived from the settings.  Batches that the run already has are
+        skipped.  With `track` stars are searched about the last attitude of the run, batch after
+        batch.  Raises `BadBatch` if the run has results of other settings.
         """
         plan = self._plan(run, source, spacecraft, start, end, processes, track)
         sky = self._context.sky
@@ -158,7 +157,7 @@ class Runs:
         scheduler: str | None = None,
         step: Callable[[ReprocessProgress], object] = lambda progress: None,
     ) -> ReprocessProgress:
-        """Process the batches of a run again, archived ones too, into parts of an archive.
+        """Process the batches of a run again into parts of an archive, archived ones included.
 
         Local processes compute, or the workers of a Dask scheduler.  See `reprocess`.
         """
@@ -184,7 +183,7 @@ class Runs:
         return reprocess_partitions(self._context.store, folder, plan, digest, workers, step)
 
     def reprocessings(self) -> list[Reprocessing]:
-        """The reprocessings into the service's archive, the latest first; none without one."""
+        """Reprocessings into the service's archive, the latest first; empty without an archive."""
         folder = self._context.settings.archive_folder
         return [] if folder is None else reprocessings(folder)
 
@@ -216,7 +215,7 @@ class Runs:
         )
 
     def _run_of_settings(self, source: str, missions: Mapping[str, Mission], track: bool) -> str:
-        """A name derived from the settings, so that an interrupted run can continue."""
+        """Name of a run, derived from the settings, so that an interrupted run can continue."""
         digests = [
             self._context.sky.catalog.digest,
             *sorted(each.digest for each in missions.values()),

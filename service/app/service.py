@@ -1,4 +1,4 @@
-"""The service itself: readiness, its description, and its log of events."""
+"""The service as a whole: readiness, its description, and its events."""
 
 import gc
 import logging
@@ -33,7 +33,7 @@ from service.times import Utc, utc_now
 log = logging.getLogger(__name__)
 
 WARM_UP_RUNS = 8
-"""Runs of a recorded batch at the start; the interpreter then has specialised its code."""
+"""Number of warm-up runs of a recorded batch; the interpreter then has specialised its code."""
 CREDITS = (
     "Hipparcos and Tycho-2 catalogs: ESA 1997, ESA/ESTEC; Hog et al. 2000",
     "Method: D. Fink and D. Shoup, Goddard Space Flight Center, 1994",
@@ -42,7 +42,7 @@ CREDITS = (
 
 
 class Service:
-    """Prepares the service for its first batch, and describes it."""
+    """Preparation of the service for its first batch, and its description."""
 
     def __init__(
         self,
@@ -67,12 +67,11 @@ class Service:
         self.started = utc_now()
 
     def ready(self) -> None:
-        """Return once batches run at full speed; the first call compiles and prewarms.
+        """Prepare the service and return when batches run at full speed.
 
-        Other calls return as soon as batches with a zone do, while the first call compiles the
-        rest.
-        Raises `Busy` while another call does so, if the database cannot be read, and if the
-        last write failed and another write, tried now, fails too.
+        The first call compiles kernels and builds the sky.  While it does, other calls return as
+        soon as batches with a zone can be processed.  Raises `Busy` before that, if the database
+        cannot be read, and if the last write failed and another write, tried now, fails too.
         """
         if not self._is_warm:
             if not self._warming.acquire(blocking=False):
@@ -80,7 +79,7 @@ class Service:
             try:
                 self._prepare()
             except BaseException:
-                # The kernels of zones may be there, but not the others: the next call tries again.
+                # The kernels of zones may exist without the others: the next call tries again.
                 self._is_warm = False
                 raise
             finally:
@@ -101,14 +100,14 @@ class Service:
         self._prewarm_sky(self._context.missions.values(), utc_now())
         self._become_warm()
         if self._kernels is not None:
-            # Only the service does this by itself, not a command beside it.
+            # Only a service does this by itself, not a command.
             self._replays.resume()
             self._single_projector.resume_with(self._replays.resume)
             self._single_projector.when_projecting(self._upgrade.start)
             self._expiries.warn()
 
     def _begin_with_zones(self) -> None:
-        """Load the kernels of batches with a zone, and be ready for these."""
+        """Load the kernels of batches with a zone, and accept such batches."""
         in_zones = [name for name, entry in IDENTIFIERS.items() if entry.searches_zone]
         prewarm_kernels(self._context.sky, self._context.missions, in_zones)
         self._prewarm_sky(self._context.missions.values(), utc_now())
@@ -116,39 +115,39 @@ class Service:
         log.info("ready for batches with an a priori attitude; still compiling other kernels")
 
     def _go_on_with_whole_sky(self) -> None:
-        """Load the kernels of whole-sky searches, and build the catalogs that they search."""
+        """Load the kernels of whole-sky searches, and build their catalogs."""
         prewarm_kernels(self._context.sky, self._context.missions)
         self._prewarm_sky(self._context.missions.values(), utc_now(), whole_sky=True)
         log.info("ready for batches that need the whole sky; still compiling other kernels")
 
     def _prewarm_sky(self, missions: Iterable[Mission], time: Utc, whole_sky: bool = False) -> None:
-        """Open or build what batches need; for the whole sky if asked, or its kernels are there."""
+        """Build catalogs and zones of missions; for the whole sky if its kernels exist."""
         whole_sky |= self._kernels is None or not self._kernels.whole_sky_needed
         for mission in missions:
             try:
                 prewarm_sky(self._context.sky, [mission], time, whole_sky)
             except AcquisitionError as error:
-                # It is refused to the batches that need it, and no other mission waits for it.
+                # Only batches of this mission are refused then; no other mission waits for it.
                 log.warning("the sky of %s cannot be built: %s", mission.name, error)
 
     def _become_warm(self) -> None:
         if not self._is_warm:
             self._prewarm_recent_pointings()
-            # Collecting the present objects would take longer than a batch, each time.
+            # Collecting the present objects each time would take longer than a batch.
             gc.freeze()
             self._is_warm = True
 
     def being_compiled(self) -> list[str]:
-        """The kinds of work that a service which is ready refuses for want of kernels."""
+        """Kinds of work that are refused while their kernels are compiled."""
         return [] if self._kernels is None else self._kernels.being_compiled
 
     def cancel_warmup(self) -> None:
-        """End the compiling of kernels, which may take minutes."""
+        """Cancel the compilation of kernels, which may take minutes."""
         if self._kernels is not None:
             self._kernels.cancel()
 
     def close(self) -> None:
-        """Let the garbage collector see the objects again that `ready` withheld from it.
+        """Return the objects that `ready` froze to the garbage collector.
 
         Otherwise a program that opens and closes services would never free one.
         """
@@ -158,8 +157,8 @@ class Service:
     def _prewarm_recent_pointings(self) -> None:
         """Build the zones that the next batch of each live spacecraft will most likely need.
 
-        The latest batch of each is processed again under a new id and rolled back; if there
-        are few, several times, because code runs slowly at first.
+        The latest batch of each is processed again under a new id and rolled back; with few
+        spacecraft several times, because code runs slowly at first.
         """
         with self._context.reading_record() as connection:
             inputs = latest_inputs(connection, self._context.missions, utc_now())
@@ -176,7 +175,7 @@ class Service:
                 log.warning("the latest batch of a spacecraft could not be run again: %s", error)
 
     def about(self, spacecraft: Collection[str] | None = None) -> About:
-        """Version, catalog, missions, of these spacecraft alone, and kind of database."""
+        """Description of the service: version, catalog, missions and database."""
         catalog = self._context.sky.catalog
         return About(
             version=__version__,
@@ -194,25 +193,25 @@ class Service:
         )
 
     def record_head(self) -> RecordHead:
-        """The last head of the record; raises `NotFound` before the first."""
+        """Last head of the record; raises `NotFound` before the first one."""
         with self._context.reading_record() as connection:
             return require_head(connection)
 
 
 class Events:
-    """Reads events."""
+    """Service that reads events."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
 
     def last(self, spacecraft: Collection[str] | None = None) -> int:
-        """The number of the latest event; with `spacecraft`, of the latest about one of these."""
+        """Number of the latest event, or of the latest one about some spacecraft."""
         with self._context.reading() as connection:
             if spacecraft is None:
                 return events.last_event(connection)
             return events.last_event_about(connection, spacecraft)
 
     def after(self, last: int, limit: int) -> Sequence[Event] | None:
-        """The events after a number, oldest first; None where some of them are no longer kept."""
+        """Events after a number, oldest first; None where some of them are no longer kept."""
         with self._context.reading_record() as connection:
             return events.events_after(connection, last, limit)

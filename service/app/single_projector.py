@@ -1,8 +1,8 @@
-"""One of the services on a PostgreSQL database projects; where it ends another takes over.
+"""Choice of the one service that projects among those on a PostgreSQL database.
 
-Every service accepts and records.  The one that holds the projector's lock also does what one of
-them does alone: it raises alarms by the clock, delivers webhooks, makes the attitudes of each day
-and ends the work that a service has left behind.
+Every service accepts and records.  The one that holds the projector's lock also does the work for
+all of them: it raises alarms by the clock, delivers webhooks, computes the attitudes of each day
+and closes work left by a service that ended.  If it ends, another takes over.
 """
 
 import logging
@@ -22,9 +22,11 @@ from service.times import utc_now
 
 TRY_EVERY_S = 0.5
 RECOVER_EVERY_S = 2.0
-"""A replay or calibration that no service works on at two looks in a row is marked as interrupted.
+"""Interval in seconds of the check for replays and calibrations without a service.
 
-A service whose session was cut has taken a new one by the second look."""
+Work without a service at two checks in a row is marked as interrupted: a service whose session was
+cut has taken a new one by the second check.
+"""
 
 log = logging.getLogger(__name__)
 
@@ -35,7 +37,7 @@ Interrupt = Callable[[Connection, str, set[str]], object]
 
 @dataclass(frozen=True)
 class LeftWork:
-    """A kind of work that a service may leave behind when it ends."""
+    """Kind of work that a service may leave unfinished when it ends."""
 
     unfinished: Unfinished
     interrupt: Interrupt
@@ -46,7 +48,7 @@ def _interrupt_replays(connection: Connection, now: str, ids: set[str]) -> None:
 
 
 class SingleProjector:
-    """Knows if this process is the one that projects; `start` makes it so where no other is.
+    """State of the choice: True if this process projects; `start` competes for the lock.
 
     A process without the lock of `Store` always projects: on SQLite, and a command.
     """
@@ -65,13 +67,13 @@ class SingleProjector:
 
     @property
     def is_projecting(self) -> bool:
-        """True if this process projects, as far as is known without asking the database."""
+        """True if this process projects, to its own knowledge, without asking the database."""
         return self._store.is_projecting
 
     def start(self, follow: Callable[[], object]) -> None:
-        """Begin to project if no other service does; else try again twice a second.
+        """Start projecting if no other service does; otherwise try again twice a second.
 
-        `follow` is called at each try, to take over what another service has changed.
+        `follow` is called at each attempt, to take over changes by other services.
         """
         if self._lock is None:
             return
@@ -85,25 +87,25 @@ class SingleProjector:
         self._thread.start()
 
     def resume_with(self, resume: Callable[[], object]) -> None:
-        """Register the function that continues work of ended services on this machine."""
+        """Register the function that resumes work of ended services on this machine."""
         self._resume = resume
 
     def ends_left_work(self, unfinished: Unfinished, interrupt: Interrupt) -> None:
-        """Start to end another kind of work that an ended service has left behind.
+        """Register a kind of work that must be closed after its service has ended.
 
-        `unfinished` gives the ids of all that is begun; `interrupt` notes the end of some.
+        `unfinished` gives the ids of all work begun; `interrupt` notes the end of some.
         """
         self._left_work.append(LeftWork(unfinished, interrupt))
 
     def when_projecting(self, begin: Callable[[], object]) -> None:
-        """Call a function as soon as this process projects, and again each time it begins to."""
+        """Call a function when this process starts projecting, each time, and now if it does."""
         with self._telling:
             self._listeners.append(begin)
             if self.is_projecting:
                 begin()
 
     def stop(self) -> None:
-        """Stop trying; a lock that is held ends with its connection."""
+        """Stop competing for the lock; a lock that is held ends with its connection."""
         self._stopped.set()
         if self._lock is not None:
             self._lock.lost.set()
@@ -113,7 +115,7 @@ class SingleProjector:
     def _keep_trying(self) -> None:
         assert self._lock is not None
         while True:
-            # A transaction may find before this thread does that the lock is lost.
+            # A transaction may find out before this thread that the lock is lost.
             self._lock.lost.wait(TRY_EVERY_S)
             if self._stopped.is_set():
                 return
@@ -123,7 +125,7 @@ class SingleProjector:
             except (AcquisitionError, SQLAlchemyError) as error:
                 log.warning("whether another service projects is not known: %s", error)
             except Exception:
-                # This thread must go on: without it the service would never take over.
+                # This thread must continue: without it the service would never take over.
                 log.exception("a look at what other services do failed; it is repeated")
 
     def _try(self) -> None:
@@ -146,12 +148,12 @@ class SingleProjector:
                 try:
                     begin()
                 except Exception:
-                    # It belongs to one part of the service: results are projected in any case.
+                    # The error concerns one part of the service: results are projected in any case.
                     log.exception("work that begins with projecting failed")
         log.info("this service projects what is recorded from now on")
 
     def _end_left_work(self) -> None:
-        """Note replays and calibrations as interrupted whose service has ended."""
+        """Mark replays and calibrations as interrupted if their service has ended."""
         with self._store.reading_record() as connection:
             ids = {id for each in self._left_work for id in each.unfinished(connection)}
         others = ids - self._store.at_work

@@ -1,6 +1,6 @@
-"""Spacecraft: state, attitudes, star rates, worst batches, histories and these as tables.
+"""Spacecraft: state, attitudes, rates of stars, worst batches, histories, and their tables.
 
-Also their gyro blocks: recorded once, however often they are sent, and read back.
+Gyro blocks are here as well: each recorded once, however often sent, and read back.
 """
 
 from collections.abc import Collection, Iterator, Sequence
@@ -36,7 +36,7 @@ from service.trends.quantities import QUANTITIES, QuantityName, tracker_names, t
 
 
 class Spacecraft:
-    """Reads the records of each spacecraft: of a run, by default of the live one."""
+    """Service that reads the data of spacecraft in a run, by default the live one."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
@@ -44,7 +44,7 @@ class Spacecraft:
     def overview(
         self, run: str | None = None, spacecraft: Collection[str] | None = None
     ) -> Overview:
-        """Every spacecraft in a run at a glance, or some; see `fleet.overview`."""
+        """Overview of all spacecraft in a run, or of some; see `fleet.overview`."""
         with self._context.reading() as connection:
             missions, name = self._context.known.values(), run or LIVE
             active = self._context.active_alarms(connection, name)
@@ -57,19 +57,19 @@ class Spacecraft:
         period: fleet.Period,
         spacecraft: Collection[str] | None = None,
     ) -> fleet.Fleet:
-        """Some of the spacecraft in a run, for one page of all of them; see `fleet.fleet`."""
+        """State of some spacecraft in a run, for a page of the fleet; see `fleet.fleet`."""
         missions = [self._context.known[name] for name in names]
         with self._context.reading() as connection:
             active = self._context.active_alarms(connection, run)
             return fleet.fleet(connection, missions, run, period, utc_now(), active, spacecraft)
 
     def alarms(self, run: str) -> list[Alarm]:
-        """The alarms of a run that are not cleared, the one that is worst now first."""
+        """Alarms of a run that are not cleared, the worst present severity first."""
         with self._context.reading() as connection:
             return self._context.active_alarms(connection, run)
 
     def states(self, run: str | None = None) -> list[records.SpacecraftRow]:
-        """Every spacecraft, retired ones included, with its state in a run."""
+        """State of every spacecraft in a run, retired ones included."""
         moment = utc_now()
         with self._context.reading() as connection:
             return [
@@ -78,7 +78,7 @@ class Spacecraft:
             ]
 
     def state(self, name: str, run: str | None = None) -> records.SpacecraftState:
-        """One spacecraft's state in a run, its mission's settings and their history."""
+        """State of one spacecraft in a run, its mission's settings and their history."""
         mission = self._context.mission(name)
         with self._context.reading() as connection:
             state = histories.live_state(connection, mission, run or LIVE, utc_now())
@@ -90,7 +90,7 @@ class Spacecraft:
             )
 
     def attitudes(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[records.AttitudeRow]:
-        """The attitudes of current results, oldest batch time first."""
+        """Page of a spacecraft's attitudes from current results, oldest batch time first."""
         listing = partial(histories.list_attitudes, archive=self._context.store.archive)
         return self._context.page(listing, ResultFilter, name, asked)
 
@@ -103,9 +103,9 @@ class Spacecraft:
         end: Utc | None = None,
         bucket: time_buckets.Bucket = "hour",
     ) -> list[records.Rates]:
-        """Stars by outcome over all observed ones, in UTC hours or days by batch time.
+        """Counts of stars by outcome and of batches, in UTC hours or days by batch time.
 
-        Raises `BadInput` for a period with too many of them.
+        Raises `BadInput` for a period with too many hours or days.
         """
         self._context.mission(name)
         with self._context.reading() as connection:
@@ -125,10 +125,10 @@ class Spacecraft:
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
     ) -> records.History:
-        """Histories of quantities, all of them unless named, in at most `size` points each.
+        """Histories of quantities, by default of all, in at most `size` points each.
 
-        `minmax` gives buckets with mean, least and greatest, `latest` the newest
-        batches one by one; see `trends.history`.  With a tracker they are the tracker's own.
+        `minmax` gives buckets with mean, least and greatest, `latest` the newest batches one by
+        one; see `trends.history`.  With a tracker they are the tracker's own values.
         """
         mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
@@ -148,7 +148,7 @@ class Spacecraft:
         quantities: Sequence[QuantityName] = (),
         tracker: str | None = None,
     ) -> Iterator[records.History]:
-        """The history of every batch of a period, in pages; see `trends.every_batch`."""
+        """History of quantities over every batch of a period, in pages; see `trends`."""
         mission = self._context.mission(name)
         names = _quantities(quantities, tracker)
         own = self._split_tracker(mission, tracker)
@@ -166,7 +166,7 @@ class Spacecraft:
         limit: int = 20,
         tracker: str | None = None,
     ) -> records.Ranking:
-        """The batches of a period with the worst values of a quantity, worst first.
+        """Batches of a period with the worst values of a quantity, worst first.
 
         With a tracker they are ranked by its own values.
         """
@@ -181,10 +181,10 @@ class Spacecraft:
             )
 
     def _split_tracker(self, mission: Mission, tracker: str | None) -> str | None:
-        """The tracker whose own values are read; None where the spacecraft's are.
+        """Tracker whose own values are read; None if they are those of the spacecraft.
 
-        Those of a single tracker are the spacecraft's.  Raises `BadInput` for one that the
-        mission has not and never had.
+        The values of a single tracker are the spacecraft's.  Raises `BadInput` for a tracker that
+        the mission never had.
         """
         if tracker is None or tracker in self._context.trackers(mission.name):
             return tracker
@@ -195,7 +195,7 @@ class Spacecraft:
 def _quantities(
     named: Sequence[QuantityName], tracker: str | None, field: str = "quantity"
 ) -> tuple[QuantityName, ...]:
-    """The quantities that are named, or all; raises `BadBatch` for one that no tracker has."""
+    """Names of the requested quantities, or of all; raises `BadBatch` where a tracker has none."""
     if tracker is None:
         return tuple(named) or trend_names()
     for name in named:
@@ -208,7 +208,7 @@ def _quantities(
 def _named(
     connection: Connection, mission: Mission, run: str, tracker: str | None
 ) -> dict[str, Any]:
-    """The fields of a tracker in an answer about it."""
+    """Fields about a tracker in an answer: its name, and True while batches are not split."""
     if tracker is None:
         return {"tracker": UNSET, "not_split": UNSET}
     waits = len(mission.trackers) > 1 and is_waiting(connection, mission.name, run)
@@ -234,7 +234,7 @@ BUCKET_PARTS = {
 
 
 def history_table(history: records.History) -> Table:
-    """The table of a history; see `trends.history`."""
+    """Convert a history of quantities to a table; see `trends.history`."""
     if history.strategy == "latest":
         return batch_table(iter([history]))
     columns = [
@@ -249,7 +249,7 @@ def history_table(history: records.History) -> Table:
 
 
 def batch_table(pages: Iterator[records.History]) -> Table:
-    """The table of pages of batches; see `trends.every_batch`.
+    """Convert pages of batches in a history to a table; see `trends.every_batch`.
 
     The first page is read at once: its errors are raised here.
     """
@@ -282,19 +282,19 @@ def _about(history: records.History) -> dict[str, str]:
 
 
 class Gyro:
-    """Takes and reads gyro blocks."""
+    """Service that records and reads gyro blocks."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self._ids = Ulids()
 
     def submit(self, name: str, sent: bytes) -> blocks.Recorded:
-        """Record the block of a JSON body; see `record`."""
+        """Record the gyro block in a JSON body; see `record`."""
         mission_named(self._context.missions, name)
         return self.record(block_from_json(sent, name))
 
     def record(self, block: GyroBlock) -> blocks.Recorded:
-        """Record a block; a repeat of the same body gets the recorded one.
+        """Record a gyro block; a repeat of the same body gets the recorded one.
 
         Raises `BadBatch` for an unknown spacecraft and for a rate beyond the largest of its
         mission, `Conflict` where another body has its name, and `SampleTaken` where another block
@@ -306,7 +306,7 @@ class Gyro:
         return recorded
 
     def record_many(self, group: Sequence[GyroBlock]) -> list[blocks.Recorded | AcquisitionError]:
-        """Record blocks in one transaction; a refused one has its error in the list."""
+        """Record gyro blocks in one transaction; a refused one has its error in the list."""
         received = utc_now()
         found: dict[int, blocks.Recorded | AcquisitionError] = {}
         rows: dict[int, Row] = {}
@@ -329,10 +329,10 @@ class Gyro:
         return [found[place] for place in range(len(group))]
 
     def page(self, name: str, **asked: Unpack[PageOfPeriod]) -> Page[GyroBlockRow]:
-        """The blocks of a period without their samples, the earliest first."""
+        """Page of the gyro blocks in a period without their samples, the earliest first."""
         return self._context.page(blocks.list_blocks, blocks.BlockFilter, name, asked)
 
     def get(self, name: str, id: str) -> GyroSamples:
-        """A block of a spacecraft with its samples."""
+        """Read a gyro block of a spacecraft with its samples."""
         with self._context.reading() as connection:
             return blocks.read_block(connection, name, known_id(id, "gyro block"))

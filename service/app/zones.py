@@ -1,4 +1,4 @@
-"""The cache of zones and run catalogs."""
+"""Cache of the sky's zones and run catalogs, as seen by operators."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -24,14 +24,14 @@ MOST_COSTS = 1_000
 
 
 class Zones:
-    """Shows, fills and empties the cache."""
+    """Service that shows, fills and empties the cache of zones."""
 
     def __init__(self, context: Context) -> None:
         self._context = context
         self._costs: dict[tuple[str, str, float], ZoneCost] = {}
 
     def state(self) -> ZoneCache:
-        """The content of the cache, least recently used first, and its counters."""
+        """Content of the cache of zones, least recently used first, with counters."""
         state = self._context.sky.cache.state()
         return ZoneCache(
             items=[
@@ -51,10 +51,10 @@ class Zones:
         )
 
     def advised_size(self, name: str, run: str | None) -> tuple[ZoneSize, list[ZoneCost]]:
-        """Advice on the size of a spacecraft's zone by a run's a priori errors.
+        """Advise the size of a spacecraft's zone from a run's a priori errors.
 
-        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude
-        has none.  The costs are those of the sizes, where another size is advised.
+        The errors are those of the latest `MOST_ERRORS` batches; a batch without an attitude has
+        none.  The costs are those of the compared sizes, if another size is advised.
         """
         size, cost_of = self._size(name, run)
         changes = size.verdict in ("too_small", "larger_than_needed")
@@ -71,7 +71,7 @@ class Zones:
         return size, partial(self._cost, mission, run_catalog)
 
     def _cost(self, mission: Mission, run_catalog: RunCatalog, size_deg: float) -> ZoneCost:
-        """The cost of a zone of this size; searching the whole sky takes up to seconds."""
+        """Cost of searching a zone of a given size; searching the whole sky takes up to seconds."""
         key = mission.digest, run_catalog.digest, size_deg
         if key not in self._costs:
             if len(self._costs) >= MOST_COSTS:
@@ -80,7 +80,7 @@ class Zones:
         return self._costs[key]
 
     def warm(self, spacecraft: str, a_priori: Sequence[APrioriIn], time: Utc) -> list[ZoneSummary]:
-        """Build the zones that batches with these a priori attitudes will need."""
+        """Build the zones for batches with the given a priori attitudes, in advance."""
         mission = mission_in_input(self._context.missions, spacecraft)
         return [
             ZoneSummary(**zone.summary())

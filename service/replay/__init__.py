@@ -1,5 +1,5 @@
-"""Files of batches, in this process or through HTTP.
+"""Replay of files of batches, in this process or through HTTP.
 
-A run that was cut short is taken up by replaying it again: a batch that is
-already recorded is answered with what is stored, and nothing is written twice.
+An interrupted replay is continued by repeating it: a batch that is already recorded gets its stored
+answer, and nothing is written twice.
 """

@@ -1,4 +1,4 @@
-"""Replay in this process, without a server."""
+"""Replay of batches in this process, without a server."""
 
 import time
 from collections.abc import Iterable
@@ -18,7 +18,7 @@ from service.replay.items import (
 )
 
 CHUNK = 500
-"""Batches of one transaction: enough to share its cost, few enough to see progress."""
+"""Number of batches in a transaction: enough to share its cost, few enough to show progress."""
 
 
 def replay_in_process(
@@ -28,7 +28,7 @@ def replay_in_process(
     pace: Pace | None = None,
     carrier: AttitudeCarrier | None = None,
 ) -> None:
-    """Submit every item and report what became of it, in order.
+    """Submit every line of a replay and report its outcome, in order.
 
     With a `carrier` each batch waits for the answer to the one before.
     """

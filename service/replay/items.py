@@ -1,6 +1,6 @@
-"""The lines of telemetry files to replay, what is added to their batches, and the outcome of each.
+"""Lines of telemetry files for a replay, additions to their batches, and their outcomes.
 
-Added are attitudes that are carried along, or data of a file.
+Additions are attitudes carried along from earlier batches, or data from a file.
 """
 
 import json
@@ -30,7 +30,7 @@ Problem = dict[str, Any]
 
 @dataclass(frozen=True)
 class Item:
-    """One line of a file: the batch or the gyro block in it, or the problem with it."""
+    """Line of a telemetry file: its batch or gyro block, or its problem."""
 
     file: Path
     number: int
@@ -40,7 +40,7 @@ class Item:
 
     @property
     def time(self) -> Utc | None:
-        """The time of the batch, or of the last sample of the gyro block."""
+        """Time of the batch, or of the last sample of the gyro block; None for a problem."""
         if self.submission is not None:
             return self.submission.batch.time
         return None if self.gyro is None else self.gyro.end
@@ -48,10 +48,10 @@ class Item:
 
 @dataclass(frozen=True)
 class LineOutcome:
-    """The outcome of a line: the answer's own bytes, or a problem.
+    """Outcome of a replayed line: the answer's own bytes, or a problem.
 
-    Of a gyro block the answer is the recorded block.  `replayed` tells that the batch or the
-    block was already recorded.
+    The answer to a gyro block is the recorded block.  `replayed` is True if the batch or the block
+    was already recorded.
     """
 
     item: Item
@@ -64,34 +64,34 @@ Report = Callable[[LineOutcome], None]
 
 
 def items_of(files: Sequence[Path], run: str) -> Iterator[Item]:
-    """Every line of the files, in order, checked as a batch or a gyro block of that run."""
+    """Read every line of files, in order, and check it as a batch or a gyro block of a run."""
     for file in files:
         for line in read_lines(file):
             yield item_of(file, line, run)
 
 
 class OtherFiles(Protocol):
-    """Files of another form than lines, which a feature reads; see `service.feature`."""
+    """Telemetry files without lines, which a feature reads; see `service.feature`."""
 
     files: Sequence[Path]
     spacecraft: str | None
-    """The mission of the files, where it is named."""
+    """Name of the files' mission; None if not named."""
 
     def items(self, run: str) -> Iterator[Item]:
-        """Every batch and gyro block in the files, read in this process."""
+        """Read every batch and gyro block in the files, in this process."""
 
     def counts(self) -> dict[str, Any] | None:
-        """The counts of what was read in this process; None where nothing was."""
+        """Counts of the data read in this process; None if nothing was read."""
 
     def __iter__(self) -> Iterator[bytes]:
-        """The files as they are sent to a service."""
+        """Iterate over the bytes of the files as sent to a service."""
 
     def item(self, number: int) -> Item:
-        """The place of a batch that the service refused by its number."""
+        """Place in the files of a batch that the service refused, by its number."""
 
 
 def item_of(file: Path, line: Line, run: str) -> Item:
-    """A line of a file, checked as a batch or a gyro block of that run."""
+    """Check a line of a file as a batch or a gyro block of a run."""
     if line.body is None:
         assert line.fault is not None
         return Item(file, line.number, None, problem_of_faults([line.fault]))
@@ -104,9 +104,9 @@ def item_of(file: Path, line: Line, run: str) -> Item:
 
 
 def run_name(files: Sequence[Path], run: str | None) -> str:
-    """The run that takes every batch: the one asked for, else the first file's stem.
+    """Name of the run for all batches: the requested one, else the first file's stem.
 
-    Raises `BadInput` for a name that no run can have.
+    Raises `BadInput` for an invalid name.
     """
     name = files[0].stem if run is None else run
     try:
@@ -119,14 +119,14 @@ def run_name(files: Sequence[Path], run: str | None) -> str:
 
 
 class Pace:
-    """When each item is due: at its own time, sped up by a factor, or at once without one."""
+    """Pace of a replay: items wait for their own time, sped up by a factor, or are sent at once."""
 
     def __init__(self, factor: float | None = None) -> None:
         self.factor = factor
         self._first: tuple[int, float] | None = None
 
     def wait_s(self, item: Item, now_s: float) -> float:
-        """Seconds until the item is due; the first is due now."""
+        """Seconds until an item is due; the first is due now."""
         time = item.time
         if self.factor is None or time is None:
             return 0.0
@@ -137,24 +137,24 @@ class Pace:
 
 
 class FromFile(ABC):
-    """Writes what a file says of a batch's time into the batch, before it is sent.
+    """Source that adds data from a file to batches by their time, before they are sent.
 
-    The recorded batch then holds it.  `supplied` counts the batches that got something.
+    The recorded batch then includes the data.  `supplied` counts the batches with added data.
     """
 
     option: str
-    """The option of the command that names the file."""
+    """Command option that names the file."""
     key: str
-    """The name of the count in the command's JSON."""
+    """Name of the count of supplied batches in the command's JSON."""
     title: str
-    """The name of the count for people."""
+    """Name of the count of supplied batches in the command's table."""
 
     def __init__(self) -> None:
         self._spacecraft: str | None = None
         self.supplied = 0
 
     def prepared(self, item: Item) -> Item:
-        """The item with what the file says, unchanged where that is nothing.
+        """Add the file's data to the batch of an item, if the file has any for its time.
 
         Raises `BadInput` for a batch of another spacecraft than the one before.
         """
@@ -174,14 +174,14 @@ class FromFile(ABC):
 
     @abstractmethod
     def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
-        """The fields of the batch that the file fills."""
+        """Fields of a batch that the file supplies, by name."""
 
 
 class FilePrior(FromFile):
-    """The attitude of an AEM or C-kernel, as `a_priori`.
+    """Source of a priori attitudes from an AEM or C-kernel.
 
-    A batch keeps its own outside the segments of the file, and where the body may have turned any
-    way between two of its attitudes.
+    A batch keeps its own outside the segments of the file, and where the attitude between two of
+    the file's entries is ambiguous.
     """
 
     option, key, title = "--a-priori", "a_priori_from_file", "a priori of file"
@@ -191,7 +191,7 @@ class FilePrior(FromFile):
         self._known = known
 
     def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
-        """The a priori attitude."""
+        """A priori attitude for a batch from the file, as fields of the batch."""
         rates = batch.body_rates_deg_per_s
         own = np.radians(rates)[None] if rates.any() else None
         (quaternion,) = self._known.at(np.array([batch.time.tai_ns]), own)
@@ -203,9 +203,9 @@ class FilePrior(FromFile):
 
 
 class FileEphemeris(FromFile):
-    """Position and velocity of an OEM or TLE, for batches that carry none.
+    """Source of position and velocity from an OEM or TLE, for batches without them.
 
-    A batch outside the span of the file gets nothing.
+    A batch outside the span of the file gets none.
     """
 
     option, key, title = "--ephemeris", "state_from_file", "velocity of file"
@@ -215,7 +215,7 @@ class FileEphemeris(FromFile):
         self._known = known
 
     def added_to(self, batch: ObservationBatch) -> dict[str, Any]:
-        """The velocity and the position, each where the batch has none."""
+        """Position and velocity for a batch from the file, each only if the batch has none."""
         wanted = {
             name: part
             for name, own, part in (
@@ -232,16 +232,16 @@ class FileEphemeris(FromFile):
 
 # Carry attitudes along a replay: the attitude of one batch is the a priori of the next.
 #
-# It goes into the next batch's `a_priori` before that is sent, so the recorded
-# batch explains its answer.
+# The attitude goes into the next batch's `a_priori` before that is sent, so the recorded batch
+# explains its answer.
 
 CARRIED_WITHIN_S = 3600.0
-"""The age of the last attitude above which a batch keeps its own a priori knowledge."""
+"""Largest age in seconds of a carried attitude; older, a batch keeps its own a priori knowledge."""
 
 
 @dataclass(frozen=True)
 class _KnownAttitude:
-    """The attitude (3, 3), inertial to body, found for a batch."""
+    """Attitude matrix (3, 3), inertial to body, found for a batch."""
 
     attitude: vectors.Matrix
     time: Utc
@@ -249,19 +249,18 @@ class _KnownAttitude:
 
 
 class AttitudeCarrier:
-    """Remembers the last good attitude of every spacecraft and writes it into its next batch.
+    """Carrier of the last good attitude of every spacecraft to its next batch.
 
-    Between the two batches the body turns with the mean of their rates where both
-    give rates, else with the given ones; where these differ and it turns far, nothing is carried.
-    A suspect or missing attitude is not
-    carried: the last good one is.
+    Between the two batches the body turns with the mean of their rates where both give rates, else
+    with the given ones; where these differ and it turns far, nothing is carried.  Suspect attitudes
+    are skipped: the last good one is carried.
     """
 
     def __init__(self) -> None:
         self._known: dict[str, _KnownAttitude] = {}
 
     def prepared(self, item: Item) -> Item:
-        """The item with the attitude in its `a_priori`, unchanged where none is known."""
+        """Add the carried attitude to the `a_priori` of an item; unchanged if none is known."""
         if item.submission is None or item.submission.batch.measurement is not None:
             return item
         batch = item.submission.batch
@@ -283,7 +282,7 @@ class AttitudeCarrier:
         return replace(item, submission=submission_from_json(json.dumps(body)))
 
     def note(self, outcome: LineOutcome) -> None:
-        """Remember the attitude of an answer, if it is a good one."""
+        """Remember the attitude of an answer, if it is good."""
         if outcome.answer is None or outcome.item.submission is None:
             return
         attitude = msgspec.json.decode(outcome.answer)["attitude"]
@@ -298,7 +297,7 @@ class AttitudeCarrier:
 
 
 def _is_unsteady(rates_deg_per_s: Sequence[vectors.Vector], passed_s: float) -> bool:
-    """True if a body that turns far has rates at both ends that lead to different attitudes."""
+    """True if rates at both ends of a large turn lead to different attitudes."""
     if len(rates_deg_per_s) < 2:
         return False
     one, other = np.radians(rates_deg_per_s) * abs(passed_s)
@@ -308,7 +307,7 @@ def _is_unsteady(rates_deg_per_s: Sequence[vectors.Vector], passed_s: float) -> 
 
 
 def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
-    """A report that passes every outcome to the carrier too."""
+    """Wrap a report so that every outcome is passed to the carrier too."""
 
     def both(outcome: LineOutcome) -> None:
         carrier.note(outcome)
@@ -320,6 +319,6 @@ def reporting_to_carrier(report: Report, carrier: AttitudeCarrier) -> Report:
 def turned(
     attitude: vectors.Matrix, rates_deg_per_s: vectors.Vector, seconds: float
 ) -> vectors.Matrix:
-    """The attitude after the body has turned with constant rates, in body axes, for a time."""
+    """Attitude after a rotation of the body with constant rates, in body axes, for `seconds`."""
     # A direction fixed in inertial space turns the other way in the body.
     return vectors.rotate_about(-np.radians(rates_deg_per_s) * seconds, attitude.T).T

@@ -1,7 +1,7 @@
-"""Replay through a running service: a window of posts at a time, or one upload.
+"""Replay through a running service: several posts at a time, or one upload.
 
-A post whose answer was lost is sent again: the service knows the batch by its
-identity and records it once.
+A post whose answer was lost is sent again: the service recognises the batch by its identity and
+records it once.
 """
 
 import asyncio
@@ -45,13 +45,12 @@ def replay_over_http(
     watched_run: str | None = None,
     carrier: AttitudeCarrier | None = None,
 ) -> None:
-    """Post every item to the service at `url` and report what became of it, in order.
+    """Post every line to the service at `url` and report its outcome, in order.
 
-    With a `carrier` each batch waits for the answer to the one before.
-    Raises `BadInput` for an address that is none, `Unauthenticated` where the
-    service does not accept `token`, `Busy` when no service answers there, or
-    none any more for `give_up_after_s`.  `watched_run` is a run that limits are to
-    be held against.
+    With a `carrier` each batch waits for the answer to the one before.  Raises `BadInput` for an
+    invalid address, `Unauthenticated` where the service does not accept `token`, `Busy` when no
+    service answers at first, or none for `give_up_after_s` later.  `watched_run` is a run whose
+    limits are to be evaluated.
     """
     client = AsyncClient(checked_url(url), token, give_up_after_s=give_up_after_s)
     if carrier is not None:
@@ -63,7 +62,7 @@ def replay_over_http(
 
 
 def checked_url(url: str) -> str:
-    """The address without a slash at its end; raises `BadInput` for one that is none."""
+    """Address of a service without a slash at its end; raises `BadInput` for an invalid one."""
     try:
         checked_address(url)
     except ValueError:
@@ -74,7 +73,7 @@ def checked_url(url: str) -> str:
 
 @contextmanager
 def translated(url: str) -> Iterator[None]:
-    """Translate the client's exceptions into the service's errors, with remedies for the user."""
+    """Context that converts the client's exceptions to the service's errors, with remedies."""
     try:
         yield
     except answers.Unauthenticated as error:
@@ -96,7 +95,7 @@ def translated(url: str) -> Iterator[None]:
 
 
 def no_service(url: str, error: answers.NoAnswer) -> errors.Busy:
-    """The error where no service answers from the beginning."""
+    """Error for an address where no service has ever answered."""
     return errors.Busy(
         f"no service answers at {url} ({error}); "
         "start one with `acquire serve`, or replay with --in-process"
@@ -125,7 +124,7 @@ async def _replay(
                     while window and window[0].done():
                         report(await window.popleft())
                     await asyncio.sleep(min(wait_s, 0.5))
-                # What asks for the last attitude waits for the answers before it.
+                # A batch that asks for the last attitude waits for the answers before it.
                 while len(window) >= (1 if _is_tracked(item) else concurrency):
                     report(await window.popleft())
                 if carrier is not None:
@@ -184,7 +183,7 @@ async def _submitted(client: AsyncClient, item: Item) -> RecordedAnswer:
 
 
 def _problem(problem: answers.Problem) -> Problem:
-    """The part of a problem that does not depend on how the batch was sent."""
+    """Part of a problem that does not depend on the way in which the batch was sent."""
     if not problem.errors:
         return {"detail": problem.detail}
     faults = [errors.Fault(each.field, each.message, each.value) for each in problem.errors]
@@ -203,7 +202,7 @@ CANCEL_S = 10.0
 
 
 class _SentLines:
-    """The lines of files as they are sent, with the place of each."""
+    """Lines of files as sent to the service, with their places in the files."""
 
     def __init__(self, files: Sequence[Path], report: Report) -> None:
         self._files = files
@@ -224,7 +223,7 @@ class _SentLines:
                 yield line.body + b"\n"
 
     def item(self, number: int) -> Item:
-        """The file and line that sent line `number` came from."""
+        """File and line from which the sent line `number` came."""
         index = number - 1
         which = max(i for i, start in enumerate(self._starts) if start <= index)
         return Item(self._files[which], self._places[index], None)
@@ -242,12 +241,11 @@ def replay_in_bulk(
 ) -> None:
     """Send files as one replay and follow it to its end.
 
-    `progress` receives the state of the replay repeatedly and at the end;
-    `report` receives every refused line, those beyond the first thousand without
-    their place.  Raises `BadInput`, `Unauthenticated`, `Forbidden` for what the service
-    refuses, `NotFound` where it no longer knows the replay, and `Busy` where it
-    does not answer or stopped early.  Interrupted, it has the service
-    cancel the replay.
+    `progress` receives the state of the replay repeatedly and at the end; `report` receives every
+    refused line, those beyond the first thousand without their place.  Raises `BadInput`,
+    `Unauthenticated`, `Forbidden` for a refusal by the service, `NotFound` where it no longer knows
+    the replay, and `Busy` where it does not answer or stopped early.  An interruption cancels the
+    replay on the service.
     """
     lines = _SentLines(files, report) if isinstance(files, Sequence) else files
     spacecraft = None if isinstance(lines, _SentLines) else lines.spacecraft
@@ -273,7 +271,7 @@ def replay_in_bulk(
             for state in client.follow_replay(begun.id):
                 progress(state)
         except KeyboardInterrupt:
-            # A second Ctrl-C, or a service that is gone, must not wait for this.
+            # A second Ctrl-C, or a service that is gone, must not be delayed by this request.
             with (
                 suppress(answers.ClientError),
                 Client(url, token, timeout_s=CANCEL_S, give_up_after_s=0.0) as canceller,

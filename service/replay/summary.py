@@ -1,4 +1,4 @@
-"""The summary of a replay: results to a file, progress to the terminal, a table at the end."""
+"""Summary of a replay: results to a file, progress to the terminal, a table at the end."""
 
 import json
 import os
@@ -23,11 +23,10 @@ STARS = ("observed", "unique", "ambiguous", "unmatched")
 
 
 class ReplaySummary:
-    """Takes every outcome of a replay in order; a context manager that closes the results.
+    """Summary of a replay's outcomes, taken in order; a context manager that closes the results.
 
-    `results` receives one line a batch: the answer exactly as given, or
-    `{"line", "problem"}` for a refused one.  `progress` None shows the bar on
-    a terminal only.
+    `results` receives one line for each batch: the answer exactly as sent, or `{"line", "problem"}`
+    for a refused one.  `progress` None shows the bar on a terminal only.
     """
 
     def __init__(
@@ -42,7 +41,7 @@ class ReplaySummary:
         self.stars: Counter[str] = Counter()
         self.seconds = 0.0
         self.packets: dict[str, Any] | None = None
-        """The counts of space packets, as a replay of the service reports them."""
+        """Counts of space packets, as the service reports them; None for other files."""
         self._path = results
         self._results: IO[bytes] | None = None
         if results is not None:
@@ -59,11 +58,11 @@ class ReplaySummary:
 
     @property
     def batches(self) -> int:
-        """Lines that were processed, gyro blocks aside."""
+        """Number of processed lines, without gyro blocks."""
         return self.new + self.replayed + self.refused
 
     def add(self, outcome: LineOutcome) -> None:
-        """Count one outcome and write its line of the results."""
+        """Count the outcome of one line and write it to the results."""
         if outcome.answer is None:
             self.refused += 1
             self._print_problem(outcome)
@@ -81,7 +80,7 @@ class ReplaySummary:
         self._bar.update()
 
     def follow(self, state: Replay) -> None:
-        """Take the counts of a replay that the service works through."""
+        """Take over the counts of a replay that the service processes."""
         counts, lines = state.counts, state.lines
         self.new, self.replayed = counts.new, counts.repeated
         self.attitudes = counts.attitudes
@@ -134,7 +133,7 @@ class ReplaySummary:
             self._results.close()
 
     def counts(self) -> dict[str, Any]:
-        """The summary as plain values."""
+        """Summary of the replay as plain values, for JSON."""
         return {
             "batches": self.batches,
             "new": self.new,
@@ -148,13 +147,13 @@ class ReplaySummary:
         }
 
     def _gyro_counts(self) -> dict[str, Any]:
-        """The counts of gyro blocks; empty where the files hold none."""
+        """Counts of gyro blocks; empty if the files hold none."""
         if not (self.gyro_new or self.gyro_replayed):
             return {}
         return {"gyro_blocks": {"new": self.gyro_new, "already_recorded": self.gyro_replayed}}
 
     def table(self) -> str:
-        """The summary: what was sent, what was found, how fast."""
+        """Summary of the replay as a table for people: batches, stars, attitudes and speed."""
         observed = self.stars["observed"]
         rows = [("batches", str(self.batches))]
         rows += [("  new", str(self.new)), ("  already recorded", str(self.replayed))]
@@ -190,7 +189,7 @@ def _packet_rows(packets: dict[str, Any] | None) -> list[tuple[str, str]]:
     rows += [(f"  {name}", str(packets[word])) for word, name in words.items()]
     gaps = f"{packets['gaps']}  ({packets['missing']} packets missing)"
     rows += [("  sequence gaps", gaps), ("  steps backward", str(packets["backward"]))]
-    # Of a damaged file these are the first to be looked at.
+    # For a damaged file these counts matter most.
     rows += [("  bytes not read", str(packets["unread_bytes"]))] if packets["unread_bytes"] else []
     rows += [("  empty files", str(packets["empty_files"]))] if packets["empty_files"] else []
     if packets["gyro_blocks"]:
@@ -207,7 +206,7 @@ def _share(part: int, whole: int) -> str:
 
 
 def _require_place(path: Path) -> None:
-    """Raise `BadFile` for a place that cannot be written, without touching what is there."""
+    """Raise `BadFile` for a path that cannot be written, without touching an existing file."""
     folder = path.absolute().parent
     place = path if path.exists() else folder
     if path.is_dir() or not folder.is_dir() or not os.access(place, os.W_OK):
@@ -223,7 +222,7 @@ def _opened(path: Path) -> IO[bytes]:
 
 
 def _lines_in(files: Sequence[Path]) -> int | None:
-    """Lines to come, for the bar; None where a line is not a batch."""
+    """Number of lines in the files, for the progress bar; None if lines are not batches."""
     count = 0
     for file in files:
         if not input_format(telemetry_format(file)).one_a_line:

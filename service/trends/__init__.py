@@ -1,1 +1,1 @@
-"""Trends: the quantities that follow from batches, how they are measured, and their limits."""
+"""Trends: quantities derived from batches, their measurement, and their limits."""

@@ -1,7 +1,7 @@
-"""Drift of instruments in one batch: the scale of each tracker, and the angles between trackers.
+"""Instrument drift from one batch: the scale of each tracker, and the angles between trackers.
 
-Neither needs an attitude.  The scatter of stars about their mean direction does not depend on how
-the body is turned, and neither does the angle between the mean directions of two trackers.
+Neither needs an attitude.  The scatter of stars about their mean direction does not depend on the
+orientation of the body, and neither does the angle between the mean directions of two trackers.
 """
 
 import math
@@ -19,12 +19,12 @@ from service.sky.ephemeris import apparent
 from service.vectors import ARCSEC_PER_RADIAN, Vector
 
 LEAST_SPREAD = 0.25
-"""Share of the field of view's radius: stars closer to their mean, rms, tell little of scale."""
+"""Least rms distance of stars from their mean, as a fraction of the field of view's radius."""
 
 
 @dataclass(frozen=True, eq=False)
 class MeanStars:
-    """The unique stars of one tracker: their number, and the sums of their unit vectors (3,).
+    """Unique stars of one tracker: their number, and the sums of their unit vectors (3,).
 
     `observed` is in body axes, `catalog` inertial and apparent.
     """
@@ -36,14 +36,14 @@ class MeanStars:
 
     @property
     def squares(self) -> tuple[float, float]:
-        """The sums of squared distances from the mean direction: observed and of the catalog.
+        """Sums of squared distances from the mean direction, of observed and of catalog stars.
 
-        Both are zero where the stars stand too close together to tell the scale.
+        Both are zero where the stars are too close together to give the scale.
         """
         if self.count < 2:
             return 0.0, 0.0
         observed, catalog = (
-            # Of stars in one place rounding may leave less than nothing.
+            # For stars in one place rounding may give a negative value.
             max(self.count - math.hypot(*each.tolist()) ** 2 / self.count, 0.0)
             for each in (self.observed, self.catalog)
         )
@@ -57,7 +57,7 @@ def mean_stars(
     star: Sequence[Integers],
     catalog_direction: Vector,
 ) -> list[MeanStars]:
-    """The input of `scale_offset_ppm` and `alignment_offsets_arcsec`, tracker by tracker.
+    """Sum up the unit vectors of each tracker's unique stars, observed and in the catalog.
 
     `star` (n,) of every tracker are rows of `catalog_direction` (N, 3), -1 for stars that are not
     unique.
@@ -75,7 +75,7 @@ def mean_stars(
 
 
 def scale_offset_ppm(means: Sequence[MeanStars]) -> float | None:
-    """How much larger the stars' distances are than the catalog's, in millionths, of all trackers.
+    """Excess of the stars' mutual distances over the catalog's in ppm, over all trackers.
 
     None where no tracker has stars far enough from each other.
     """
@@ -85,9 +85,9 @@ def scale_offset_ppm(means: Sequence[MeanStars]) -> float | None:
 
 
 def alignment_offsets_arcsec(means: Sequence[MeanStars]) -> list[float | None]:
-    """How much larger each tracker's angles to the others are than the catalog's, as a mean.
+    """Mean excess of each tracker's angles to the others over the catalog's angles, in arcsec.
 
-    None where it has no star, or none of the others has.
+    None for a tracker without a star, or if no other has one.
     """
     seen = [each for each in means if each.count]
     return [
@@ -100,13 +100,13 @@ def alignment_offsets_arcsec(means: Sequence[MeanStars]) -> list[float | None]:
 
 
 def _wider_arcsec(one: MeanStars, other: MeanStars) -> float:
-    """The angle between the stars of two trackers, observed minus catalog."""
+    """Angle between the mean directions of two trackers, observed minus catalog, in arcsec."""
     observed_rad = _angle_rad(one.observed, other.observed)
     return (observed_rad - _angle_rad(one.catalog, other.catalog)) * ARCSEC_PER_RADIAN
 
 
 def _angle_rad(a: Vector, b: Vector) -> float:
-    """The angle between two vectors (3,) of any length; numbers, because numpy's calls take long.
+    """Angle in radians between two vectors (3,) of any length, in plain numbers for speed.
 
     Kahan's formula, which is accurate at every angle.
     """

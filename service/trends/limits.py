@@ -1,8 +1,8 @@
 """Limits: the bounds of a quantity by severity.
 
-The value is taken over the latest `minimum_count` batches together.  It is out
-of a bound when it lies beyond it, and stays out until it has come back by
-`hysteresis`.  It counts only once it has been out for `duration_s` of batch time.
+A value is computed over the latest `minimum_count` batches together.  It is out of a bound when it
+lies beyond it, and stays out until it has come back by `hysteresis`.  It counts only once it has
+been out for `duration_s` of batch time.
 """
 
 import math
@@ -18,12 +18,12 @@ from service.missions.strict import Strict
 from service.times import Utc
 
 MAX_COUNT = 200
-"""Most batches that a value is taken over: the samples are written with every batch."""
+"""Largest number of batches for one value: its samples are written with every batch."""
 LONGEST_S = 7 * 86400.0
 
 
 class Severity(IntEnum):
-    """The severity of an alarm; the worst is the greatest."""
+    """Severity of an alarm; a greater number is worse."""
 
     WATCH = 1
     WARNING = 2
@@ -31,12 +31,12 @@ class Severity(IntEnum):
 
     @property
     def word(self) -> str:
-        """The severity as the interface writes it."""
+        """Severity as a word of the interface."""
         return self.name.lower()
 
 
 class Bounds(Strict):
-    """A value below `low` or above `high` is out of limits; null: no bound."""
+    """Bounds of one severity: a value below `low` or above `high` is out; null: no bound."""
 
     low: float | None = None
     high: float | None = None
@@ -49,7 +49,7 @@ class Bounds(Strict):
 
 
 class LimitSettings(Strict):
-    """The limits of one quantity."""
+    """Limits of one quantity: bounds by severity, hysteresis and duration."""
 
     enabled: StrictBool = True
     watch: Bounds = Bounds()
@@ -82,7 +82,7 @@ class LimitSettings(Strict):
         return self
 
     def bounds(self, severity: Severity) -> Bounds:
-        """The bounds of a severity."""
+        """Bounds of a severity in these limits."""
         found: Bounds = getattr(self, severity.word)
         return found
 
@@ -95,7 +95,7 @@ class LimitSettings(Strict):
 
     @cached_property
     def _levels(self) -> tuple[tuple[Severity, float, float], ...]:
-        """Lower and upper bound of each severity; infinite where no bound is set."""
+        """Lower and upper bound for each severity; infinite if not set."""
         levels = ((severity, self.bounds(severity)) for severity in Severity)
         return tuple(
             (
@@ -109,55 +109,55 @@ class LimitSettings(Strict):
 
     @cached_property
     def inner_bounds(self) -> tuple[float, float]:
-        """The least and the greatest value within every bound; infinite where there is none."""
+        """Range of values inside every bound; infinite where none is set."""
         lows, highs = ([level[k] for level in self._levels] for k in (1, 2))
         return max(lows, default=-math.inf), min(highs, default=math.inf)
 
     def severities_out(self, value: float) -> list[Severity]:
-        """The severities whose bounds a value leaves that was within them so far, worst last."""
+        """Severities whose bounds a value exceeds, without hysteresis; worst last."""
         return [s for s, low, high in self._levels if value < low or value > high]
 
     def beyond(self, severity: Severity, value: float) -> float:
-        """How far a value lies beyond the bounds of a severity; below zero inside them."""
+        """Distance of a value beyond the bounds of a severity; negative inside them."""
         bounds = self.bounds(severity)
         above = -math.inf if bounds.high is None else value - bounds.high
         below = -math.inf if bounds.low is None else bounds.low - value
         return max(above, below)
 
     def bound(self, severity: Severity, value: float) -> float:
-        """The bound that a value is out of."""
+        """Bound of a severity that is nearest to a value out of it."""
         bounds = self.bounds(severity)
         middle = [each for each in (bounds.low, bounds.high) if each is not None]
         return min(middle, key=lambda each: abs(value - each))
 
 
 def above(watch: float | None, warning: float, critical: float, **others: float) -> LimitSettings:
-    """Upper bounds alone; `others` are further settings by name."""
+    """Limits with upper bounds only; `others` are further settings by name."""
     highs = {"watch": watch, "warning": warning, "critical": critical}
     bounds = {name: {"high": high} for name, high in highs.items()}
     return LimitSettings.model_validate(bounds | others)
 
 
 def about_zero(watch: float, warning: float, critical: float, hysteresis: float) -> LimitSettings:
-    """Bounds of these sizes on both sides of zero."""
+    """Limits with bounds of equal size on both sides of zero."""
     sizes = {"watch": watch, "warning": warning, "critical": critical}
     bounds = {name: {"low": -size, "high": size} for name, size in sizes.items()}
     return LimitSettings.model_validate(bounds | {"hysteresis": hysteresis})
 
 
 Sample = tuple[int, float, float]
-"""(time_ns, part, whole): a share of counts, or a value over one."""
+"""Sample of a quantity: (time_ns, part, whole), a fraction of counts, or a value over one."""
 
 
 @dataclass(frozen=True)
 class SampledDay:
-    """A quantity that is measured for a UTC day as a whole; `created` is when it was recorded."""
+    """Quantity measured over a whole UTC day; `created` is the time of its recording."""
 
     quantity: str
     run: str
     start: Utc
     samples: Sequence[Sample]
-    """In order of time."""
+    """Samples of the quantity in order of time."""
     revision: int
-    """1 for the first record of the day."""
+    """Number of the day's record, from 1; it grows with each repetition."""
     created: str

@@ -1,12 +1,12 @@
-"""The sources of quantities, and the functions that measure them in the stars of a batch.
+"""Sources of quantities, and the functions that measure quantities in the stars of a batch.
 
 `STORED` names the quantities with columns of their own in the database, in the order of these
-columns: the tables are made from it.  What a quantity is called, its limits and its usual cause
-are in `service.trends.quantities`.
+columns: the tables are built from it.  Names, limits and usual causes of quantities are in
+`service.trends.quantities`.
 
 A new `Measured` quantity needs a migration as well: a column of its name in `results` and in
 `tracker_values`; and for `rolled_up` the columns `_min` and `_max` in all four rollups, and `_n`
-and `_sum` too.  Results that were recorded before it have no value of it.
+and `_sum` too.  Results recorded earlier have no value of the quantity.
 """
 
 import math
@@ -29,13 +29,15 @@ if TYPE_CHECKING:
     from service.trends.drift import MeanStars
 
 Counts = Mapping[str, Any]
-"""`batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`: the counts of
-one result, columns of a rollup, or SQL."""
+"""Counts of one result, columns of a rollup, or SQL.
+
+The names are `batches`, `observed`, `unique`, `ambiguous`, `unmatched`, `solved`, `suspect`.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class BatchStars:
-    """The stars of a batch that a result was made of, tracker by tracker.
+    """Stars of a batch from which a result was made, for each tracker.
 
     `corrected` are the observations of `batch`, and `star` the rows of the catalog (n,) of the
     unique ones, -1 for others and where they are not known.
@@ -49,7 +51,7 @@ class BatchStars:
 
     @classmethod
     def of(cls, acquisition: "Acquisition") -> "BatchStars":
-        """The stars of an acquisition."""
+        """Collect the stars of an acquisition."""
         return cls(
             acquisition.batch,
             [each.corrected for each in acquisition.trackers],
@@ -60,8 +62,8 @@ class BatchStars:
 
     @cached_property
     def means(self) -> list["MeanStars"]:
-        """The mean directions of every tracker; none without an attitude."""
-        # Only what records an acquisition needs the ephemeris.
+        """Mean directions of the stars of every tracker; empty without an attitude."""
+        # Only recording an acquisition needs the ephemeris.
         from service.trends.drift import mean_stars
 
         if not self.has_attitude:
@@ -71,7 +73,7 @@ class BatchStars:
 
     @cached_property
     def alignment_offsets_arcsec(self) -> list[float | None]:
-        """How much larger each tracker's angles to the others are than the catalog's, as a mean."""
+        """Mean excess of each tracker's angles to the others over the catalog's, in arcsec."""
         from service.trends.drift import alignment_offsets_arcsec
 
         if len(self.corrected) == 1 or not self.has_attitude:
@@ -81,9 +83,9 @@ class BatchStars:
 
 @dataclass(frozen=True, eq=False)
 class MeasuredStars:
-    """The stars of one tracker of a batch, or of all its trackers: what a measure is taken of.
+    """Stars of one tracker of a batch, or of all its trackers, in which a quantity is measured.
 
-    `trackers` are their places in `batch`.  Both rms are those of the attitude's residuals over
+    `trackers` are their positions in `batch`.  Both rms are those of the attitude's residuals over
     these stars; None without an attitude from stars.
     """
 
@@ -94,14 +96,14 @@ class MeasuredStars:
 
     @classmethod
     def of_all(cls, acquisition: "Acquisition") -> "MeasuredStars":
-        """The stars of all trackers of an acquisition."""
+        """Collect the stars of all trackers of an acquisition."""
         stars = BatchStars.of(acquisition)
         return cls(stars, range(len(stars.corrected)), *rms_arcsec(acquisition))
 
 
 @dataclass(frozen=True)
 class StarShare:
-    """A share of the observed stars; `part` gives the stars from counts."""
+    """Source of a quantity: a fraction of the observed stars; `part` counts them."""
 
     part: Callable[[Counts], Any]
     rolled_up: bool = False
@@ -109,14 +111,14 @@ class StarShare:
 
 @dataclass(frozen=True)
 class BatchShare:
-    """A share of the batches; `part` gives the batches from counts, 0 or 1 for one batch."""
+    """Source of a quantity: a fraction of the batches; `part` counts them, 0 or 1 for one batch."""
 
     part: Callable[[Counts], Any]
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A value that is measured as a result is recorded, and stored in a column of its own.
+    """Source of a quantity: a value measured at recording, stored in its own column.
 
     The same function measures the stars of a batch and those of each of its trackers.
     """
@@ -127,7 +129,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class MeasuredOfBatch:
-    """A value of the batch as a whole, stored in a column of its own; no tracker has one."""
+    """Source of a quantity: a value of the whole batch in its own column; trackers have none."""
 
     measure: Callable[["Acquisition"], float | None]
     rolled_up: bool = False
@@ -135,7 +137,7 @@ class MeasuredOfBatch:
 
 @dataclass(frozen=True)
 class Ratio:
-    """The ratio of two measured quantities, by their names; None where either is missing."""
+    """Source of a quantity: the ratio of two measured ones by name; None if either is missing."""
 
     numerator: str
     denominator: str
@@ -144,32 +146,33 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Rate:
-    """Batches in an hour of batch time."""
+    """Source of a quantity: the number of batches in an hour of batch time."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Time without a batch; it has no history."""
+    """Source of a quantity: the time without a batch; it has no history."""
 
 
 @dataclass(frozen=True)
 class SmoothedShare:
-    """A share of the attitudes that the filter met, of days that are smoothed; it has no history.
+    """Source of a quantity: a fraction of a smoothed day's attitudes; it has no history.
 
-    Batches have no value of it as they are recorded: `acquire smooth` has.
+    Batches have no value of it when they are recorded: `acquire smooth` computes it.
     """
 
 
 Source = StarShare | BatchShare | Measured | MeasuredOfBatch | Ratio | Rate | Gap | SmoothedShare
-"""How a quantity follows from batches.
+"""Source of a quantity: the way in which it follows from batches.
 
-`rolled_up`, where a source has it: True if the rollups have columns of it.  Without, buckets have
-no extremes of a share of stars and no values of a ratio, and batches are not ranked by it.
+`rolled_up`, where a source has it, is True if the rollups have columns of it.  Without such columns
+buckets have no extremes of a share of stars and no values of a ratio, and batches are not ranked by
+the quantity.
 """
 
 
 def rms_arcsec(acquisition: "Acquisition") -> tuple[float | None, float | None]:
-    """The rms of the attitude's residuals, and what its covariance predicts; None: not known."""
+    """Rms of the attitude's residuals in arcsec, measured and predicted; None: not known."""
     solution = acquisition.solution
     if solution is None:
         return None, None
@@ -177,7 +180,7 @@ def rms_arcsec(acquisition: "Acquisition") -> tuple[float | None, float | None]:
 
 
 def magnitude_offset_mag(stars: MeasuredStars) -> float | None:
-    """The mean of observed less catalog magnitude over the unique stars.
+    """Mean of observed minus catalog magnitude over the unique stars.
 
     None where no unique star has a magnitude.
     """
@@ -193,7 +196,7 @@ def magnitude_offset_mag(stars: MeasuredStars) -> float | None:
 
 
 def scale_offset_ppm(stars: MeasuredStars) -> float | None:
-    """How much larger the stars' distances are than the catalog's, in millionths.
+    """Excess of the stars' mutual distances over the catalog's, in ppm.
 
     None without an attitude, or where the stars are too close together.
     """
@@ -204,7 +207,7 @@ def scale_offset_ppm(stars: MeasuredStars) -> float | None:
 
 
 def alignment_offset_arcsec(stars: MeasuredStars) -> float | None:
-    """How much larger the angles to the other trackers are than the catalog's, as a mean.
+    """Mean excess of the angles to the other trackers over the catalog's angles, in arcsec.
 
     None without an attitude, or where fewer than two trackers have unique stars.
     """
@@ -213,10 +216,10 @@ def alignment_offset_arcsec(stars: MeasuredStars) -> float | None:
 
 
 def a_priori_angle_deg(acquisition: "Acquisition") -> float | None:
-    """The angle from the a priori attitude to the one found; None without either.
+    """Angle from the a priori attitude to the found one in degrees; None without either.
 
-    Where the a priori gives an axis alone, the pole of a band or the boresight
-    of a cap, the angle between that axis and where it was found to be.
+    If the a priori gives only an axis (the pole of a band or the boresight of a cap), the angle
+    between that axis and its found direction.
     """
     if acquisition.solution is None or acquisition.prior is None:
         return None
@@ -249,7 +252,7 @@ STORED: dict[str, StarShare | Measured | MeasuredOfBatch | Ratio] = {
     "scale_offset_ppm": Measured(scale_offset_ppm, rolled_up=True),
     "alignment_offset_arcsec": Measured(alignment_offset_arcsec, rolled_up=True),
 }
-"""The sources of the quantities that have columns, by name, in the order of these.
+"""Sources of the quantities stored in database columns, by name, in the order of the columns.
 
-New ones come last: an index of results has the columns in this order.
+Add new ones at the end: an index of results has the columns in this order.
 """

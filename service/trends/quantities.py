@@ -1,4 +1,4 @@
-"""The registry of quantities: what trends show, limits apply to and batches are ranked by.
+"""Registry of quantities, for trends, limits and rankings of batches.
 
 Every list of quantities is derived from `QUANTITIES`: histories, limits, the ranking, query
 parameters and the OpenAPI document, the labels of the console, and the columns of CSV files.
@@ -33,7 +33,7 @@ from service.trends.measures import (
 
 @dataclass(frozen=True)
 class Cause:
-    """Why a quantity usually leaves its limits, and what to do then."""
+    """Usual cause of a quantity out of its limits, and the remedy."""
 
     cause: str
     remedy: str
@@ -48,19 +48,21 @@ class Quantity:
     name: str
     unit: str
     label: str
-    """The name that pages show."""
+    """Name of the quantity on pages."""
     source: Source
     limits: Callable[[Mission], LimitSettings] | None = None
-    """The limits of a mission until others are set; None: limits do not apply."""
+    """Function that gives a mission's default limits; None if limits do not apply."""
     worse: Literal["high", "size"] = "high"
-    """`high` if a greater value is worse, `size` if one further from zero is."""
+    """Direction of worse values: `high` if greater, `size` if further from zero."""
     description: str = ""
-    """The description of its value in `measures`, in the OpenAPI document."""
+    """Description of the quantity in `measures`, for the OpenAPI document."""
     by_tracker: bool = False
-    """True if each tracker of a spacecraft with several has a value of it.  A tracker is suspect
-    where it is the one that disagrees with the others."""
+    """True if each tracker of a spacecraft with several has its own value of the quantity.
+
+    A tracker is suspect if it disagrees with the others.
+    """
     cause: Cause | None = None
-    """The cause of a value out of its limits; docs/operators.md has the table of all."""
+    """Usual cause of a value out of limits; docs/operators.md has the table of all causes."""
 
     def __post_init__(self) -> None:
         of_trackers = StarShare | BatchShare | Measured | Ratio
@@ -69,17 +71,17 @@ class Quantity:
 
     @property
     def rolled_up(self) -> bool:
-        """True if the rollups have columns of it; see `Source`."""
+        """True if the rollups have columns for the quantity; see `Source`."""
         return getattr(self.source, "rolled_up", False)
 
     @property
     def is_share(self) -> bool:
-        """True if it is a share of stars or batches, which rollups count."""
+        """True if the quantity is a fraction of stars or batches, which rollups count."""
         return isinstance(self.source, StarShare | BatchShare)
 
     @property
     def value_of(self) -> Callable[[Mapping[str, Any]], float | None]:
-        """The function that gives the value of one result, a row; None where it has none."""
+        """Function that gives the quantity of one result from its row; None without a value."""
         match self.source:
             case Measured() | MeasuredOfBatch():
                 return itemgetter(self.name)
@@ -93,7 +95,7 @@ class Quantity:
                 return lambda row: None
 
     def sample_of(self, result: Mapping[str, Any]) -> Sample | None:
-        """The sample of one result for the value that limits are evaluated for; None: nothing."""
+        """Sample of the quantity from one result, to evaluate limits; None without a value."""
         match self.source:
             case StarShare(part):
                 whole = result["observed"]
@@ -106,14 +108,14 @@ class Quantity:
 
 
 def counts_of(result: Mapping[str, Any]) -> dict[str, int]:
-    """The counts of one result, as a rollup of it has them."""
+    """Counts of one result, in the form of a rollup of it."""
     stars = {name: result[name] for name in ("observed", "unique", "ambiguous", "unmatched")}
     solved, suspect = result["status"] is not None, result["status"] == "suspect"
     return {"batches": 1, **stars, "solved": int(solved), "suspect": int(suspect)}
 
 
 def a_priori_margin_deg(mission: Mission) -> float:
-    """How far the a priori attitude may be off before the field of view leaves the zone."""
+    """A priori attitude error in degrees at which the field of view leaves the zone."""
     zone = mission.zone
     half_width_deg = zone.half_width_deg if isinstance(zone, Band) else zone.radius_deg
     widest_deg = max(each.field_of_view_radius_deg for each in mission.trackers)
@@ -308,7 +310,7 @@ QUANTITIES: dict[str, Quantity] = {
             "1",
             "attitudes that the filter rejects",
             SmoothedShare(),
-            # Of good ones one in ten thousand is rejected.
+            # One in ten thousand good attitudes is rejected.
             lambda mission: above(0.02, 0.05, 0.2, hysteresis=0.005, minimum_count=100),
             cause=Cause(
                 "A star that is misidentified in every batch, a step of the clock, or a fault "
@@ -323,42 +325,42 @@ QUANTITIES: dict[str, Quantity] = {
 
 
 def quantity_named(name: str) -> Quantity:
-    """The quantity of a stored alarm, which may be registered no longer: then its name is known."""
+    """Quantity of a stored alarm by name; a placeholder if it is no longer registered."""
     return QUANTITIES.get(name) or Quantity(name, "", name.replace("_", " "), Gap())
 
 
 def names() -> tuple[str, ...]:
-    """Every quantity."""
+    """Names of all quantities."""
     return tuple(QUANTITIES)
 
 
 def trend_names() -> tuple[str, ...]:
-    """The quantities that have a history."""
+    """Names of the quantities that have a history."""
     return _names(lambda each: not isinstance(each.source, Gap | SmoothedShare))
 
 
 def tracker_names() -> tuple[str, ...]:
-    """The quantities that each tracker has a value of."""
+    """Names of the quantities that each tracker has its own value of."""
     return _names(lambda each: each.by_tracker)
 
 
 def limited_names() -> tuple[str, ...]:
-    """The quantities that limits apply to."""
+    """Names of the quantities that have limits."""
     return _names(lambda each: each.limits is not None)
 
 
 def ranked_names() -> tuple[str, ...]:
-    """The quantities that batches are ranked by."""
+    """Names of the quantities by which batches are ranked."""
     return _names(lambda each: each.rolled_up)
 
 
 def value_names() -> tuple[str, ...]:
-    """The quantities that are values of one batch: measured, or the ratio of such."""
+    """Names of the quantities of a single batch: measured, or a ratio of measured ones."""
     return _names(lambda each: isinstance(each.source, Measured | MeasuredOfBatch | Ratio))
 
 
 def default_limits(mission: Mission) -> dict[str, LimitSettings]:
-    """The limits of a mission until others are set (docs/alarms.md gives reasons)."""
+    """Default limits of a mission by quantity (docs/alarms.md gives reasons)."""
     return {name: each.limits(mission) for name, each in QUANTITIES.items() if each.limits}
 
 
@@ -368,20 +370,20 @@ def _names(chosen: Callable[[Quantity], bool]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class OneOf:
-    """Validates a name against the registry as it is when the name is validated."""
+    """Validator of a name against the registry, read at each validation."""
 
     names: Callable[[], tuple[str, ...]]
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        """A text that is one of the names."""
+        """Schema of a text that must be one of the names."""
         return core_schema.no_info_after_validator_function(self._check, handler(source))
 
     def __get_pydantic_json_schema__(
         self, schema: CoreSchema, handler: GetJsonSchemaHandler
     ) -> dict[str, Any]:
-        """An enumeration, as for a `Literal`."""
+        """JSON schema of an enumeration of the names, as for a `Literal`."""
         return {"enum": list(self.names()), "type": "string"}
 
     def _check(self, name: str) -> str:
@@ -399,25 +401,25 @@ RankedName = Annotated[str, OneOf(ranked_names)]
 # ---- subjects of limits ----------------------------------------------------------------------
 
 Subject = str
-"""What has limits: a quantity of a spacecraft, or of one of its trackers.
+"""Subject of a limit: a quantity of a spacecraft, or of one of its trackers.
 
 Texts such as `residual_ratio` and `residual_ratio@STARTRACKER_2`: names have no `@`.
 """
 
 
 def subject_of(quantity: str, tracker: str = "") -> Subject:
-    """The subject that a quantity is; without a tracker, of the spacecraft as a whole."""
+    """Subject of a limit: a quantity of a tracker, or without one of the whole spacecraft."""
     return f"{quantity}@{tracker}" if tracker else quantity
 
 
 def quantity_and_tracker(subject: Subject) -> tuple[str, str]:
-    """The quantity and the tracker of a subject; the tracker is empty for the spacecraft's."""
+    """Quantity and tracker in a limit's subject; the tracker is empty for the whole spacecraft."""
     quantity, _, tracker = subject.partition("@")
     return quantity, tracker
 
 
 def limited_trackers(mission: Mission) -> tuple[str, ...]:
-    """The trackers that have limits of their own: all, where there are several."""
+    """Trackers with limits of their own: all, if the mission has several."""
     if len(mission.trackers) == 1:
         return ()
     return tuple(each.name for each in mission.trackers)
@@ -426,7 +428,7 @@ def limited_trackers(mission: Mission) -> tuple[str, ...]:
 def limits_of_subjects(
     mission: Mission, shipped: Mapping[str, LimitSettings], own: Mapping[Subject, LimitSettings]
 ) -> dict[Subject, LimitSettings]:
-    """The limits of every subject of a mission, own ones in place of the shipped.
+    """Limits of every subject of a mission; a spacecraft's own settings override shipped ones.
 
     A tracker without limits of its own has those of its spacecraft.
     """
@@ -440,7 +442,7 @@ def limits_of_subjects(
 
 
 def sampler(subject: Subject) -> Callable[[Mapping[str, Any], Mapping[str, Any]], Any]:
-    """The function that gives a result's sample of a subject, or None.
+    """Function that gives a result's sample of a limit's subject, or None.
 
     It takes the result and, by tracker, the values of its trackers.
     """
