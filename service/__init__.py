@@ -4,5 +4,5 @@ from service.compiled.cache import keep_kernels_apart
 
 __version__ = "0.2.0"
 
-# Before anything imports numba.
+# Must precede any import of numba.
 keep_kernels_apart()

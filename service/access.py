@@ -1,10 +1,10 @@
-"""Access: tokens, callers by token or session with their rates, and the audit list.
+"""Access control: tokens, callers by token or session with their rates, and the audit list.
 
-A token is 32 random bytes behind `acq_`.  The database keeps its SHA-256 alone:
-nothing can be guessed of that many random bits, so no slower digest is needed.
-Until the first token is made, access on a loopback address is open.  Callers are
-cached for a second, so a revocation takes effect in every process within a second.
-The audit list says who changed what; entries are only added.
+A token is 32 random bytes after the prefix `acq_`.  The database stores its SHA-256 only: that many
+random bits cannot be guessed, so no slower digest is needed.  Until the first token is made, access
+on a loopback address is open.  Callers are cached for a second, so a revocation takes effect in
+every process within a second.  The audit list records the author of every change; entries are only
+added.
 """
 
 import hashlib
@@ -45,10 +45,9 @@ MAX_BODY_KEPT = 4_000
 
 @dataclass(frozen=True)
 class Entry:
-    """One entry: who did what to what, with what body, and the status of the answer.
+    """Entry of the audit list: author, action, object, request body, and status of the answer.
 
-    Handed to the operation that makes the change, it becomes part of the change's own
-    transaction: neither is stored without the other.
+    It is stored in the transaction of the change itself: neither is stored without the other.
     """
 
     id: str
@@ -60,11 +59,11 @@ class Entry:
     status: int | None = None
 
     def row(self) -> Row:
-        """The entry as a row of the table, its body shortened."""
+        """Convert the audit entry to a database row, its body shortened."""
         return vars(self) | {"body": _kept(self.body)}
 
     def add_to(self, connection: Connection) -> None:
-        """Add the entry to the list."""
+        """Insert the entry into the audit list."""
         connection.execute(insert(audit).values(self.row()))
 
 
@@ -86,9 +85,9 @@ def list_entries(
     action: str = "",
     about: str = "",
 ) -> Page[AuditEntry]:
-    """The entries, newest first; a cursor is the id of the last one shown.
+    """List the entries of the audit list, newest first; a cursor is the id of the last one shown.
 
-    `person` signed them or is the token's name; `action` and `about` are parts of theirs.
+    `person` is the signature or the token's name; `action` and `about` are parts of the fields.
     """
     query = select(audit).order_by(audit.c.id.desc()).limit(READ_AT_ONCE)
     if action:
@@ -107,7 +106,7 @@ def list_entries(
 
 
 def _entry(row: Any) -> AuditEntry:
-    """A stored entry with the signature in its body, if that has one."""
+    """Convert a stored audit entry, with the signature in its body, if it has one."""
     who, reason = signed_in(row["body"])
     return AuditEntry(**row, person=who or row["who"], reason=reason)
 
@@ -116,9 +115,9 @@ SCOPES: tuple[Scope, ...] = get_args(Scope)
 
 PREFIX = "acq_"
 SESSION_H = 12
-"""How long a browser stays signed in, in hours."""
+"""Duration of a browser's session in hours."""
 CLOCKS_APART_S = 300.0
-"""How much the clocks of services on one database may differ."""
+"""Largest difference between the clocks of services on one database, in seconds."""
 MAX_DAYS = 3660
 DEFAULT_DAYS = 365
 KNOWN_FOR_S = 1.0
@@ -130,9 +129,9 @@ _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9 ._@+-]{0,63}", re.ASCII)
 
 @dataclass(frozen=True)
 class Caller:
-    """A caller and what it may do.
+    """Caller of a request, with its token's scopes, spacecraft and rate.
 
-    `spacecraft` None stands for every one.  `rate_per_s` None is no bound.
+    `spacecraft` is None for all; `rate_per_s` is None for no limit.
     """
 
     name: str
@@ -142,27 +141,27 @@ class Caller:
     rate_per_s: float | None = None
 
     def may_see(self, spacecraft: str) -> bool:
-        """True if the caller may see a spacecraft."""
+        """True if the caller has access to a spacecraft."""
         return self.spacecraft is None or spacecraft in self.spacecraft
 
     def require(self, spacecraft: str) -> None:
-        """Raise `Forbidden` unless the caller may see a spacecraft."""
+        """Raise `Forbidden` unless the caller has access to a spacecraft."""
         if self.spacecraft is not None and spacecraft not in self.spacecraft:
             theirs = ", ".join(sorted(self.spacecraft))
             raise Forbidden(f"{self.name} is bound to {theirs}, not to {spacecraft[:128]}")
 
 
 OPEN_CALLER = Caller("local", frozenset(SCOPES))
-"""The caller of every request while access is open."""
+"""Caller assigned to every request while access is open."""
 
 
 def new_secret() -> str:
-    """A new random secret."""
+    """Generate a random secret for a token or a session."""
     return PREFIX + secrets.token_urlsafe(32)
 
 
 def secret_digest(secret: str) -> str:
-    """The digest that is stored of a token or a session."""
+    """Digest of the secret of a token or a session, as stored in the database."""
     return hashlib.sha256(secret.encode("utf-8", "surrogatepass")).hexdigest()
 
 
@@ -178,11 +177,10 @@ def add_token(
     created: str,
     expires: str,
 ) -> None:
-    """Keep a new token under a name that signs what is done with it.
+    """Store a new token; its name signs the changes made with it.
 
-    Raises `BadInput` for a name or a scope that cannot be, `Conflict` for a
-    name that is taken, also by a token that was revoked: the name stands in the
-    audit list.
+    Raises `BadInput` for an invalid name or scope, `Conflict` for a name in use, also by a revoked
+    token: the name stands in the audit list.
     """
     if not _NAME.fullmatch(name):
         message = "must be 1 to 64 letters, digits, spaces or . _ @ + -, a letter or digit first"
@@ -213,13 +211,13 @@ def add_token(
 
 
 def list_tokens(connection: Connection, now: str) -> list[Token]:
-    """Every token without its digest, the oldest first; states are those at a time."""
+    """List all tokens without their digests, the oldest first, with their states at a time."""
     query = select(access_tokens).order_by(access_tokens.c.id)
     return [_token(row, now) for row in connection.execute(query).mappings()]
 
 
 def read_token(connection: Connection, name: str, now: str) -> Token:
-    """A token without its digest; raises `NotFound`."""
+    """Read a token by name, without its digest; raises `NotFound`."""
     query = select(access_tokens).where(access_tokens.c.name == name)
     row = connection.execute(query).mappings().first()
     if row is None:
@@ -242,7 +240,7 @@ def _token(row: Any, now: str) -> Token:
 
 
 def revoke_token(connection: Connection, name: str, moment: str) -> None:
-    """End a token and the sessions begun with it; raises `NotFound`."""
+    """Revoke a token and end its sessions; raises `NotFound`."""
     row = connection.execute(
         select(access_tokens.c.id, access_tokens.c.revoked).where(access_tokens.c.name == name)
     ).first()
@@ -256,10 +254,10 @@ def revoke_token(connection: Connection, name: str, moment: str) -> None:
 
 
 def _caller(connection: Connection, kind: str, digest: str, now: Utc) -> Caller | None:
-    """The caller of a token or of a browser's session that is valid now; else None."""
+    """Look up the caller of a valid token or browser session; None if there is none."""
     condition, moment = access_tokens.c.digest == digest, now.text
     if kind == "session":
-        # One that was begun by a clock far ahead, which was set right since, would last too long.
+        # A session started by a clock far ahead, since corrected, would last too long.
         latest = shifted(now, SESSION_H * 3600 + CLOCKS_APART_S).text
         held = (
             select(access_sessions.c.token_id)
@@ -290,24 +288,24 @@ def _caller(connection: Connection, kind: str, digest: str, now: Utc) -> Caller 
 
 
 class Database(Protocol):
-    """Reads, and changes together with the audit list."""
+    """Interface to the database: reading, and changes with an entry in the audit list."""
 
     def reading(self) -> AbstractContextManager[Connection]:
-        """A connection that sees one moment of the database."""
+        """Provide a connection with one snapshot of the database."""
 
     def change_audited(self, change: Callable[[Connection], Any], entry: Entry | None) -> Any:
         """Change the database in one transaction, with an entry in the audit list."""
 
 
 class Tokens:
-    """Makes, lists and revokes tokens.  `entry` goes to the audit list with a change."""
+    """Service that creates, lists and revokes tokens; `entry` adds a change to the audit list."""
 
     def __init__(self, database: Database, missions: Mapping[str, Mission]) -> None:
         self._database, self._missions = database, missions
         self._ids = Ulids()
 
     def all(self) -> list[Token]:
-        """Every token without its secret, the oldest first."""
+        """List all tokens without their secrets, the oldest first."""
         with self._database.reading() as connection:
             return list_tokens(connection, utc_now().text)
 
@@ -321,12 +319,12 @@ class Tokens:
         rate_per_s: float | None = None,
         entry: Entry | None = None,
     ) -> NewToken:
-        """Make a token; its secret is in the answer alone.
+        """Create a token; only the return value holds its secret.
 
-        Raises `BadInput` for what cannot be and `Conflict` for a name that was used before.
+        Raises `BadInput` for invalid values and `Conflict` for a name that was used before.
         """
         for each in spacecraft or ():
-            # A misspelt name would bind the token to nothing.
+            # A misspelt name would limit the token to nothing.
             mission_named(self._missions, each)
         secret, id, created = new_secret(), self._ids.new(), utc_now()
 
@@ -350,7 +348,7 @@ class Tokens:
         )
 
     def revoke(self, name: str, entry: Entry | None = None) -> Token:
-        """End a token and the sessions begun with it; raises `NotFound`."""
+        """Revoke a token and end its sessions; raises `NotFound`."""
 
         def change(connection: Connection) -> Token:
             moment = utc_now().text
@@ -368,21 +366,21 @@ RunInTransaction = Callable[[Callable[[Connection], Any]], Any]
 
 @dataclass
 class _TokenBucket:
-    """The token bucket of a rate limit: it fills with time, up to a burst."""
+    """Token bucket of a rate limit: it fills with time, up to a burst."""
 
     left: float
     filled_s: float
 
 
 class Access:
-    """Identifies callers; the one place that does."""
+    """Service that identifies the callers of all requests."""
 
     def __init__(
         self, reading: Reading, change: RunInTransaction, loopback: bool, now: Now
     ) -> None:
         """`reading` gives a connection; `change` runs a change and waits for its commit.
 
-        `loopback`: whether the service listens on a loopback address only.
+        `loopback` is True if the service listens on a loopback address only.
         """
         self._reading, self._change = reading, change
         self._loopback = loopback
@@ -402,20 +400,20 @@ class Access:
             return False
         clock_s = time.monotonic()
         if clock_s >= self._open_until_s:
-            # Rows of tokens are never deleted: closed access stays closed.
+            # Tokens are never deleted: closed access stays closed.
             self._closed = self.has_tokens()
             self._open_until_s = clock_s + KNOWN_FOR_S
         return not self._closed
 
     @property
     def cached_is_open(self) -> bool | None:
-        """`is_open` where it is known without reading the database; else None."""
+        """True if access is known to be open, False if closed, None if not known without a read."""
         if self._closed or not self._loopback:
             return False
         return True if time.monotonic() < self._open_until_s else None
 
     def database_timed_out(self) -> None:
-        """Let requests fail at once for a second, because the database did not answer in time."""
+        """Make requests fail at once for a second, because the database did not answer in time."""
         self._out_of_reach_until_s = time.monotonic() + KNOWN_FOR_S
 
     def require_database(self) -> None:
@@ -429,7 +427,7 @@ class Access:
             return connection.execute(select(access_tokens.c.id).limit(1)).first() is not None
 
     def cached_caller(self, token: str | None, session: str | None) -> Caller | None:
-        """The result of `caller` where it is known without reading the database; else None."""
+        """Caller of a token or session from the cache; None if the database must be read."""
         clock_s = time.monotonic()
         if not self._closed and self._loopback:
             return OPEN_CALLER if clock_s < self._open_until_s else None
@@ -438,9 +436,9 @@ class Access:
         return known[0] if known is not None and clock_s < known[1] else None
 
     def last_known_caller(self, token: str | None, session: str | None) -> Caller | None:
-        """The caller as it was at the last look-up, however long ago; None: never looked up.
+        """Caller as of the last look-up, however long ago; None if never looked up.
 
-        For what must answer while the database does not.
+        For requests that must be answered while the database is not.
         """
         if self.was_open:
             return OPEN_CALLER
@@ -450,11 +448,11 @@ class Access:
 
     @property
     def was_open(self) -> bool:
-        """True if access was open when that was last asked."""
+        """True if access was open at the last check."""
         return self._loopback and not self._closed and self._open_until_s > 0.0
 
     def caller(self, token: str | None, session: str | None) -> Caller:
-        """The caller of a bearer token or a session; raises `Unauthenticated`."""
+        """Caller of a bearer token or a session; raises `Unauthenticated`."""
         if self.is_open:
             return OPEN_CALLER
         for kind, secret in (("token", token), ("session", session)):
@@ -463,7 +461,7 @@ class Access:
         raise Unauthenticated("a token is needed: Authorization: Bearer acq_...")
 
     def look_up_again(self, token: str | None, session: str | None) -> Caller:
-        """`caller` without the cache."""
+        """Look up the caller of a token or session again, without the cache."""
         with self._lock:
             self._open_until_s = 0.0
             for kind, secret in (("token", token), ("session", session)):
@@ -488,10 +486,10 @@ class Access:
         return caller
 
     def count_request(self, caller: Caller, count: int = 1) -> None:
-        """Count a request against its token's rate; raises `RateLimited`.
+        """Count a request against the rate of its token; raises `RateLimited`.
 
-        A request that counts as more than a burst is let through when the burst is there;
-        requests after it wait until what it took beyond that is made up for.
+        A request that counts as more than a burst is accepted when the full burst is available;
+        later requests wait until the excess is made up for.
         """
         rate = caller.rate_per_s
         if rate is None or caller.token_id is None or count < 1:
@@ -508,13 +506,13 @@ class Access:
             bucket.left -= count
 
     def forget(self) -> None:
-        """Look callers up again from now on, because tokens have changed."""
+        """Clear the cache of callers, because tokens have changed."""
         with self._lock:
             self._known.clear()
             self._open_until_s = 0.0
 
     def sign_in(self, token: str) -> tuple[str, Caller]:
-        """Begin a browser's session; returns the secret for its cookie, and the caller."""
+        """Start a browser's session; returns the secret for its cookie, and the caller."""
         caller = self._holder("token", secret_digest(token))
         if caller.token_id is None:
             raise Unauthenticated("access is open: signing in is not needed")
@@ -527,7 +525,7 @@ class Access:
         }
 
         def begin(connection: Connection) -> None:
-            # Expired ones are deleted.
+            # Delete expired sessions.
             expired = access_sessions.c.expires <= begun.text
             connection.execute(delete(access_sessions).where(expired))
             connection.execute(insert(access_sessions).values(row))
@@ -544,9 +542,9 @@ class Access:
             self._known.pop(("session", digest), None)
 
     def entry(self, who: str, action: str, about: str, body: str | None, status: int) -> Entry:
-        """A new entry for the audit list."""
+        """Create an entry for the audit list."""
         return Entry(self._ids.new(), self._now().text, who, action, about, body, status)
 
     def add_entry(self, entry: Entry) -> None:
-        """Store an entry without a change; returns after the commit."""
+        """Store an audit entry without a change; returns after the commit."""
         self._change(entry.add_to)

@@ -1,7 +1,7 @@
-"""Starting child processes that run the code of this process, never code of the current folder.
+"""Start of child processes with the code of this process, never code in the current folder.
 
-Python puts the current folder first on the module search path of `python -c` and `python -m`,
-which the standard library starts its fork server and its spawned processes with.
+Python puts the current folder first on the module search path of `python -c` and `python -m`, with
+which the standard library starts its fork server and its spawned processes.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ _lock = threading.RLock()
 
 @contextmanager
 def safe_path() -> Iterator[None]:
-    """Leave the current folder off the search path of every Python process started in the block.
+    """Keep the current folder off the search path of Python processes started in a `with` block.
 
     The environment of this process carries the setting; other threads may see it meanwhile.
     """
@@ -41,7 +41,7 @@ def safe_path() -> Iterator[None]:
 
 
 def command_of(module: str) -> list[str]:
-    """The command that runs a module as `python -m` does, with the search path of this process."""
+    """Command line that runs a module as `python -m` does, with this process's search path."""
     paths = [os.path.abspath(path) for path in sys.path]
     code = f"import sys; sys.path[:] = {paths!r}; import runpy; "
     code += f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
@@ -50,7 +50,7 @@ def command_of(module: str) -> list[str]:
 
 @dataclass(frozen=True)
 class Source:
-    """The code that a process runs; the same code in two folders is equal."""
+    """Identity of a process's code: version, digest and folder; equal for equal code."""
 
     version: str
     sha256: str
@@ -62,7 +62,7 @@ class Source:
 
 @cache
 def own_source() -> Source:
-    """The source that this process runs, as its files are at the first call."""
+    """Identity of the code that this process runs, from its files at the first call."""
     digest = hashlib.sha256()
     for path in sorted(_PACKAGE.rglob("*.py")):
         digest.update(path.relative_to(_PACKAGE).as_posix().encode() + b"\0" + path.read_bytes())
@@ -70,7 +70,7 @@ def own_source() -> Source:
 
 
 def require_source(parent: Source) -> None:
-    """Raise `BadConfiguration` where this process, a worker, runs other code than its parent."""
+    """Raise `BadConfiguration` if this worker process runs other code than its parent."""
     if own_source() != parent:
         raise BadConfiguration(
             f"a worker process runs {own_source()}, and its parent {parent}: restart the parent, "

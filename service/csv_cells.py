@@ -1,7 +1,7 @@
-"""Texts in cells of CSV files that a spreadsheet takes for one cell, and not for a formula.
+"""Text cells of CSV files, written so that no spreadsheet reads them as formulas.
 
-As the OWASP page on CSV injection recommends, an apostrophe goes before a text that begins with a
-character that begins a formula.  Reading takes it away.
+As the OWASP page on CSV injection recommends, an apostrophe precedes a text that begins with a
+character that begins a formula.  Reading removes it.
 """
 
 import re
@@ -10,19 +10,19 @@ _STARTS = "=+\\-@\t\r\n＝＋－＠"
 _IS_FORMULA = re.compile(f"'*[{_STARTS}]")
 _IS_NEUTRALISED = re.compile(f"'+[{_STARTS}]")
 NEEDS_QUOTES = re.compile('[",;\t\r\n]')
-"""A spreadsheet of another country takes a semicolon or a tab for the end of a cell."""
+"""Characters that need quotes; some locales' spreadsheets separate cells by semicolon or tab."""
 
 
 def neutralised(text: str) -> str:
-    """The text as a cell: no spreadsheet computes it, and `original` gives the text back."""
+    """Convert a text to a cell that no spreadsheet computes; `original` reverses this."""
     return f"'{text}" if _IS_FORMULA.match(text) else text
 
 
 def original(cell: str) -> str:
-    """The text of a cell that `neutralised` may have written."""
+    """Convert a cell back to the text that `neutralised` may have changed."""
     return cell[1:] if _IS_NEUTRALISED.match(cell) else cell
 
 
 def quoted(text: str) -> str:
-    """The text as it stands between two separators: in quotes where one is in it."""
+    """Put a cell in quotes if it contains a separator, a quote or a line end."""
     return '"{}"'.format(text.replace('"', '""')) if NEEDS_QUOTES.search(text) else text

@@ -1,7 +1,7 @@
-"""A demonstration: a real server, sample passes through HTTP, a table against truth.
+"""Demonstration: a real server, simulated passes sent through HTTP, and a table against truth.
 
-Everything goes into one folder.  A second run draws the same samples, whose
-batches the server has recorded already, and prints the same table.
+All files are in one folder.  A second run draws the same samples, whose batches the server has
+recorded already, and prints the same table.
 """
 
 import dataclasses
@@ -38,23 +38,23 @@ from service.times import HOUR_S
 
 MISSIONS = ("XTE", "SWAS", "SOHO")
 START = "1999-03-01T00:00:00.000Z"
-"""The start of every pass: a day on which all three were at work."""
+"""Start of every simulated pass: a day on which all three spacecraft operated."""
 WIDTH_S = 20 * HOUR_S
-"""How long a pass lasts: within the day that the console shows first."""
+"""Duration of a simulated pass in seconds, within the day that the console shows first."""
 GYRO = telemetry.GyroWanted(step_s=10.0)
-"""The gyro beside a pass: coarse in time, so that 20 hours are 7,200 samples."""
+"""Gyro data of a simulated pass: coarse in time, so that 20 hours are 7,200 samples."""
 START_S = 300.0
-"""The longest that the server may take to be ready once its kernels are compiled."""
+"""Longest wait for the server after its kernels are compiled, in seconds."""
 COMPILING_S = 1800.0
-"""The longest that the compiling may take: minutes, more where other work has the processors."""
+"""Longest wait for the compilation in seconds: it takes minutes, more on a busy machine."""
 COMPILES_AFTER_S = 5.0
-"""The time after which a message says what a start waits for."""
+"""Seconds of waiting after which a message gives the reason."""
 PROGRESS_EVERY_S = 10.0
-"""How often progress is printed without a terminal."""
+"""Seconds between progress messages without a terminal."""
 STOP_S = 15.0
 STOPPED_EXIT_CODES = (0, 130, 143, -signal.SIGINT, -signal.SIGTERM)
 CONCURRENCY = 2
-"""Posts at a time: more would only wait for each other and swell the times that are shown."""
+"""Number of simultaneous posts: more would only wait and lengthen the times shown."""
 
 
 def run_demo(
@@ -65,22 +65,22 @@ def run_demo(
     once: bool,
     as_json: bool = False,
 ) -> int:
-    """Serve, replay and print; then keep serving until interrupted, unless `once`.
+    """Run the demonstration: serve, replay and print; then serve until interrupted, unless `once`.
 
-    `as_json` prints the table's figures as JSON in its place and nothing else.
+    `as_json` prints the table's figures as JSON in place of the table.
 
-    Raises `BadInput` for a pass that cannot be, `BadConfiguration` where the
-    port is taken or the server does not start.
+    Raises `BadInput` for an impossible pass, `BadConfiguration` where the port is taken or the
+    server does not start.
     """
     started = time.perf_counter()
     if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
-        # A script that starts this with & ignores the signal: only a kill would end it.
+        # A script that starts this with & ignores SIGINT: without this only a kill would end it.
         signal.signal(signal.SIGINT, signal.default_int_handler)
     wanted = Pass(batches, seed, START, WIDTH_S / batches)
     if settings.port == 0:
         raise BadInput(Fault("--port", "must be a port that can be named", "0"))
     folder.mkdir(parents=True, exist_ok=True)
-    # Everything in here can be made again: git ignores it.
+    # The folder's content can be made again: let git ignore it.
     (folder / ".gitignore").write_text("*\n", encoding="utf-8")
     database = folder / "acquire.db"
     settings = dataclasses.replace(settings, database=f"sqlite:///{database}")
@@ -111,7 +111,7 @@ def run_demo(
         stream = sys.stderr if as_json else sys.stdout
         print(f"\nServing on {url} until Ctrl-C.", file=stream, flush=True)
         with suppress(KeyboardInterrupt):
-            # A terminal's Ctrl-C reaches the server too, which may stop first.
+            # A terminal's Ctrl-C also reaches the server, which may stop first.
             if server.wait() not in STOPPED_EXIT_CODES:
                 raise Busy(f"the server stopped by itself; see {folder / 'server.log'}")
         print("stopped", file=stream)
@@ -119,7 +119,7 @@ def run_demo(
 
 
 def rows_of(scores: Mapping[str, Mapping[str, Score]]) -> list[dict[str, Any]]:
-    """The table's rows as plain values; a figure without batches is NaN."""
+    """Rows of the demonstration's table as plain values; a figure without batches is NaN."""
     rows = []
     for name, stretches in scores.items():
         serious = together(each for kind, each in stretches.items() if kind != "nominal")
@@ -159,7 +159,7 @@ def _where_next(
             serve += f" --{name} {getattr(settings, name)}"
     page = f"{url}/?run={run}"
     if once:
-        # The server has stopped: its address alone would be of no use.
+        # The server has stopped: its address alone would be useless.
         yield serve, "serve these records; the console of this run is then"
         yield f"  {page}", "  every spacecraft, its trends, each batch down to its stars"
     else:
@@ -181,7 +181,7 @@ def _where_next(
         "acquire frame PICTURE",
         "any picture of the sky, from any camera: its attitude, its lens, the names of its stars",
     )
-    # A wheel has no documents.
+    # An installed wheel has no documents.
     if shipped("docs", "quickstart.md").is_file():
         yield "docs/quickstart.md", "a walk: post a batch, read the attitude, try other tolerances"
     if not once:
@@ -201,7 +201,7 @@ def _samples(folder: Path, wanted: Pass) -> list[Path]:
 
 
 def _scores(url: str, files: Sequence[Path], run: str, ready_s: float) -> dict[str, Any]:
-    """Send the passes to the server, which was ready after so many seconds; scores by mission.
+    """Send the passes to the server, which took `ready_s` seconds to start; scores by mission.
 
     The kernels of the whole sky may not be compiled by then: a batch that needs them waits.
     """
@@ -231,7 +231,7 @@ def _scores(url: str, files: Sequence[Path], run: str, ready_s: float) -> dict[s
 
 
 def _answers(results: Path) -> Iterator[dict[str, Any]]:
-    """The answers to the batches, without the records that answer gyro blocks."""
+    """Answers to batches in a file of results, without those to gyro blocks."""
     return (each for each in telemetry.read_objects(results) if "block" not in each)
 
 
@@ -245,7 +245,7 @@ def _digest(files: Sequence[Path]) -> str:
 
 @contextmanager
 def _served(settings: Settings, log: Path) -> Iterator[subprocess.Popen[bytes]]:
-    """A server of its own process, stopped when the block ends, however it ends."""
+    """Start a server process for a `with` block; it is stopped at the block's end in any case."""
     command = [*command_of("service.cli"), "serve"]
     command += ["--host", settings.host, "--port", str(settings.port)]
     command += ["--database", settings.database]
@@ -296,7 +296,7 @@ def _wait_until_ready(server: subprocess.Popen[bytes], url: str, log: Path) -> N
 
 
 class _Waiting:
-    """Progress while the server starts: one moving line on a terminal, else a line at times."""
+    """Progress of the server's start: one changing line on a terminal, else a line at times."""
 
     def __init__(self) -> None:
         self._moves = sys.stderr.isatty()
@@ -304,7 +304,7 @@ class _Waiting:
         self._next_s = COMPILES_AFTER_S
 
     def show(self, waited_s: float) -> None:
-        """Show how long the start has taken."""
+        """Show the time that the start of the server has taken."""
         line = f"the server is starting: {waited_s:.0f} s"
         if waited_s >= COMPILES_AFTER_S and self._compiles():
             line += f"; {kernel_progress().line(waited_s)} (only the first start compiles)"
@@ -317,7 +317,7 @@ class _Waiting:
 
     @staticmethod
     def _compiles() -> bool:
-        """True if the server, which has this process's cache, is still compiling its kernels."""
+        """True if the server, which shares this process's cache, is still compiling its kernels."""
         return KernelBuild().is_needed
 
     def __enter__(self) -> Self:

@@ -1,4 +1,4 @@
-"""Every exception that the service raises itself.
+"""Exceptions of the service, in one tree.
 
     AcquisitionError
     ├── BadInput              invalid input: names the field and the value
@@ -18,8 +18,8 @@
         ├── BeingBuilt        another thread builds what the work needs
         └── Stopping          the service is stopping: a later attempt here will fail too
 
-Not finding a star is a result and raises nothing.  Nothing here knows HTTP;
-the status codes are given in `service.web.requests.problems`.
+An unidentified star is a result and raises nothing.  This module does not know HTTP; the status
+codes are given in `service.web.requests.problems`.
 """
 
 from collections.abc import Iterable, Sequence
@@ -30,7 +30,7 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault of an input: the field, what is expected, and the value."""
+    """Fault of an input: the field, the expected value, and the given value."""
 
     field: str
     message: str
@@ -38,12 +38,12 @@ class Fault:
 
     def __str__(self) -> str:
         shown = "" if self.value is None else f" (got {self.value})"
-        # Names and values come from files and requests, and are shown on terminals.
+        # Names and values come from files and requests, and are shown on terminals: escape them.
         return printable(f"{self.field}: {self.message}{shown}")
 
 
 def printable(text: str) -> str:
-    """Text that cannot begin a line or move a terminal's cursor: such characters as escapes."""
+    """Escape characters that would begin a line or move a terminal's cursor."""
     if text.isprintable():
         return text
     return "".join(
@@ -52,69 +52,69 @@ def printable(text: str) -> str:
 
 
 def shown_value(value: object, limit: int = 80) -> str:
-    """A value as text for a message, cut to `limit` characters."""
+    """Format a value for a message, cut to `limit` characters."""
     text = repr(value)
     return text if len(text) <= limit else text[: limit - 1] + "…"
 
 
 class AcquisitionError(Exception):
-    """The base of every error that the service raises itself."""
+    """Base class of every error that the service raises itself."""
 
 
 class BadInput(AcquisitionError):
-    """Invalid input, with every fault found in it."""
+    """Error for invalid input, with every fault found in it."""
 
     def __init__(self, faults: Iterable[Fault] | Fault) -> None:
         self.faults = (faults,) if isinstance(faults, Fault) else tuple(faults)
         super().__init__("; ".join(str(fault) for fault in self.faults))
 
     def __reduce__(self) -> tuple[type["BadInput"], tuple[tuple[Fault, ...]]]:
-        # Pickling would pass the text in place of the faults.
+        # Pickling would otherwise pass the text in place of the faults.
         return type(self), (self.faults,)
 
 
 class BadBatch(BadInput):
-    """An invalid batch, option or query."""
+    """Error for an invalid batch, option or query."""
 
 
 class BadFile(BadInput):
-    """An invalid file; names line and column."""
+    """Error for an invalid file; names line and column."""
 
 
 class Conflict(AcquisitionError):
-    """Another body under a (spacecraft, run, batch) that is already recorded."""
+    """Error for another body under a (spacecraft, run, batch) that is already recorded."""
 
 
 class KeyReused(AcquisitionError):
-    """Another body under an Idempotency-Key that is already taken."""
+    """Error for another body under an Idempotency-Key that is already used."""
 
 
 class WrongState(AcquisitionError):
-    """The state of the object does not allow the operation."""
+    """Error for an operation that the state of its object does not allow."""
 
 
 class NotFound(AcquisitionError):
-    """There is no such object; names it, and where the list is short those that exist."""
+    """Error for a missing object; names it, and the existing ones if they are few."""
 
 
 class UnknownSpacecraft(NotFound):
-    """There is no mission of that name."""
+    """Error for the name of a spacecraft without a mission."""
 
 
 class NotAvailable(BadInput):
-    """A feature of the interface that this version or installation lacks."""
+    """Error for a feature of the interface that this version or installation lacks."""
 
 
 class Unauthenticated(AcquisitionError):
-    """The token is absent, unknown, expired or revoked; the message does not say which."""
+    """Error for an absent, unknown, expired or revoked token; the message does not say which."""
 
 
 class Forbidden(AcquisitionError):
-    """The token is valid, but its scopes or spacecraft do not cover the request."""
+    """Error for a valid token whose scopes or spacecraft do not cover the request."""
 
 
 class RateLimited(AcquisitionError):
-    """More requests than a token's rate allows; trying again later will succeed."""
+    """Error for more requests than a token's rate allows; trying again later will succeed."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -122,11 +122,11 @@ class RateLimited(AcquisitionError):
 
 
 class BadConfiguration(AcquisitionError):
-    """A mistake in a mission file or a setting: names file, key and allowed values."""
+    """Error in a mission file or a setting: names file, key and allowed values."""
 
 
 class Busy(AcquisitionError):
-    """The service cannot take the work now; trying again later may succeed."""
+    """Error for work that the service cannot take now; trying again later may succeed."""
 
     def __init__(self, message: str, retry_after_s: int = 1) -> None:
         super().__init__(message)
@@ -134,7 +134,7 @@ class Busy(AcquisitionError):
 
 
 class BeingBuilt(Busy):
-    """Refusal while another thread builds a needed part of the sky; `done` is its future."""
+    """Error while another thread builds a needed part of the sky; `done` is its future."""
 
     def __init__(self, done: "Future[Any]") -> None:
         super().__init__("a part of the sky that this needs is built for the first time", 5)
@@ -142,14 +142,14 @@ class BeingBuilt(Busy):
 
 
 class Stopping(Busy):
-    """The service is stopping: this process will take no more work."""
+    """Error while the service is stopping: this process will take no more work."""
 
 
 def problem_of(error: Exception) -> dict[str, Any]:
-    """The `detail` and `errors` of an error, the same in HTTP, replays and files.
+    """Fields `detail` and `errors` of an error, the same in HTTP, replays and files.
 
-    `detail` is the first fault with the number of the others; `errors` has every
-    field and value, and is absent where the error is about no field.
+    `detail` is the first fault with the number of the others; `errors` has every field and value,
+    and is absent where the error is about no field.
     """
     if not isinstance(error, BadInput):
         return {"detail": str(error)}
@@ -157,7 +157,7 @@ def problem_of(error: Exception) -> dict[str, Any]:
 
 
 def problem_of_faults(faults: Sequence[Fault]) -> dict[str, Any]:
-    """The same for faults without an exception."""
+    """Fields `detail` and `errors` for faults without an exception."""
     more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
     return {
         "detail": f"{faults[0]}{more}",

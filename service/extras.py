@@ -1,4 +1,4 @@
-"""Optional packages: what an installation lacks, and the command that installs it."""
+"""Optional packages: a check for missing ones, with the command that installs them."""
 
 from importlib.util import find_spec
 

@@ -61,7 +61,7 @@ SHIPPED = (
     "tracks",
     "webhooks",
 )
-"""The features that come with the service, in the order of their routes and commands."""
+"""Names of the features in this package, in the order of their routes and commands."""
 
 KINDS = (
     "tables",
@@ -79,14 +79,14 @@ KINDS = (
     "metrics",
     "telemetry",
 )
-"""The names of the modules that a feature may bring."""
+"""Names of the modules that a feature may have."""
 
 SETTING = "ACQUIRE_FEATURES_OFF"
 
 
 @dataclass(frozen=True)
 class Feature:
-    """What a feature brings.
+    """Declaration of a feature and its modules.
 
     `name` is its name in `ACQUIRE_FEATURES_OFF`; `package` is the package that holds the modules
     named in `brings`.
@@ -103,16 +103,16 @@ class Feature:
 
 @cache
 def known_features() -> Mapping[str, Feature]:
-    """Every feature that is installed, by name: those of `SHIPPED`, then those of entry points."""
+    """All installed features by name: those of `SHIPPED`, then those of entry points."""
     shipped = [import_module(f"service.features.{name}").FEATURE for name in SHIPPED]
     brought = [entry.load() for entry in entry_points(group="acquire.features")]
     return {feature.name: feature for feature in (*shipped, *brought)}
 
 
 def features_on(off: str) -> list[Feature]:
-    """The features without those in a list such as `follow,tracks`.
+    """Features that are on, given a list of those off, such as `follow,tracks`.
 
-    Raises `BadConfiguration` for the name of no feature.
+    Raises `BadConfiguration` for an unknown name.
     """
     known = known_features()
     names_off = {name.strip() for name in off.split(",")} - {""}
@@ -124,7 +124,7 @@ def features_on(off: str) -> list[Feature]:
 
 
 def feature_modules(kind: str, off: str) -> list[ModuleType]:
-    """The module of a kind from each feature that is not in the list `off`, imported now."""
+    """Import the modules of a kind from every feature that is not in the list `off`."""
     return [
         import_module(f"{feature.package}.{kind}")
         for feature in features_on(off)
@@ -133,13 +133,13 @@ def feature_modules(kind: str, off: str) -> list[ModuleType]:
 
 
 def brought_modules(kind: str) -> list[ModuleType]:
-    """The module of a kind from each feature that another package brings, imported now."""
+    """Import the modules of a kind from every feature of another package."""
     brought = (each for name, each in known_features().items() if name not in SHIPPED)
     return [import_module(f"{each.package}.{kind}") for each in brought if kind in each.brings]
 
 
 def feature_folders(name: str) -> list[str]:
-    """The packages of all features that have a folder of this name, such as `templates`."""
+    """Packages of all features that have a folder of a given name, such as `templates`."""
     return [
         feature.package
         for feature in known_features().values()

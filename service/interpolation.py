@@ -1,13 +1,13 @@
-"""The attitude of a turning body between two known ones, and how well it is known there.
+"""Interpolation of the attitude of a rotating body between two known ones, with its error.
 
-Two attitudes leave open how many turns the body made between them, and which way round.  Where
+Two attitudes leave open how many turns the body made between them, and in which direction.  If
 rates are known at both, the body is carried from one attitude to the other at their mean, and a
-cubic (Hermite's) adds what is missing at the end, so that attitudes and rates are met.  Where
-none are known, the body is taken to have turned the shorter way, by a quarter turn at most.
+cubic (Hermite's) adds the difference at the end, so that attitudes and rates are met.  If none are
+known, the body is assumed to have turned the shorter way, by a quarter turn at most.
 
-A body that turns farther than a quarter turn may nutate between two attitudes without a trace in
-them but this: its rates differ, or they do not lead from one attitude to the other.  Both widen
-the error, and where it becomes too large, the attitude between is not known.
+A body that turns farther than a quarter turn may nutate between two attitudes and leave no other
+trace than this: its rates differ, or do not lead from one attitude to the other.  Both widen the
+error, and where it becomes too large, the attitude in between is unknown.
 """
 
 import math
@@ -19,23 +19,26 @@ import numpy.typing as npt
 from service.vectors import Vector, rotate_about, rotation_vectors, turned_quaternion
 
 QUARTER_TURN_RAD = math.pi / 2.0
-"""A larger turn between two attitudes is not told from the one the other way round."""
+"""Largest rotation between two attitudes that can be told from one in the opposite direction."""
 LARGEST_ERROR_RAD = math.radians(1.0)
-"""An attitude that may be off by more is not known: no zone of a mission is wide enough for it."""
+"""Largest error of a known attitude; no zone of a mission is wide enough for a greater one."""
 NEAR, FAR = (0.2, 0.01, 0.0), (4.0, 1.0, 0.1)
-"""Error of the cubic over steps of at most a quarter turn, and over longer ones: shares of the
-angle by which the mean rate misses the second attitude, and of the change of rate, across the
-rate and along it, times the step.  They hold for random bodies that nutate, drawn by the tests."""
+"""Error coefficients of the cubic over steps of at most a quarter turn, and over longer ones.
+
+They are factors on the angle by which the mean rate misses the second attitude, and on the change
+of rate, across the rate and along it, times the step.  They hold for random bodies that nutate,
+drawn by the tests.
+"""
 
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """n steps from one attitude to the next, between which the attitude is interpolated.
+    """Steps (n) between known attitudes, within which the attitude is interpolated.
 
-    `first` (n, 4) are the attitudes at their beginnings.  Of the motion, about the body axes in
-    rad: `turn` (n, 3) at the mean rate, `missing` (n, 3) what that leaves to the second
-    attitude, `begin` and `end` (n, 3) the slopes of the missing part at both ends, a step being
-    the unit of time.  `error_rad` (n,) bounds the error between; infinite where it is not known.
+    `first` (n, 4) are the attitudes at their beginnings.  The motion, about the body axes in rad:
+    `turn` (n, 3) at the mean rate, `missing` (n, 3) the remainder to the second attitude, `begin`
+    and `end` (n, 3) the slopes of the missing part at both ends, a step being the unit of time.
+    `error_rad` (n,) bounds the error between; infinite where it is not known.
     """
 
     first: Vector
@@ -47,11 +50,11 @@ class Steps:
 
     @property
     def is_known(self) -> npt.NDArray[np.bool_]:
-        """Marks (n,) of the steps between whose ends the attitude is known."""
+        """True (n,) for the steps within which the attitude is known."""
         return np.asarray(self.error_rad <= LARGEST_ERROR_RAD)
 
     def at(self, share: Vector) -> Vector:
-        """The attitudes (n, 4) a share (n,) of each step after its beginning."""
+        """Attitudes (n, 4) at a fraction (n,) of each step after its beginning."""
         s = share[:, None]
         carried = turned_quaternion(self.first, self.turn * s)
         cubic = s * s * (3.0 - 2.0 * s) * self.missing
@@ -66,10 +69,10 @@ def steps_between(
     first_rate: Vector | None = None,
     second_rate: Vector | None = None,
 ) -> Steps:
-    """The steps between attitudes (n, 4) and others (n, 4) that are `step_s` (n,) later.
+    """Build the steps between attitudes (n, 4) and others (n, 4) that are `step_s` (n,) later.
 
-    Rates (n, 3) are of the body relative to inertial, in body axes, rad/s; NaN where none is
-    known.  Where one of both is known, it is taken for the whole step.
+    Rates (n, 3) are of the body relative to inertial, in body axes, rad/s; NaN where unknown.
+    Where only one of both is known, it is used for the whole step.
     """
     shorter = rotation_vectors(first, second)
     none = np.full_like(shorter, np.nan)
@@ -81,7 +84,7 @@ def steps_between(
     turn = np.where(known, 0.5 * (one + other) * h, shorter)
     missing = rotation_vectors(turned_quaternion(first, turn), second)
     begin = one * h - turn
-    # At the end the axes have turned by the missing part too.
+    # At the end the axes have turned by the missing part as well.
     end = other * h - rotate_about(-missing, turn)
     end += 0.5 * np.cross(end, missing)
     missing, begin, end = (np.where(known, each, 0.0) for each in (missing, begin, end))
@@ -92,7 +95,7 @@ def steps_between(
 
 
 def _error_rad(turn: Vector, missing: Vector, change: Vector) -> Vector:
-    """Bounds (n,) of the error between, from what the rates leave unexplained."""
+    """Bounds (n,) on the interpolation error in rad, from motion not explained by the rates."""
     missed = np.linalg.norm(missing, axis=1)
     angle = np.linalg.norm(turn, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):

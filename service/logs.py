@@ -1,8 +1,8 @@
-"""Logs: how a line looks, which request it belongs to, and that an error is not repeated endlessly.
+"""Logging: format of lines, the request that a line belongs to, and limits on repeated errors.
 
-The standard library's logging does the work; `configure` sets it up, once in each
-process.  A line never holds a token, a cookie or a body: nothing of these is given to
-a logger, and what an error's own text might bring along is cut.
+The standard library's logging does the work; `configure` sets it up, once in each process.  A line
+never holds a token, a cookie or a body: none of these is passed to a logger, and secrets in the
+text of an error are cut.
 """
 
 import json
@@ -20,7 +20,7 @@ from service.errors import printable
 FORMATS = ("text", "json")
 LEVELS = ("debug", "info", "warning", "error")
 REPEATS_S = 60.0
-"""An error that comes again within this time is counted; the count is written at its end."""
+"""Seconds within which a repeated error is only counted; the count is written afterwards."""
 
 _MAX_COUNTED = 1_000
 _MAX_LINE = 300
@@ -32,22 +32,22 @@ _NUMBER = re.compile(r"\d+")
 
 @dataclass
 class RequestContext:
-    """The request that is worked on: its id, who asks (a token's name), and the run it names."""
+    """Context of a request for log lines: its id, the caller's token name, and the run."""
 
     id: str
     caller: str | None = None
     run: str | None = None
     behind_s: float = 0.0
-    """How far the trends and alarms in the answer are behind the record, where it is much."""
+    """Lag of trends and alarms in the answer behind the record, in seconds, if large."""
 
 
 request: ContextVar[RequestContext | None] = ContextVar("request", default=None)
-"""The request to which lines written meanwhile belong, also in threads that handlers run in."""
+"""Request to which the present log lines belong, also in threads that run handlers."""
 
 
 @dataclass(frozen=True)
 class LogSettings:
-    """Format and level, as other processes of the service are to have them too."""
+    """Format and level of the log, passed on to other processes of the service."""
 
     format: str
     level: str
@@ -57,35 +57,35 @@ _configured: LogSettings | None = None
 
 
 def configured() -> LogSettings | None:
-    """The configuration of this process; None where it leaves logging as it was."""
+    """Log settings of this process; None if it has not configured logging."""
     return _configured
 
 
 def configure(settings: LogSettings, process: str, stream: TextIO | None = None) -> None:
-    """Write every line of this process to a stream (standard error), `process` named in each."""
+    """Configure logging to a stream (standard error); each line names `process`."""
     global _configured
     _configured = settings
     handler = CountingHandler(stream)
     handler.setFormatter(JsonLines(process) if settings.format == "json" else TextLines(process))
     level = logging.getLevelNamesMapping()[settings.level.upper()]
-    # Libraries tell of much that nobody asked for: of them only what is wrong.
+    # Libraries log much at lower levels: keep only their warnings and errors.
     logging.basicConfig(handlers=[handler], level=max(level, logging.WARNING), force=True)
     logging.getLogger("service").setLevel(level)
     logging.getLogger("uvicorn").setLevel(max(level, logging.INFO))
 
 
 def finish() -> None:
-    """Write what is counted by now: a process that a signal ends does not come to close its log."""
+    """Write the pending counts: a process ended by a signal does not close its log."""
     for handler in logging.getLogger().handlers:
         if isinstance(handler, CountingHandler):
             handler.write_counts()
 
 
 class CountingHandler(logging.StreamHandler[TextIO]):
-    """Writes a warning or an error once, counts its repetitions, and writes their number.
+    """Log handler that writes a warning or error once, counts repetitions, and writes the count.
 
-    Two are the same where the text before its arguments is filled in, the error and
-    the place that raised it are the same.
+    Two records are the same if their text without arguments, the error, and the place that raised
+    it are the same.
     """
 
     def __init__(self, stream: TextIO | None = None, period_s: float = REPEATS_S) -> None:
@@ -95,7 +95,7 @@ class CountingHandler(logging.StreamHandler[TextIO]):
         self._timer: threading.Timer | None = None
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Write a record, or count it."""
+        """Write a log record, or count it as a repetition."""
         if record.levelno >= logging.WARNING and self._is_repeated(record):
             return
         super().emit(record)
@@ -144,12 +144,12 @@ class CountingHandler(logging.StreamHandler[TextIO]):
         count_record = logging.LogRecord(
             last.name, last.levelno, last.pathname, last.lineno, message, None, None
         )
-        # Of many requests, not of the one that this thread happens to work on.
+        # The count is about many requests, not the one in progress in this thread.
         vars(count_record).update(repeated=known.count, about=None)
         super().emit(count_record)
 
     def write_counts(self) -> None:
-        """Write what is counted by now, and count anew."""
+        """Write the pending counts of repetitions, and reset them."""
         self.acquire()
         try:
             if self._timer is not None:
@@ -163,7 +163,7 @@ class CountingHandler(logging.StreamHandler[TextIO]):
             self.release()
 
     def close(self) -> None:
-        """Write what is counted, and no more."""
+        """Write the pending counts of repetitions, and close the handler."""
         self.write_counts()
         super().close()
 
@@ -176,7 +176,7 @@ class _Counted:
 
 
 def _kind(record: logging.LogRecord) -> object:
-    """The key by which two records are the same; numbers in an error's text do not count."""
+    """Key under which log records count as equal; numbers in an error's text are ignored."""
     arguments = record.args if isinstance(record.args, tuple) else ()
     errors = tuple(
         (type(each).__name__, _NUMBER.sub("#", str(each)[:_MAX_LINE]))
@@ -191,14 +191,14 @@ def _kind(record: logging.LogRecord) -> object:
 
 
 class _Lines(logging.Formatter):
-    """The common part of both formats."""
+    """Base class of both log formats."""
 
     def __init__(self, process: str) -> None:
         super().__init__()
         self._process = process
 
     def fields(self, record: logging.LogRecord) -> dict[str, object]:
-        """The fields of a line, in order; those that have no value are left out."""
+        """Fields of a log line, in order; fields without a value are left out."""
         seconds = time.strftime("%Y-%m-%dT%H:%M:%S", time.gmtime(record.created))
         about: RequestContext | None = getattr(record, "about", request.get())
         values: dict[str, object | None] = {
@@ -220,17 +220,17 @@ class _Lines(logging.Formatter):
         }
 
     def error(self, record: logging.LogRecord) -> list[str]:
-        """The lines of what was raised; none where nothing was."""
+        """Lines of a log record's traceback; empty without an exception."""
         if not record.exc_info or record.exc_info[0] is None:
             return []
         return _harmless(self.formatException(record.exc_info)).splitlines()
 
 
 class TextLines(_Lines):
-    """A line to be read; what was raised follows in lines of its own."""
+    """Log format for people: a line for each record; a traceback follows in lines of its own."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as text."""
+        """Format a log record as text."""
         fields = self.fields(record)
         head = " ".join(str(fields.pop(each)) for each in ("time", "level", "process", "logger"))
         message = printable(str(fields.pop("message")))
@@ -244,10 +244,10 @@ class TextLines(_Lines):
 
 
 class JsonLines(_Lines):
-    """An object a line."""
+    """Log format with one JSON object in each line."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """The record as JSON."""
+        """Format a log record as JSON."""
         fields = self.fields(record)
         if raised := self.error(record):
             fields["error"] = "\n".join(raised)
@@ -255,7 +255,7 @@ class JsonLines(_Lines):
 
 
 def _harmless(text: str) -> str:
-    """Text without tokens and statements' parameters; each of its lines is cut."""
+    """Remove tokens and statements' parameters from a text, and cut long lines."""
     text = _PARAMETERS.sub("[parameters: not shown]", _SECRET.sub(r"\1(not shown)", text))
     return "\n".join(
         line if len(line) <= _MAX_LINE else line[: _MAX_LINE - 1] + "…"

@@ -1,7 +1,7 @@
-"""Paths of the data that travel with the code.
+"""Paths of data files that are shipped with the code.
 
-In a checkout the star catalog and the migrations stand beside the package; in
-an installed wheel they lie inside it, in `service/_shipped`.
+In a checkout the star catalog and the migrations stand beside the package; in an installed wheel
+they lie inside it, in `service/_shipped`.
 """
 
 from pathlib import Path
@@ -10,10 +10,10 @@ _PACKAGE = Path(__file__).resolve().parent
 
 
 def shipped(*parts: str) -> Path:
-    """The path of a shipped file or folder, e.g. `shipped("catalogs", "stars.npz")`.
+    """Path of a shipped file or folder, e.g.  `shipped("catalogs", "stars.npz")`.
 
-    `parts` are the names of the path in the checkout.  Nothing is checked: a
-    file that is missing is reported by whoever opens it.
+    `parts` are the names of the path in the checkout.  Nothing is checked: a missing file is
+    reported when it is opened.
     """
     inside = _PACKAGE / "_shipped"
     return (inside if inside.is_dir() else _PACKAGE.parent).joinpath(*parts)

@@ -1,4 +1,4 @@
-"""The settings of the process, read from the environment once, and whether its port is free."""
+"""Settings of the process from environment variables, and a check that its port is free."""
 
 import errno
 import ipaddress
@@ -17,7 +17,7 @@ from service.logs import FORMATS, LEVELS, LogSettings
 PREFIX = "ACQUIRE_"
 LOCAL_MISSIONS = Path("missions")
 MOST_USEFUL_PROCESSES = 4
-"""Most processes that are useful: the single writing process records no faster."""
+"""Largest useful number of worker processes: the single writing process records no faster."""
 _TOKEN = re.compile(r"[!-~]+")
 _ROOT_PATH = re.compile(r"(/[A-Za-z0-9._~-]+)*", re.ASCII)
 _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
@@ -25,7 +25,7 @@ _HOST = re.compile(r"[A-Za-z0-9.:_-]{1,253}", re.ASCII)
 
 @dataclass(frozen=True)
 class Settings:
-    """What an operator may set; each field is the variable ACQUIRE_<FIELD>.
+    """Settings for operators; each field is the environment variable ACQUIRE_<FIELD>.
 
     `database` is a SQLAlchemy URL.  `missions` is a folder with a site's own
     mission files, beside `./missions`; `shipped_missions` off hides XTE, SWAS, SOHO and IMAGER.
@@ -83,7 +83,7 @@ class Settings:
     features_off: str = ""
     record_key: str | None = None
     mission_file: Path | None = field(default=None, metadata={"is_option": True})
-    """The mission file that a command was given in place of a spacecraft's name; no variable."""
+    """Mission file given to a command in place of a spacecraft's name; not a variable."""
 
     def __post_init__(self) -> None:
         if not self.database.strip():
@@ -133,22 +133,22 @@ class Settings:
 
     @property
     def mission_places(self) -> tuple[Path, ...]:
-        """The folders and files with a site's own missions, in the order of their search.
+        """Folders and files with a site's own missions, in the order of the search.
 
-        They are `./missions`, if there is such a folder, then ACQUIRE_MISSIONS; a file that a
-        command was given comes last, and replaces a mission of its name.
+        They are `./missions`, if there is such a folder, then ACQUIRE_MISSIONS; a file given to a
+        command comes last, and replaces a mission of the same name.
         """
         here = (LOCAL_MISSIONS,) if LOCAL_MISSIONS.is_dir() else ()
         return (*here, *filter(None, (self.missions, self.mission_file)))
 
     @property
     def ships_missions(self) -> bool:
-        """True if the missions of the package are offered."""
+        """True if the missions of the package are available."""
         return self.shipped_missions == "on"
 
     @property
     def mission_places_text(self) -> str:
-        """The places where missions are looked for, in words."""
+        """Description of the places that are searched for missions."""
         own = "not set" if self.missions is None else str(self.missions)
         shipped = "the shipped missions" if self.ships_missions else "no shipped missions"
         return f"./{LOCAL_MISSIONS}/*.toml, ACQUIRE_MISSIONS ({own}), {shipped}"
@@ -163,16 +163,15 @@ class Settings:
 
     @property
     def logs(self) -> LogSettings:
-        """How the service's processes write their logs."""
+        """Log settings of the service's processes."""
         return LogSettings(self.log_format, self.log_level)
 
     @classmethod
     def from_environment(cls, environment: Mapping[str, str] = os.environ) -> "Settings":
-        """The settings that the ACQUIRE_ variables ask for; an empty one counts as not set.
+        """Read the settings from the ACQUIRE_ variables; an empty one counts as not set.
 
-        Raises `BadConfiguration` for a value that cannot be, and for a name
-        that is no setting: a misspelt ACQUIRE_DATABASE must not quietly record
-        somewhere else.
+        Raises `BadConfiguration` for an invalid value, and for an unknown name: a misspelt
+        ACQUIRE_DATABASE must not silently record elsewhere.
         """
         known = {PREFIX + each.name.upper(): each.name for each in fields(cls) if not each.metadata}
         values = {
@@ -225,7 +224,7 @@ def networks(text: str) -> tuple[Network, ...]:
 
 @lru_cache(maxsize=256)
 def is_loopback(host: str) -> bool:
-    """True if a name or an address is this machine's own, whoever answers for names."""
+    """True if a host name or address is this machine's own, without asking a name server."""
     try:
         return host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
@@ -241,17 +240,17 @@ _REMEDIES = {
 
 
 def url_of(host: str, port: int) -> str:
-    """The address of a service on a host and a port."""
+    """URL of a service on a host and a port."""
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
 
 
 def require_free(host: str, port: int) -> None:
-    """Raise `BadConfiguration`, with what to do, where a port cannot be served on."""
+    """Raise `BadConfiguration`, with the remedy, if a port cannot be served on."""
     try:
         places = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         for family, kind, protocol, _, address in places:
             with socket.socket(family, kind, protocol) as probe:
-                # As the server does: a port that was just let go of is free.
+                # The server sets the same option: a recently released port is free.
                 probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                 if family == socket.AF_INET6:
                     probe.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_V6ONLY, 1)

@@ -1,13 +1,12 @@
-"""UTC text to a two-part Julian date and back.
+"""Conversion between UTC text and two-part Julian dates.
 
-Calendar (`1996-01-10T12:00:00.000Z`) and day-of-year (`1996-010T12:00:00Z`)
-forms are read, also with the offset of a time zone (`+01:00`), which is
-converted; a leap second (`23:59:60`) is a time like any other; digits below
-the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
+Calendar (`1996-01-10T12:00:00.000Z`) and day-of-year (`1996-010T12:00:00Z`) forms are read, also
+with the offset of a time zone (`+01:00`), which is converted; a leap second (`23:59:60`) is a time
+like any other; digits below the microsecond are kept (CCSDS 301.0-B, ASCII codes A and B).
 
-ERFA does the arithmetic.  Its bare ufuncs are called because pyerfa's wrappers
-warn of every year beyond the leap-second table, and silencing a warning is not
-safe between threads; the status they return is read instead.
+ERFA does the arithmetic.  Its bare ufuncs are called because pyerfa's wrappers warn of every year
+beyond the leap-second table, and silencing a warning is not safe between threads; the status they
+return is read instead.
 """
 
 import re
@@ -28,7 +27,7 @@ FIRST_YEAR, LAST_YEAR = 1972, 2099
 HOUR_S, DAY_S = 3600, 86400
 J2000_YEAR = 2000.0
 UNIX_DAY = 40587
-"""The Modified Julian Date of 1970-01-01, where POSIX time begins."""
+"""Modified Julian Date of 1970-01-01, where POSIX time begins."""
 
 _MJD_ZERO = date(1858, 11, 17).toordinal()
 _J2000_MJD = 51544
@@ -49,10 +48,10 @@ _FORMS = "UTC as 1996-01-10T12:00:00.000Z or 1996-010T12:00:00.000Z"
 
 
 class _Once(Generic[T]):
-    """What is worked out when it is first asked for; `functools.cached_property` without its lock.
+    """Property computed at the first access; `functools.cached_property` without its lock.
 
-    Until Python 3.12 that takes longer than most of what is worked out here.
-    Two threads may both work a value out, and find the same.
+    Until Python 3.12 the lock takes longer than most of these computations.  Two threads may both
+    compute a value, and get the same.
     """
 
     def __init__(self, work_out: Callable[[Any], T]) -> None:
@@ -67,7 +66,7 @@ class _Once(Generic[T]):
 
 @dataclass(frozen=True, order=True)
 class Utc:
-    """A moment in UTC as ERFA's two-part quasi-Julian date."""
+    """Time in UTC as ERFA's two-part quasi-Julian date."""
 
     jd1: float
     jd2: float
@@ -105,24 +104,24 @@ class Utc:
 
     @_Once
     def tt(self) -> tuple[float, float]:
-        """The same moment in Terrestrial Time, two-part Julian date."""
+        """Time converted to Terrestrial Time, as a two-part Julian date."""
         day = self._fields[0]
         if self.jd1 == _midnight_jd(day) and _length_s(day) == DAY_S:
-            # What `utctai` comes to on a day like any other, in less time.
+            # Same result as `utctai` on a day without a leap second, in less time.
             tai1, tai2 = self.jd1, self.jd2 + _tai_less_utc_s(day) / DAY_S
         else:
             tai1, tai2 = map(float, ufunc.utctai(self.jd1, self.jd2)[:2])
-        # The second part is the lesser one, to which `taitt` would add the same.
+        # `taitt` would add the same constant to the second, smaller part.
         return tai1, tai2 + _TT_LESS_TAI_D
 
     @property
     def julian_year(self) -> float:
-        """The moment as a Julian epoch, 2000.0 being J2000."""
+        """Time converted to a Julian epoch in years, 2000.0 being J2000."""
         tt1, tt2 = self.tt
         return J2000_YEAR + ((tt1 - _J2000_JD) + tt2) / _DAYS_PER_JULIAN_YEAR
 
     def bucket(self, width_s: int) -> int:
-        """The number of the UTC hour (3600) or day (86400) that holds the moment, from MJD 0.
+        """Number of the UTC hour (3600) or day (86400) that contains the time, from MJD 0.
 
         A leap second belongs to the hour and the day that it ends.
         """
@@ -133,12 +132,12 @@ class Utc:
 
 @lru_cache(maxsize=1024)
 def _tai_less_utc_s(day: date) -> int:
-    """Seconds of TAI less UTC on a day."""
+    """Difference TAI - UTC on a day, in seconds."""
     return int(ufunc.dat(day.year, day.month, day.day, 0.0)[0])
 
 
 def bucket_start(number: int, width_s: int) -> Utc:
-    """The moment at which hour or day `number` (see `Utc.bucket`) begins."""
+    """Time at which the hour or day with a number (see `Utc.bucket`) begins."""
     days, hour = (number, 0) if width_s == DAY_S else divmod(number, 24)
     day = date.fromordinal(days + _MJD_ZERO)
     found = _from_fields(day, hour, 0, 0.0)
@@ -153,7 +152,7 @@ def utc_now() -> Utc:
 
 @cache
 def _leap_seconds() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """The moments (`tai_ns`) from which another number of leap seconds counts, and the numbers."""
+    """Times (`tai_ns`) of the changes of the number of leap seconds, and the numbers."""
     counted = {
         int(ufunc.dat(year, month, 1, 0.0)[0]): _from_fields(date(year, month, 1), 0, 0, 0.0).tai_ns
         for year in range(LAST_YEAR, FIRST_YEAR - 1, -1)
@@ -164,15 +163,15 @@ def _leap_seconds() -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
 
 
 def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Seconds of POSIX time, which knows no leap seconds, of moments given as `Utc.tai_ns`.
+    """Convert times given as `Utc.tai_ns` to POSIX seconds, which ignore leap seconds.
 
-    A leap second is put just before the midnight that it leads to, and so is
-    of the same hour and day as in `Utc.bucket`.
+    A leap second is placed just before the following midnight, and so belongs to the same hour and
+    day as in `Utc.bucket`.
     """
     tai = np.asarray(tai_ns, dtype=np.int64)
     begin, number = _leap_seconds()
     place = np.searchsorted(begin, tai, side="right") - 1
-    # Whole seconds by themselves: a moment at the beginning of one shall not fall before it.
+    # Whole seconds by themselves: rounding must not move a full second before itself.
     midnight = _UNIX_J2000_S + begin // 10**9 - number
     following = np.append(midnight[1:].astype(float), np.inf)
     whole, rest_ns = np.divmod(tai, 10**9)
@@ -181,7 +180,7 @@ def unix_seconds(tai_ns: npt.ArrayLike) -> npt.NDArray[np.float64]:
 
 
 def utc_of_unix(unix_s: float) -> Utc:
-    """The moment of a POSIX time, to the microsecond."""
+    """Convert a POSIX time to UTC, to the microsecond."""
     moment = datetime.fromtimestamp(unix_s, UTC)
     day, hour, minute = moment.date(), moment.hour, moment.minute
     found = _from_fields(day, hour, minute, moment.second + moment.microsecond / 1e6)
@@ -190,10 +189,10 @@ def utc_of_unix(unix_s: float) -> Utc:
 
 
 def shifted(moment: Utc, seconds: float) -> Utc:
-    """The moment `seconds` of TAI later, leap seconds counted, to the nanosecond.
+    """Time that is `seconds` of TAI later, leap seconds counted, to the nanosecond.
 
-    It is read again from its text: moments are equal and in order only where
-    the two parts of the Julian date are split alike.
+    It is read again from its text: times compare equal and in order only if the two parts of the
+    Julian date are split alike.
     """
     tai1, tai2, _ = ufunc.utctai(moment.jd1, moment.jd2)
     jd1, jd2, _ = ufunc.taiutc(tai1, tai2 + seconds / DAY_S)
@@ -224,7 +223,7 @@ def recorded_utc(text: str) -> Utc:
 
 @lru_cache(maxsize=4096)
 def _read(text: str, first_year: int, last_year: int) -> Utc:
-    """The moment of a text, which one batch asks for again and again; raises `ValueError`."""
+    """Parse UTC text, cached for the repeated texts of a batch; raises `ValueError`."""
     match = _TEXT.fullmatch(text)
     if match is None:
         raise ValueError(f"must be {_FORMS}")
@@ -254,7 +253,7 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
     if second == 60 and not ((hour, minute) == (23, 59) and _length_s(day) > DAY_S):
         raise ValueError("there is no leap second at that time")
     moment = _from_fields(day, hour, minute, second + float(fraction or 0.0))
-    # What was read need not be worked out again from the Julian date, which has it to 1e-11 s.
+    # Keep the parsed fields: the Julian date, exact to 1e-11 s, would give the same ones.
     nanoseconds = int(fraction[1:].ljust(9, "0"))
     vars(moment)["_fields"] = day, hour, minute, second, nanoseconds
     return moment
@@ -263,7 +262,7 @@ def _read(text: str, first_year: int, last_year: int) -> Utc:
 def _in_utc(
     day: date, hour: int, minute: int, sign: str, zone_hours: str, zone_minutes: str
 ) -> tuple[date, int, int]:
-    """Day, hour and minute of UTC for those of a time zone; raises `ValueError`."""
+    """Convert day, hour and minute from a time zone to UTC; raises `ValueError`."""
     ahead_min = 60 * int(zone_hours) + int(zone_minutes or 0)
     if int(zone_hours) > 23 or int(zone_minutes or 0) > 59:
         raise ValueError("there is no such time zone")
@@ -276,7 +275,7 @@ def _in_utc(
 
 @lru_cache(maxsize=1024)
 def _length_s(day: date) -> int:
-    """Seconds of UTC in a day."""
+    """Length of a UTC day in seconds."""
     return DAY_S + _tai_less_utc_s(day + timedelta(days=1)) - _tai_less_utc_s(day)
 
 
@@ -285,5 +284,5 @@ def _midnight_jd(day: date) -> float:
 
 
 def _from_fields(day: date, hour: int, minute: int, second: float) -> Utc:
-    # As ERFA's `dtf2d` has it: the day's share of a day that a leap second may have made longer.
+    # The fraction of the day as ERFA's `dtf2d` defines it: a leap second lengthens the day.
     return Utc(_midnight_jd(day), (60.0 * (60 * hour + minute) + second) / _length_s(day))

@@ -23,18 +23,18 @@ Matrix = npt.NDArray[np.float64]
 
 ARCSEC_PER_RADIAN = math.degrees(1.0) * 3600.0
 UPPER = ([0, 0, 0, 1, 1, 2], [0, 1, 2, 1, 2, 2])
-"""Rows and columns of a symmetric (3, 3) as it is recorded: 11, 12, 13, 22, 23, 33."""
+"""Row and column indices of the stored upper triangle of a symmetric (3, 3) matrix."""
 
 
 def read_only(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """The same array, locked against writing."""
-    # Through `flags` it takes twice as long.
+    """Mark an array as read-only and return it."""
+    # Setting `flags` would take twice as long.
     array.setflags(write=False)
     return array
 
 
 def locked(array: npt.NDArray[Any]) -> npt.NDArray[Any]:
-    """A view of an array that cannot be written to, whoever else may write to the array."""
+    """Read-only view of an array, also if the array itself stays writable."""
     return array if not array.flags.writeable else read_only(array.view())
 
 
@@ -46,14 +46,14 @@ def unit(vectors: npt.ArrayLike) -> Vector:
 
 
 def unit_of(vector: Vector) -> Vector:
-    """`unit` of one vector (3,), without most of an array's overhead."""
+    """Scale one vector (3,) to length one, without most of an array's overhead."""
     x, y, z = vector.tolist()
     norm = math.sqrt(x * x + y * y + z * z)
     return vector / (norm or math.nan)
 
 
 def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
-    """Unit vectors (..., 3) of right ascensions and declinations in degrees."""
+    """Unit vectors (..., 3) from right ascensions and declinations in degrees."""
     ra, dec = np.radians(ra_deg), np.radians(dec_deg)
     return np.stack(
         np.broadcast_arrays(np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)),
@@ -62,14 +62,14 @@ def from_ra_dec(ra_deg: npt.ArrayLike, dec_deg: npt.ArrayLike) -> Vector:
 
 
 def direction_of(ra_deg: float, dec_deg: float) -> tuple[float, float, float]:
-    """`from_ra_dec` of one direction, without an array's overhead."""
+    """Unit vector (x, y, z) from one right ascension and declination in degrees, without arrays."""
     ra, dec = math.radians(ra_deg), math.radians(dec_deg)
     across = math.cos(dec)
     return across * math.cos(ra), across * math.sin(ra), math.sin(dec)
 
 
 def to_ra_dec(vectors: npt.ArrayLike) -> tuple[Vector, Vector]:
-    """Right ascension in [0, 360) and declination, in degrees, of vectors (..., 3)."""
+    """Right ascension in [0, 360) and declination in degrees from vectors (..., 3)."""
     v = np.asarray(vectors, dtype=np.float64)
     ra = np.degrees(np.arctan2(v[..., 1], v[..., 0])) % 360.0
     dec = np.degrees(np.arctan2(v[..., 2], np.hypot(v[..., 0], v[..., 1])))
@@ -77,7 +77,7 @@ def to_ra_dec(vectors: npt.ArrayLike) -> tuple[Vector, Vector]:
 
 
 def ra_dec_of(vector: Vector) -> tuple[float, float]:
-    """`to_ra_dec` of one unit vector (3,), without an array's overhead."""
+    """Right ascension and declination in degrees of one unit vector (3,); faster than on arrays."""
     x, y, z = vector.tolist()
     ra_deg = math.degrees(math.atan2(y, x)) % 360.0
     return 0.0 if ra_deg >= 360.0 else ra_deg, math.degrees(math.atan2(z, math.hypot(x, y)))
@@ -96,7 +96,7 @@ def angle_between_deg(a: npt.ArrayLike, b: npt.ArrayLike) -> Vector:
 
 
 def separation_deg(a: Vector, b: Vector) -> float:
-    """`angle_between_deg` of two unit vectors (3,), without an array's overhead."""
+    """Angle in degrees between two unit vectors (3,), without an array's overhead."""
     x, y, z = a.tolist()
     u, v, w = b.tolist()
     apart = math.hypot(x - u, y - v, z - w)
@@ -104,7 +104,7 @@ def separation_deg(a: Vector, b: Vector) -> float:
 
 
 def coordinate_rotation(axis: int, angle_deg: float) -> Matrix:
-    """The matrix that turns the axes by `angle_deg` about axis 0, 1 or 2 (x, y, z)."""
+    """Rotation matrix that turns the axes by `angle_deg` about axis 0, 1 or 2 (x, y, z)."""
     c, s = math.cos(math.radians(angle_deg)), math.sin(math.radians(angle_deg))
     i, j = (axis + 1) % 3, (axis + 2) % 3
     matrix = np.eye(3)
@@ -114,7 +114,7 @@ def coordinate_rotation(axis: int, angle_deg: float) -> Matrix:
 
 
 def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) -> Vector:
-    """exp([w x]) v: vectors (..., 3) turned about rotation vectors (..., 3) in radians."""
+    """Rotate vectors (..., 3) about rotation vectors (..., 3) in radians: exp([w x]) v."""
     w = np.asarray(rotation_vectors_rad, dtype=np.float64)
     v = np.asarray(vectors, dtype=np.float64)
     angle = np.sqrt(np.sum(w * w, axis=-1, keepdims=True))
@@ -126,14 +126,14 @@ def rotate_about(rotation_vectors_rad: npt.ArrayLike, vectors: npt.ArrayLike) ->
 
 
 def _cross(a: Vector, b: Vector) -> Vector:
-    # numpy's own spends most of its time on choosing axes.
+    # numpy's own cross product spends most of its time on choosing axes.
     x, y, z = a[..., 0], a[..., 1], a[..., 2]
     u, v, w = b[..., 0], b[..., 1], b[..., 2]
     return np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=-1)
 
 
 def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Matrix:
-    """The attitude matrix A(q), (3, 3), of a quaternion (4,): body = A @ inertial."""
+    """Attitude matrix A(q), (3, 3), of a quaternion (4,): body = A @ inertial."""
     q1, q2, q3, qc = np.asarray(quaternion, dtype=np.float64).tolist()
     return np.array(
         [
@@ -157,10 +157,10 @@ def matrix_from_quaternion(quaternion: npt.ArrayLike) -> Matrix:
 
 
 def quaternion_from_matrix(matrix: npt.ArrayLike) -> Vector:
-    """The quaternion (4,) of one attitude matrix A (3, 3), with qc >= 0.
+    """Quaternion (4,) of one attitude matrix A (3, 3), with qc >= 0.
 
-    Shepperd's choice of the largest component keeps it accurate at every
-    angle, exact half turns included.
+    Shepperd's choice of the largest component keeps it accurate at every angle, exact half turns
+    included.
     """
     a = np.asarray(matrix, dtype=np.float64)
     squares = np.array(
@@ -216,7 +216,7 @@ def rotation_vectors(first: Vector, second: Vector) -> Vector:
 
 
 def turned_quaternion(quaternion: Vector, rotation_vector_rad: Vector) -> Vector:
-    """The attitude (..., 4) after the body has turned by vectors (..., 3) in body axes.
+    """Attitudes (..., 4) after rotations of the body by vectors (..., 3) in rad, in body axes.
 
     The inverse of `rotation_vectors`.
     """
@@ -230,7 +230,7 @@ def turned_quaternion(quaternion: Vector, rotation_vector_rad: Vector) -> Vector
 
 
 def attitude_matrices(quaternion: Vector) -> Vector:
-    """The attitude matrices A(q), (n, 3, 3), of quaternions (n, 4): body = A @ inertial."""
+    """Attitude matrices A(q), (n, 3, 3), of quaternions (n, 4): body = A @ inertial."""
     v, c = quaternion[:, :3], quaternion[:, 3]
     x, y, z = v.T
     zero = np.zeros_like(x)
@@ -244,6 +244,6 @@ def attitude_matrices(quaternion: Vector) -> Vector:
 
 
 def full_matrices(upper: Vector) -> Vector:
-    """Symmetric matrices (..., 3, 3) of their upper triangles (..., 6) in the order of `UPPER`."""
+    """Symmetric matrices (..., 3, 3) from upper triangles (..., 6) in the order of `UPPER`."""
     full = upper[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]]
     return np.asarray(full.reshape(*upper.shape[:-1], 3, 3))
