@@ -32,15 +32,15 @@ HEADER = "# Written by `make client` from {}.\n"
 # ---- models ----------------------------------------------------------------------------------
 
 NAMED_BESIDE = {"ProblemDocument", "TokenList"}
-"""Models that no module of the client names as `models.`..., and no other model holds."""
+"""Models that the client's modules do not name as `models.`..., and no other model holds."""
 BASES = {"History": "Tabulated"}
-"""The classes of the client's `base` that give methods to models."""
+"""Base classes in the client that give methods to models, by the name of the model."""
 WORDS: Mapping[str, Any] = {
     "Outcome": base.Outcome,
     "Status": base.Status,
     "Identifier": answers.Identifier,
 }
-"""Types for which a type checker knows the words of this version."""
+"""Types of texts for which a type checker knows the words of this version."""
 ABOUT = """Every model: what the answers of the service hold.
 
 Quaternions have the scalar last and transform inertial (EME2000) into body components.
@@ -50,17 +50,17 @@ as text: they may be in a leap second and have nanoseconds.  Ids sort by the tim
 
 
 def client_name(record: type[Record]) -> str:
-    """The name of a record's model."""
+    """Name of the client's model for a record."""
     return vars(record).get("client_name") or record.__name__
 
 
 def module_name(record: type[Record]) -> str:
-    """The client's module of a record: that of the contract, or the folder of a feature."""
+    """Name of the client's module for a record: that of the contract, or of a feature's folder."""
     return record.__module__.removesuffix(".records").rpartition(".")[2]
 
 
 def all_records() -> Mapping[str, type[Record]]:
-    """Every record of the contract and of the installed features, by the name of its model."""
+    """Records of the contract and of all installed features, by the name of their model."""
     modules = [f"{contract.__name__}.{each.name}" for each in iter_modules(contract.__path__)]
     modules += [f"{feature.package}.records" for feature in known_features().values()]
     for module in filter(find_spec, modules):
@@ -79,7 +79,7 @@ def all_records() -> Mapping[str, type[Record]]:
 
 
 def own_fields(record: type[Record]) -> dict[str, Any]:
-    """The types of the fields that a record adds to those of its base."""
+    """Types of the fields that a record adds to those of its base class."""
     hints = get_type_hints(record, include_extras=True)
     return {name: hints[name] for name in record.__annotations__ if name in struct_fields(record)}
 
@@ -90,7 +90,7 @@ def struct_fields(record: type[Record]) -> Mapping[str, structs.FieldInfo]:
 
 
 def with_parts(record: type[Record], known: dict[type[Record], None]) -> None:
-    """Add a record to those known, behind its base and the records that its fields hold."""
+    """Add a record to `known`, after its base class and the records in its fields."""
 
     def records_in(kind: Any) -> Iterator[type[Record]]:
         if isinstance(kind, type) and issubclass(kind, Record):
@@ -107,7 +107,7 @@ def with_parts(record: type[Record], known: dict[type[Record], None]) -> None:
 
 
 def models() -> Mapping[str, str]:
-    """The text of each module of models, by its path in the client."""
+    """Generate the text of each module of models, by its path in the client."""
     own = {*CLIENT.glob("*.py"), *CLIENT.glob("_async/*.py")} - {CLIENT / "events.py"}
     texts = "\n".join(path.read_text(encoding="utf-8") for path in own)
     names = set(re.findall(r"\bmodels\.([A-Z]\w+)", texts)) | NAMED_BESIDE
@@ -136,14 +136,14 @@ def models() -> Mapping[str, str]:
 
 
 def place_in_source(record: type[Record]) -> tuple[bool, int]:
-    """The order of records in a module: those of the contract, then those of a feature."""
+    """Sort key of records in a module: those of the contract, then those of a feature."""
     source = sys.modules[record.__module__]
     of_feature = not source.__name__.startswith(contract.__name__)
     return of_feature, list(vars(source)).index(record.__name__)
 
 
 def module_text(name: str, held: Sequence[type[Record]], needed: Sequence[type[Record]]) -> str:
-    """A module of models; ruff takes away what it need not import."""
+    """Generate the text of a module of models; ruff removes unused imports."""
     source = sys.modules[held[0].__module__]
     others = sorted({module_name(each) for each in needed} - {name})
     imports = [
@@ -166,7 +166,7 @@ def module_text(name: str, held: Sequence[type[Record]], needed: Sequence[type[R
 
 
 def words_text() -> str:
-    """The words that a type checker knows, and any text where an answer is read."""
+    """Generate the module of answers' words: known to a type checker, any text at run time."""
     words = {name: get_args(described_type(alias)) for name, alias in WORDS.items()}
     return "".join(
         [
@@ -182,13 +182,13 @@ def words_text() -> str:
 
 
 def described_type(alias: Any) -> Any:
-    """The type that describes a text, such as a `Literal`."""
+    """Type, such as a `Literal`, that describes the words of a text."""
     (described,) = (each for each in alias.__metadata__ if isinstance(each, DescribedAs))
     return described.shape
 
 
 def class_text(record: type[Record]) -> str:
-    """The class of a model."""
+    """Generate the text of a model's class."""
     parent = record.__base__
     is_derived = parent not in (Record, base.Items)
     name = client_name(record)
@@ -199,7 +199,7 @@ def class_text(record: type[Record]) -> str:
 
 
 def field_text(record: type[Record], name: str, hint: Any) -> str:
-    """The line of a field with its default, and the text below it."""
+    """Generate the line of a model's field with its default, and the description below it."""
     field = struct_fields(record)[name]
     kind, default = type_text(hint), field.default
     if field.default_factory is not NODEFAULT:
@@ -215,7 +215,7 @@ def field_text(record: type[Record], name: str, hint: Any) -> str:
 
 
 def metadata_of(hint: Any) -> tuple[Any, ...]:
-    """What an annotation says beside the type."""
+    """Metadata of an annotated type; empty for a plain type."""
     return hint.__metadata__ if get_origin(hint) is Annotated else ()
 
 
@@ -223,7 +223,7 @@ OF_ALIASES = [each for alias in vars(base).values() for each in metadata_of(alia
 
 
 def description(hint: Any) -> str | None:
-    """What an annotation says of its own field, not of every quaternion or time."""
+    """Description of a field in its annotation, without those of common types such as times."""
     found = [
         each.description
         for each in metadata_of(hint)
@@ -233,7 +233,7 @@ def description(hint: Any) -> str | None:
 
 
 def type_text(hint: Any) -> str:
-    """The type of a field in the client: lists are sequences, words are any text."""
+    """Type of a model's field as text: lists are sequences, words are any text."""
     for word, alias in WORDS.items():
         if any(each in metadata_of(hint) for each in alias.__metadata__):
             return word
@@ -253,18 +253,18 @@ def type_text(hint: Any) -> str:
 
 
 def in_client_words(text: str) -> str:
-    """A description in the words of Python."""
+    """Replace JSON's null by None in a description."""
     return re.sub(r"\b[nN]ull\b", "None", text.strip())
 
 
 def documented(text: str) -> str:
-    """A text below a field."""
+    """Format the description below a field."""
     lines = textwrap.wrap(f'"""{text}"""', 96)
     return textwrap.indent("\n".join(lines), "    ") + "\n"
 
 
 def events_text() -> str:
-    """The kinds of events, each with the model of its data."""
+    """Generate the module with the kinds of events, each with the model of its data."""
     classes = [
         f'class {kind.capitalize()}Event(_Numbered, frozen=True):\n    """An event `{kind}`."""\n\n'
         f'    kind: Literal["{kind}"]\n    data: models.{client_name(data)}\n\n\n'
@@ -298,7 +298,7 @@ SYNCHRONOUS = [
 
 
 def synchronous() -> Mapping[str, str]:
-    """The text of each module that is written for asyncio, with its words replaced, by path."""
+    """Generate the synchronous modules from the asynchronous ones, by path."""
     texts = {}
     for path in sorted((CLIENT / "_async").glob("*.py")):
         if path.name not in BY_HAND:
@@ -311,12 +311,12 @@ def synchronous() -> Mapping[str, str]:
 
 # ---- files -----------------------------------------------------------------------------------
 
-# The rest makes one call of loops that wait for nothing any more, and sorts imports.
+# The other fixes turn loops that no longer wait into one call, and sort imports.
 TIDY = ["check", "--quiet", "--fix-only", "--unsafe-fixes", "--select=C4,F401,I,UP028"]
 
 
 def tidied(text: str, path: Path) -> str:
-    """A module as ruff formats it."""
+    """Format the text of a module with ruff."""
     for step in (TIDY, ["format"]):
         command = [sys.executable, "-m", "ruff", *step, "--stdin-filename", str(path), "-"]
         text = subprocess.run(
@@ -326,7 +326,7 @@ def tidied(text: str, path: Path) -> str:
 
 
 def main() -> int:
-    """Write the files; with `--check` name those that differ, and return 1 for any."""
+    """Write the generated files; with `--check` name those that differ, and return 1 for any."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--check", action="store_true", help="write nothing, name what differs")
     only_checks = parser.parse_args().check

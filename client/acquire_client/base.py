@@ -1,4 +1,4 @@
-"""The base of all models."""
+"""Base classes of all models of the client."""
 
 from typing import TYPE_CHECKING, Generic, TypeVar, cast
 
@@ -14,35 +14,36 @@ T = TypeVar("T")
 
 
 class Model(Struct, frozen=True):
-    """A part of an answer.
+    """Base class of a model: a part of an answer.
 
     Fields that a later service adds are ignored.  A field with a default may be absent from the
-    answer.  Words such as a status are text when they are read, since a later service may know
-    further ones; for a type checker they are those of this version.
+    answer.  Words such as a status are read as text, since a later service may have further ones;
+    for a type checker they are those of this version.
     """
 
 
 class Page(Struct, Generic[T], frozen=True):
-    """A part of a list; `next_cursor` leads to the next part, None at the end."""
+    """Page of a list; `next_cursor` leads to the next page, None at the end."""
 
     items: list[T]
     next_cursor: str | None = None
 
 
 class Tabulated(Model, frozen=True):
-    """The methods of quantities over time that make tables of them."""
+    """Base class of histories, with methods that convert them to tables."""
 
     def to_arrow(self) -> "pa.Table":
-        """A table with a row for each point; a column such as `residual_rms_arcsec.mean`.
+        """Convert a history to an Arrow table with a row for each point.
 
-        Raises `PackageMissing` where pyarrow is not installed.
+        Columns have names such as `residual_rms_arcsec.mean`.  Raises `PackageMissing` where
+        pyarrow is not installed.
         """
         from .tables import table_of_history
 
         return table_of_history(cast("History", self))
 
     def to_pandas(self) -> "pd.DataFrame":
-        """The same as a data frame.
+        """Convert a history to a data frame with a row for each point.
 
         Raises `PackageMissing` where pandas and pyarrow are not both installed.
         """

@@ -1,7 +1,7 @@
-"""Methods of both clients that are one request: each is written once, as what it asks.
+"""Client methods of one request each, written once for both clients as a description.
 
-A method describes its request, and the client that it is called on carries it out: `Client` at
-once, `AsyncClient` when the call is awaited.
+A method describes its request, and the client on which it is called sends it: `Client` at once,
+`AsyncClient` when the call is awaited.
 """
 
 from collections.abc import Callable, Coroutine
@@ -28,7 +28,7 @@ Row = TypeVar("Row", bound=msgspec.Struct)
 
 @dataclass(frozen=True)
 class Call(Generic[T]):
-    """A request, and how its answer is read; the rest is as `request` of the clients has it."""
+    """Description of a request, with the function that reads its answer; fields as in `request`."""
 
     read: Callable[[httpx.Response], T]
     method: str
@@ -42,7 +42,7 @@ class Call(Generic[T]):
 
 @dataclass(frozen=True)
 class Listing(Generic[Row]):
-    """A long list, whose pages are read as they are needed."""
+    """Description of a long list, whose pages are read on demand."""
 
     kind: type[Row]
     path: str
@@ -50,24 +50,24 @@ class Listing(Generic[Row]):
 
 
 def get(kind: type[T], path: str, query: Query | None = None) -> Call[T]:
-    """A GET whose answer is a model."""
+    """Describe a GET request whose answer is a model."""
     return Call(partial(decoded, kind=kind), "GET", path, query)
 
 
 def get_items(kind: type[Row], path: str, query: Query | None = None) -> Call[list[Row]]:
-    """A GET whose answer is a short list of models."""
-    # The type is known only now, which the checker of types does not allow.
+    """Describe a GET request whose answer is a short list of models."""
+    # The type is known only at run time, which type checkers do not allow.
     page: Any = Page[kind]  # type: ignore[valid-type]
     return Call(lambda response: decoded(response, page).items, "GET", path, query)
 
 
 def post(kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED) -> Call[T]:
-    """A POST of JSON whose answer is a model."""
+    """Describe a POST request with JSON whose answer is a model."""
     return Call(partial(decoded, kind=kind), "POST", path, body=body, repeat=repeat)
 
 
 class _Method:
-    """A method that describes what the client carries out."""
+    """Method of a client given by the description of its request or list."""
 
     def __init__(self, describe: Callable[..., Any]) -> None:
         self._describe = describe
@@ -75,16 +75,16 @@ class _Method:
         update_wrapper(cast(Any, self), describe)
 
     def function_of(self, owner: type["Caller"]) -> Callable[..., Any]:
-        """The function that a class of clients has in place of this object."""
-        # Each of the two kinds of methods has its own.
+        """Function that replaces this description in a class of clients."""
+        # The two kinds of methods override this.
         raise NotImplementedError
 
 
 class Caller:
-    """The base of both connections: classes below it get functions in place of descriptions.
+    """Base class of both connections, in which functions replace descriptions of requests.
 
-    They are coroutine functions where the connection is asynchronous, as `inspect` and
-    `unittest.mock.create_autospec` look for.
+    They are coroutine functions where the connection is asynchronous, so that `inspect` and
+    `unittest.mock.create_autospec` recognise them.
     """
 
     _carry_out: Callable[..., Any]
@@ -99,13 +99,13 @@ class Caller:
 
 
 class single_request(_Method, Generic[P, T]):  # noqa: N801 - a decorator
-    """Decorates a method that describes one request."""
+    """Decorator of a client method that describes one request."""
 
     def __init__(self, describe: Callable[Concatenate[Any, P], Call[T]]) -> None:
         super().__init__(describe)
 
     def function_of(self, owner: type[Caller]) -> Callable[..., Any]:
-        """A function that sends the request, and gives the answer."""
+        """Function that sends the described request, and returns the answer."""
         describe = self._describe
 
         @wraps(describe)
@@ -130,18 +130,18 @@ class single_request(_Method, Generic[P, T]):  # noqa: N801 - a decorator
     ) -> Callable[P, Coroutine[Any, Any, T]]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """For type checkers: classes of clients have a function in place of this object."""
+        """Present only for type checkers: a function replaces this object in classes of clients."""
         return self
 
 
 class paged_list(_Method, Generic[P, Row]):  # noqa: N801 - a decorator
-    """Decorates a method that describes a long list."""
+    """Decorator of a client method that describes a long list."""
 
     def __init__(self, describe: Callable[Concatenate[Any, P], Listing[Row]]) -> None:
         super().__init__(describe)
 
     def function_of(self, owner: type[Caller]) -> Callable[..., Any]:
-        """A function that gives the items of the list."""
+        """Function that returns the items of the described list."""
         describe = self._describe
 
         @wraps(describe)
@@ -160,5 +160,5 @@ class paged_list(_Method, Generic[P, Row]):  # noqa: N801 - a decorator
     def __get__(self, client: "AsyncConnection", owner: type) -> Callable[P, "AsyncItems[Row]"]: ...
 
     def __get__(self, client: Any, owner: type) -> Any:
-        """For type checkers: classes of clients have a function in place of this object."""
+        """Present only for type checkers: a function replaces this object in classes of clients."""
         return self

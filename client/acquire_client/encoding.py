@@ -1,4 +1,4 @@
-"""The encoding of what the client sends: addresses, queries and bodies."""
+"""Encoding of the client's requests: addresses, queries and bodies."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -13,7 +13,7 @@ import msgspec
 from .errors import InvalidArgument, UnexpectedAnswer
 
 Batch: TypeAlias = Mapping[str, Any] | str | bytes
-"""A batch as the API has it: a mapping, which may hold numpy's arrays, or its JSON."""
+"""Batch in the API's form: a mapping, which may hold numpy arrays, or its JSON text."""
 
 Time: TypeAlias = str | datetime
 """UTC as text, such as `1996-01-10T12:00:00Z` or `1996-010T12:00:00Z`, or with a time zone."""
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 def checked_address(url: str) -> httpx.URL:
-    """The address of a service; raises `InvalidArgument` for one that is none."""
+    """Parse the address of a service; raises `InvalidArgument` for an invalid one."""
     try:
         parsed = httpx.URL(url)
         valid = parsed.scheme in ("http", "https") and bool(parsed.host)
@@ -40,7 +40,7 @@ def checked_address(url: str) -> httpx.URL:
 
 
 def bearer_of(token: str | None) -> dict[str, str]:
-    """The header with a token; raises `InvalidArgument`, without the token, for one that is none.
+    """Header with a token; raises `InvalidArgument`, without naming the token, for an invalid one.
 
     A token that was read from a file may end in a newline.
     """
@@ -53,12 +53,12 @@ def bearer_of(token: str | None) -> dict[str, str]:
 
 
 def path_of(*parts: str) -> str:
-    """A path of the API, such as `/api/v1/batches/ID`."""
+    """Path of the API from its parts, such as `/api/v1/batches/ID`."""
     return "/api/v1/" + "/".join(quote(each, safe="") for each in parts)
 
 
 def parameters_of(query: Query) -> dict[str, Any]:
-    """The parameters of a query; those that are None are left out."""
+    """Query parameters of a request; those that are None are left out."""
     return {name: _parameter(name, value) for name, value in query.items() if value is not None}
 
 
@@ -73,7 +73,7 @@ def _utc(name: str, value: datetime) -> str:
 
 
 def json_of(body: Batch) -> bytes:
-    """A body as JSON.  NaN stays NaN: the service refuses it and names the field."""
+    """Encode a body as JSON. NaN stays NaN: the service refuses it and names the field."""
     if isinstance(body, bytes):
         return body
     try:
@@ -95,7 +95,7 @@ def _plain(value: Any) -> Any:
 
 
 def decoded(response: httpx.Response, kind: type[T]) -> T:
-    """The body of an answer as a model of that kind."""
+    """Decode the body of an answer as a model; raises `UnexpectedAnswer`."""
     try:
         return msgspec.json.decode(response.content, type=kind)
     except msgspec.DecodeError as error:
@@ -104,7 +104,7 @@ def decoded(response: httpx.Response, kind: type[T]) -> T:
 
 
 def pieces_of(file: Path) -> Iterator[bytes]:
-    """The bytes of a file, piece by piece."""
+    """Read a file piece by piece."""
     with file.open("rb") as stream:
         while piece := stream.read(PIECE_BYTES):
             yield piece

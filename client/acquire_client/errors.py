@@ -37,26 +37,26 @@ if TYPE_CHECKING:
 
 
 class ClientError(Exception):
-    """The base of every error that the client raises itself."""
+    """Base class of every error that the client raises itself."""
 
 
 class InvalidArgument(ClientError, ValueError):
-    """An argument that no request can carry; the message holds no secret."""
+    """Error for an argument that no request can carry; the message holds no secret."""
 
 
 class NoAnswer(ClientError):
-    """No service answers at the address, or none did for as long as the client waits."""
+    """Error if no service answers at the address for as long as the client waits."""
 
 
 class UnexpectedAnswer(ClientError):
-    """The answer is not one of this service, or of a version that the client does not know."""
+    """Error for an answer from another program, or from an unknown version of the service."""
 
 
 class EventsLost(ClientError):
-    """The service no longer keeps some of the events that were missed.
+    """Error if the service no longer keeps some of the events that were missed.
 
-    Those after `after` and up to `resumes_after` are lost: read again what you keep of them, and
-    go on with the events after `resumes_after`.
+    Those after `after` and up to `resumes_after` are lost: read the data concerned again, and
+    continue with the events after `resumes_after`.
     """
 
     def __init__(self, after: int | None, resumes_after: int) -> None:
@@ -68,7 +68,7 @@ class EventsLost(ClientError):
 
 
 class ReplayEnded(ClientError):
-    """A replay ended before its file did; `replay` is its last state."""
+    """Error for a replay that ended before its file did; `replay` is its last state."""
 
     def __init__(self, replay: "Replay") -> None:
         self.replay = replay
@@ -78,11 +78,11 @@ class ReplayEnded(ClientError):
 
 
 class PackageMissing(ClientError):
-    """A table needs a package that is not installed; the message has the command."""
+    """Error for a table that needs a missing package; the message has the install command."""
 
 
 class Problem(ClientError):
-    """The service refuses a request.
+    """Error for a request that the service refuses.
 
     `status` is that of HTTP, `type` a page of the service such as `/problems/bad-input`; `detail`
     has the fault in a sentence, `errors` every fault, field by field.
@@ -96,47 +96,47 @@ class Problem(ClientError):
 
 
 class BadInput(Problem):
-    """Invalid input: the same request will fail again."""
+    """Error for invalid input: the same request will fail again."""
 
 
 class NotAvailable(BadInput):
-    """A feature that this version or installation of the service lacks."""
+    """Error for a feature that this version or installation of the service lacks."""
 
 
 class KeyReused(BadInput):
-    """The Idempotency-Key was used with another body."""
+    """Error for an Idempotency-Key that was used with another body."""
 
 
 class Unauthenticated(Problem):
-    """The token is absent, unknown, expired or revoked."""
+    """Error for an absent, unknown, expired or revoked token."""
 
 
 class Forbidden(Problem):
-    """The token lacks the scope of this request, or is bound to other spacecraft."""
+    """Error for a token without the scope of the request, or limited to other spacecraft."""
 
 
 class NotFound(Problem):
-    """There is no such spacecraft, batch, alarm or replay, or the token may not see it."""
+    """Error for a spacecraft, batch, alarm or replay that is missing, or hidden from the token."""
 
 
 class Conflict(Problem):
-    """Another body has this batch id or name of a gyro block, or another block one of its times."""
+    """Error for a batch id, block name or sample time that another body has already."""
 
 
 class WrongState(Problem):
-    """The state does not allow this: an alarm is already cleared, a replay has ended."""
+    """Error for an action in the wrong state: an alarm already cleared, a replay ended."""
 
 
 class Busy(Problem):
-    """The service cannot take the request now; the same request may succeed later."""
+    """Error if the service cannot take the request now; repeating it later may succeed."""
 
 
 class RateLimited(Busy):
-    """More requests than the token's rate allows, or more event streams."""
+    """Error for more requests than the token's rate allows, or more event streams."""
 
 
 class ServiceFailed(Problem):
-    """A fault of the service, or a status that the client does not know."""
+    """Error for a fault of the service, or a status that the client does not know."""
 
 
 _BY_TYPE: dict[str, type[Problem]] = {
@@ -165,11 +165,11 @@ _BY_STATUS: dict[int, type[Problem]] = {
 
 
 def problem_of(response: httpx.Response) -> Problem:
-    """The problem that an answer describes; its body must have been read."""
+    """Build the error for an answer with a problem; the answer's body must have been read."""
     try:
         document = msgspec.json.decode(response.content, type=ProblemDocument)
     except msgspec.DecodeError:
-        # Not of the service but of a proxy before it, for example.
+        # The answer may come from a proxy, not from the service.
         status, text = response.status_code, response.text[:200].strip()
         detail = f"HTTP {status}: {text}" if text else f"HTTP {status}"
         if response.is_redirect and (place := response.headers.get("Location")):
@@ -187,7 +187,7 @@ def problem_of(response: httpx.Response) -> Problem:
 
 
 def retry_after_s(response: httpx.Response) -> float | None:
-    """How long the answer asks to wait (`Retry-After`, RFC 9110): seconds, or until a date.
+    """Seconds to wait that an answer asks for (`Retry-After`, RFC 9110), directly or as a date.
 
     The date is compared with the service's own clock where the answer has its `Date`.
     """

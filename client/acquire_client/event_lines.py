@@ -1,4 +1,4 @@
-"""Server-sent events: the blocks of an event stream, and the events in them."""
+"""Server-sent events: parsing of an event stream to blocks, and of blocks to events."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, cast, get_args, get_type_hints
@@ -11,7 +11,7 @@ from .events import KnownEvent
 
 
 class OtherEvent(Model, frozen=True):
-    """An event of a kind that a later service added: the word is `name`."""
+    """Event of a kind that a later service added, whose word is `name`."""
 
     id: int
     kind: Literal["other"]
@@ -20,9 +20,9 @@ class OtherEvent(Model, frozen=True):
 
 
 Event = KnownEvent | OtherEvent
-"""Something that happened, by its number: numbers have no gaps and are in order of commit.
+"""Event of the service with its number: numbers have no gaps and follow the order of commit.
 
-`kind` says which it is, and so what `data` is.
+`kind` gives the kind of event, which determines the type of `data`.
 """
 _BY_KIND: Mapping[str, Any] = {
     get_args(get_type_hints(each)["kind"])[0]: each for each in get_args(KnownEvent)
@@ -30,14 +30,14 @@ _BY_KIND: Mapping[str, Any] = {
 
 
 class Block(Model, frozen=True):
-    """A block of a stream: `data` is None where it has only the number."""
+    """Block of an event stream; `data` is None for a block with only a number."""
 
     id: int | None
     kind: str
     data: str | None
 
     def event(self) -> Event:
-        """The block as an event."""
+        """Convert the block to an event; raises `UnexpectedAnswer` if it is none."""
         fault = UnexpectedAnswer(f"this is no event of the service: {self}")
         if self.id is None:
             raise fault
@@ -53,10 +53,10 @@ class Block(Model, frozen=True):
 
 
 class BlockReader:
-    """Reads the blocks of a stream from its bytes.
+    """Parser of the blocks of an event stream from its bytes.
 
-    A block counts once the empty line after it has come: one that was cut off is left out, and
-    its number with it.  Lines end with a line feed alone: text may hold other separators.
+    A block is complete after its empty line: an incomplete one is dropped, with its number.  Lines
+    end with a line feed only: text may hold other separators.
     """
 
     def __init__(self) -> None:
@@ -64,7 +64,7 @@ class BlockReader:
         self._fields: dict[str, str] = {}
 
     def feed(self, piece: bytes) -> list[Block]:
-        """The blocks that these bytes complete."""
+        """Add bytes of the stream; returns the blocks that they complete."""
         *lines, self._rest = (self._rest + piece).split(b"\n")
         found = []
         for line in lines:

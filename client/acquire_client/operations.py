@@ -1,4 +1,4 @@
-"""Batches, results, runs, alarms, calibrations and access: read them, and act on them.
+"""Client methods for batches, results, runs, alarms, calibrations and access.
 
 `who` signs an action while access is open; with a token, its name does.
 """
@@ -23,14 +23,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class RecordedAnswer:
-    """An answer as it is recorded: its JSON, and whether the batch was recorded before."""
+    """Answer as recorded: its JSON, and True if the batch was recorded before."""
 
     body: bytes
     replayed: bool
 
     @cached_property
     def answer(self) -> models.Answer:
-        """The answer as a model."""
+        """Decode the recorded answer to a model."""
         try:
             return msgspec.json.decode(self.body, type=models.Answer)
         except msgspec.DecodeError as error:
@@ -39,7 +39,7 @@ class RecordedAnswer:
 
 @dataclass(frozen=True)
 class BatchOutcome:
-    """A batch that was sent, with its answer, or with the problem for which it was refused."""
+    """Outcome of a submitted batch: its answer, or the problem for which it was refused."""
 
     batch: Batch
     recorded: RecordedAnswer | None
@@ -47,7 +47,7 @@ class BatchOutcome:
 
     @property
     def answer(self) -> models.Answer:
-        """The answer; raises the problem of a batch that was refused."""
+        """Answer to the batch as a model; raises the problem of a refused one."""
         if self.recorded is None:
             assert self.problem is not None
             raise self.problem
@@ -55,7 +55,7 @@ class BatchOutcome:
 
 
 class Results:
-    """The part of the clients that is about batches, their results, and pictures."""
+    """Client methods for batches, their results, and pictures."""
 
     @single_request
     def submit(self, batch: Batch, *, idempotency_key: str | None = None) -> Call[models.Answer]:
@@ -75,7 +75,7 @@ class Results:
     def submit_json(
         self, batch: Batch, *, idempotency_key: str | None = None
     ) -> Call[RecordedAnswer]:
-        """The same, with the answer as it is recorded, and whether it was recorded before.
+        """Submit a batch as `submit` does; the answer as recorded, with `replayed` for a repeat.
 
         >>> recorded = client.submit_json(batch)
         >>> recorded.replayed
@@ -95,7 +95,7 @@ class Results:
         status: Status | Literal["no_attitude"] | None = None,
         batch: str | None = None,
     ) -> Listing[models.Summary]:
-        """The current results of recorded batches, newest first by batch time.
+        """List the current results of recorded batches, newest first by batch time.
 
         `run` is `*` for all runs; `end` is excluded; `outcome` asks for at least one such star.
 
@@ -115,12 +115,12 @@ class Results:
 
     @single_request
     def batch(self, id: str) -> Call[models.Result]:
-        """One recorded result with its batch; raises `NotFound`."""
+        """Read a recorded result with its batch; raises `NotFound`."""
         return get(models.Result, path_of("batches", id))
 
     @single_request
     def latest(self, spacecraft: str, *, run: str = "live") -> Call[models.Result]:
-        """The newest result of a spacecraft by batch time; raises `NotFound` without a batch.
+        """Read the newest result of a spacecraft by batch time; raises `NotFound` without a batch.
 
         >>> latest = client.latest("XTE")
         >>> latest.answer.attitude.status
@@ -130,7 +130,7 @@ class Results:
 
     @single_request
     def adopt(self, id: str, options: Mapping[str, Any]) -> Call[models.Answer]:
-        """Process a recorded batch again, and let the result stand for the batch.
+        """Process a recorded batch again, and make the result the batch's current one.
 
         >>> latest = client.latest("XTE")
         >>> adopted = client.adopt(latest.answer.id, {"identifier": "verified"})
@@ -151,7 +151,8 @@ class Results:
     ) -> Call[models.Picture]:
         """Find the attitude, the lens and the stars of a picture of any camera; records nothing.
 
-        `picture` is the content of its file; a `spacecraft` is the one whose camera took it.
+        `picture` is the content of its file; `spacecraft` names the spacecraft whose camera took
+        it.
         """
         return Call(
             partial(decoded, kind=models.Picture),
@@ -165,11 +166,11 @@ class Results:
 
 
 class Runs:
-    """The part of the clients that is about runs and the state of replays."""
+    """Client methods for runs and for the state of replays."""
 
     @single_request
     def runs(self) -> Call[list[models.Run]]:
-        """Every run with batches."""
+        """List all runs with batches."""
         return get_items(models.Run, path_of("runs"))
 
     @single_request
@@ -184,21 +185,21 @@ class Runs:
 
     @single_request
     def replays(self) -> Call[list[models.Replay]]:
-        """The latest hundred replays, newest first."""
+        """List the latest hundred replays, newest first."""
         return get_items(models.Replay, path_of("replays"))
 
     @single_request
     def cancel_replay(self, id: str) -> Call[models.Replay]:
-        """Cancel a replay; what it recorded stays.  Raises `WrongState` where it has ended."""
+        """Cancel a replay; recorded batches stay.  Raises `WrongState` if it has ended."""
         return Call(partial(decoded, kind=models.Replay), "DELETE", path_of("replays", id))
 
 
 class Access:
-    """The part of the clients that is about the caller and tokens."""
+    """Client methods for the caller and for tokens."""
 
     @single_request
     def session(self) -> Call[models.Session]:
-        """The caller as the service knows it: the token's name, its scopes and spacecraft.
+        """Read the caller as the service knows it: the token's name, its scopes and spacecraft.
 
         Raises `Unauthenticated` where the service asks for a token, or for another one.
 
@@ -210,7 +211,7 @@ class Access:
 
     @single_request
     def tokens(self) -> Call[list[models.Token]]:
-        """Every token without its secret, the oldest first."""
+        """List all tokens without their secrets, the oldest first."""
         return get_items(models.Token, path_of("tokens"))
 
     @single_request
@@ -223,25 +224,25 @@ class Access:
         days: int = 365,
         rate_per_s: float | None = None,
     ) -> Call[models.NewToken]:
-        """Make a token; its secret is in this answer alone.  The first one ends open access."""
+        """Create a token; only this answer has its secret.  The first one ends open access."""
         asked = {"name": name, "scopes": list(scopes), "days": days, "rate_per_s": rate_per_s}
         asked["spacecraft"] = None if spacecraft is None else list(spacecraft)
         return post(models.NewToken, path_of("tokens"), asked)
 
     @single_request
     def revoke_token(self, name: str) -> Call[models.Token]:
-        """End a token at once, with the sessions that were begun with it; raises `NotFound`."""
+        """Revoke a token at once and end its sessions; raises `NotFound`."""
         return Call(partial(decoded, kind=models.Token), "DELETE", path_of("tokens", name))
 
 
 class Alarms:
-    """The part of the client that is about alarms."""
+    """Client methods for alarms."""
 
     @paged_list
     def alarms(
         self, spacecraft: str | None = None, *, run: str = "live", state: str = "active"
     ) -> Listing[models.Alarm]:
-        """Alarms, newest first; `state` active: all that are not cleared.
+        """List alarms, newest first; the state `active` means all that are not cleared.
 
         >>> [alarm.severity for alarm in client.alarms("XTE")]
         []
@@ -251,7 +252,7 @@ class Alarms:
 
     @single_request
     def alarm(self, id: str) -> Call[models.AlarmWithActions]:
-        """One alarm with its history; raises `NotFound`."""
+        """Read an alarm with its history; raises `NotFound`."""
         return get(models.AlarmWithActions, path_of("alarms", id))
 
     @single_request
@@ -272,7 +273,7 @@ class Alarms:
     def unshelve(
         self, id: str, *, who: str | None = None, comment: str | None = None
     ) -> Call[models.AlarmWithActions]:
-        """Let a shelved alarm return now."""
+        """End the silence of a shelved alarm now."""
         return _act(id, "unshelve", {"who": who, "comment": comment})
 
     @single_request
@@ -284,7 +285,7 @@ class Alarms:
 
 
 class Calibrations:
-    """The part of the client that is about calibrations."""
+    """Client methods for calibrations."""
 
     @single_request
     def calibrate(
@@ -298,7 +299,7 @@ class Calibrations:
         time_tag: bool = False,
         who: str | None = None,
     ) -> Call[models.Calibration]:
-        """Begin a calibration from recorded batches; read it again until its `state` is done.
+        """Start a calibration from recorded batches; read it again until its `state` is done.
 
         Without a `degree`, the distortion gets the degree that fits held-out blocks of time best.
         """
@@ -317,7 +318,7 @@ class Calibrations:
 
     @paged_list
     def calibrations(self, spacecraft: str | None = None) -> Listing[models.CalibrationSummary]:
-        """Calibrations without covariances and residual maps, newest first.
+        """List calibrations without covariances and residual maps, newest first.
 
         >>> [each.version for each in client.calibrations("XTE")]
         []
@@ -327,12 +328,12 @@ class Calibrations:
 
     @single_request
     def calibration(self, id: str) -> Call[models.Calibration]:
-        """One calibration with all that was found; raises `NotFound`."""
+        """Read a calibration with all its results; raises `NotFound`."""
         return get(models.Calibration, path_of("calibrations", id))
 
     @single_request
     def calibration_in_force(self, spacecraft: str) -> Call[models.CalibrationInForce]:
-        """The calibration that new batches use, and what held when.
+        """Read the calibration that new batches use, with all adoptions.
 
         >>> in_force = client.calibration_in_force("XTE")
         >>> in_force.calibration, in_force.history
@@ -345,7 +346,7 @@ class Calibrations:
     def adopt_calibration(
         self, id: str, *, who: str | None = None, note: str = ""
     ) -> Call[models.CalibrationAdoption]:
-        """Let new batches be processed with a calibration; raises `WrongState`."""
+        """Adopt a calibration for new batches; raises `WrongState`."""
         path = path_of("calibrations", id, "adopt")
         return post(models.CalibrationAdoption, path, {"who": who, "note": note})
 
@@ -353,7 +354,7 @@ class Calibrations:
     def revert_calibration(
         self, spacecraft: str, to: str | None = None, *, who: str | None = None, note: str = ""
     ) -> Call[models.CalibrationAdoption]:
-        """Go back to the adoption of this id, or with None to the mission file."""
+        """Return to an earlier adoption of a calibration, or with None to the mission file."""
         path = path_of("spacecraft", spacecraft, "calibration", "revert")
         return post(models.CalibrationAdoption, path, {"to": to, "who": who, "note": note})
 

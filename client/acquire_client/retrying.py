@@ -1,4 +1,4 @@
-"""How long to wait before the same request is sent again, and when to give up."""
+"""Decision whether and when to send a request again, and when to give up."""
 
 import random
 import time
@@ -12,7 +12,7 @@ FIRST_WAIT_S, LONGEST_WAIT_S = 0.1, 5.0
 
 
 class Repeat(Enum):
-    """The requests that may be sent again."""
+    """Condition under which a request may be sent again."""
 
     ALWAYS = "a second one changes nothing"
     IF_REFUSED = "unless the service may have received it"
@@ -20,12 +20,12 @@ class Repeat(Enum):
 
 
 class Patience:
-    """Decides about one request, or one stream: wait, or give up.
+    """Waiting times between attempts of one request, or one stream, until giving up.
 
-    Waits double from 0.1 s to 5 s, less a random part, so that many clients do not come back at
-    the same moment.  They are longer where the service asks for it (`Retry-After`), and the
-    client gives up at once where that would take longer than `give_up_after_s`.  This time counts
-    from the first failure: a slow attempt that fails is followed by another one.
+    Waits double from 0.1 s to 5 s, less a random part, so that many clients do not return at the
+    same moment.  They are longer where the service asks for it (`Retry-After`), and the client
+    gives up at once where that would take longer than `give_up_after_s`.  This time counts from the
+    first failure: a slow attempt that fails is followed by another one.
     """
 
     def __init__(self, give_up_after_s: float, repeat: Repeat = Repeat.ALWAYS) -> None:
@@ -34,16 +34,16 @@ class Patience:
         self.progressed()
 
     def answered(self) -> None:
-        """The service answers: count anew how long it does not, from the next failure on."""
+        """Note that the service answers: the time until giving up restarts at the next failure."""
         self._deadline_s: float | None = None
 
     def progressed(self) -> None:
-        """The answer was worth it: begin with a short wait again, too."""
+        """Note progress: the next wait is short, and the time until giving up restarts."""
         self.answered()
         self._wait_s = FIRST_WAIT_S
 
     def after_problem(self, problem: Problem) -> float:
-        """Seconds until the request should be sent again; raises `problem` where it should not."""
+        """Seconds until the request should be sent again; raises `problem` if it should not."""
         is_refused = isinstance(problem, RateLimited) and self._repeat is Repeat.IF_REFUSED
         may_repeat = isinstance(problem, Busy) and self._repeat is Repeat.ALWAYS
         if not (is_refused or may_repeat):
@@ -54,12 +54,12 @@ class Patience:
         return wait_s
 
     def after_loss(self, error: httpx.RequestError, url: httpx.URL) -> float:
-        """The same where no answer came; raises `NoAnswer` where it should not be sent again."""
+        """Seconds until a lost request is sent again; raises `NoAnswer` if it should not be."""
         is_unsent = isinstance(error, httpx.ConnectError | httpx.ConnectTimeout)
         may_repeat = self._repeat is Repeat.ALWAYS or (
             is_unsent and self._repeat is Repeat.IF_REFUSED
         )
-        # A request that cannot be sent as it is will not be sent at the next attempt either.
+        # A request that cannot be sent as it is would fail at the next attempt as well.
         is_faulty = isinstance(error, httpx.LocalProtocolError | httpx.UnsupportedProtocol)
         wait_s = self._next_wait_s() if may_repeat and not is_faulty else None
         if wait_s is None:
@@ -80,5 +80,5 @@ class Patience:
 
 
 def shown(error: Exception) -> str:
-    """An error's words, or its name where it has none."""
+    """Message of an error, or the name of its class if it has none."""
     return str(error) or type(error).__name__

@@ -1,4 +1,4 @@
-"""Spacecraft: state, attitudes, trends and gyro blocks."""
+"""Client methods for spacecraft: state, attitudes, trends and gyro blocks."""
 
 from collections.abc import Sequence
 
@@ -9,11 +9,11 @@ from .retrying import Repeat
 
 
 class Spacecraft:
-    """The part of the client that is about spacecraft.  In each period `end` is excluded."""
+    """Client methods for spacecraft; the `end` of each period is excluded."""
 
     @single_request
     def fleet(self, *, run: str = "live") -> Call[list[models.SpacecraftRow]]:
-        """Every spacecraft with its state in a run.
+        """List all spacecraft with their state in a run.
 
         >>> [each.name for each in client.fleet() if each.attitude]
         ['XTE']
@@ -22,7 +22,7 @@ class Spacecraft:
 
     @single_request
     def spacecraft(self, name: str, *, run: str = "live") -> Call[models.SpacecraftState]:
-        """One spacecraft: state in a run, mission settings and their history."""
+        """Read a spacecraft's state in a run, with its mission's settings and their history."""
         return get(models.SpacecraftState, path_of("spacecraft", name), {"run": run})
 
     @paged_list
@@ -34,7 +34,7 @@ class Spacecraft:
         start: Time | None = None,
         end: Time | None = None,
     ) -> Listing[models.AttitudeRow]:
-        """The attitudes of a run, oldest first by batch time, suspect ones included.
+        """List the attitudes of a run, oldest first by batch time, suspect ones included.
 
         >>> [round(row.quaternion[3], 4) for row in client.attitudes("XTE")]
         [0.3536]
@@ -47,7 +47,7 @@ class Spacecraft:
 
     @single_request
     def live_attitude(self, spacecraft: str) -> Call[models.LiveAttitude]:
-        """The filtered attitude at the last epoch, of a mission with a live filter."""
+        """Read the filtered attitude at the last epoch, for a mission with a live filter."""
         return get(models.LiveAttitude, path_of("spacecraft", spacecraft, "attitude", "latest"))
 
     @single_request
@@ -60,14 +60,14 @@ class Spacecraft:
         end: Time | None = None,
         who: str | None = None,
     ) -> Call[models.DefinitiveJob]:
-        """Let the service filter and smooth the days of a period; the job goes on beside it."""
+        """Start a job that filters and smooths the days of a period in the background."""
         asked = {"run": run, "start": start, "end": end, "who": who}
         path = path_of("spacecraft", spacecraft, "definitive-attitude")
         return post(models.DefinitiveJob, path, asked)
 
     @single_request
     def definitive_attitude(self, spacecraft: str, id: str) -> Call[models.DefinitiveJob]:
-        """How far a job is that makes a definitive attitude."""
+        """Read the progress of a job that computes a definitive attitude."""
         path = path_of("spacecraft", spacecraft, "definitive-attitude", id)
         return get(models.DefinitiveJob, path)
 
@@ -80,9 +80,9 @@ class Spacecraft:
         start: Time | None = None,
         end: Time | None = None,
     ) -> Listing[models.Innovation]:
-        """How the attitudes of a period met the filter, the earliest first.
+        """List the innovations of a period: measured less predicted attitudes in the filter.
 
-        There are some of the days that `acquire smooth` recorded.
+        Only days that `acquire smooth` recorded have them.
 
         >>> [row.chi_square for row in client.innovations("XTE")]
         []
@@ -99,7 +99,7 @@ class Spacecraft:
         start: Time | None = None,
         end: Time | None = None,
     ) -> Call[models.TrackList]:
-        """Tracks of points that no catalog star explains: objects, planets, hot pixels.
+        """List tracks of points that no catalog star explains: objects, planets, hot pixels.
 
         The period has at most 2,000 batches.
 
@@ -118,7 +118,7 @@ class Spacecraft:
         start: Time | None = None,
         end: Time | None = None,
     ) -> Call[str]:
-        """The moving tracks of a period as a CCSDS TDM; raises `NotFound` if there are none."""
+        """Read the moving tracks of a period as a CCSDS TDM; raises `NotFound` without any."""
         query = {"run": run, "start": start, "end": end, "format": "tdm"}
         path = path_of("spacecraft", spacecraft, "tracks")
         return Call(lambda response: response.text, "GET", path, query)
@@ -136,7 +136,7 @@ class Spacecraft:
         strategy: str | None = None,
         size: int | None = None,
     ) -> Call[models.History]:
-        """Quantities over a period, thinned out to at most `size` points; default: all, 500.
+        """Read quantities over a period, reduced to at most `size` points; default: all, 500.
 
         `strategy` is `minmax` for buckets, `latest` for the newest batches one by one.
 
@@ -165,7 +165,7 @@ class Spacecraft:
         end: Time | None = None,
         bucket: str = "hour",
     ) -> Call[list[models.Rates]]:
-        """Stars by outcome for each hour or day with batches, oldest first.
+        """Read the stars by outcome for each hour or day with batches, oldest first.
 
         >>> [(each.start, each.observed) for each in client.rates("XTE")]
         [('1996-01-10T12:00:00.000Z', 4)]
@@ -185,7 +185,7 @@ class Spacecraft:
         tracker: str | None = None,
         limit: int = 20,
     ) -> Call[models.Ranking]:
-        """The batches with the worst values of a quantity in a period, worst first."""
+        """Read the batches with the worst values of a quantity in a period, worst first."""
         query = {
             "by": by,
             "run": run,
@@ -198,7 +198,7 @@ class Spacecraft:
 
 
 class Gyro:
-    """The part of the client that is about gyro blocks."""
+    """Client methods for gyro blocks."""
 
     @single_request
     def submit_gyro(self, spacecraft: str, block: Batch) -> Call[models.GyroBlock]:
@@ -226,7 +226,7 @@ class Gyro:
         start: Time | None = None,
         end: Time | None = None,
     ) -> Listing[models.GyroBlock]:
-        """The blocks that touch a period, the earliest first; `end` is excluded.
+        """List the gyro blocks that overlap a period, the earliest first; `end` is excluded.
 
         >>> recorded = client.submit_gyro("XTE", block)
         >>> [found.block for found in client.gyro("XTE")]
@@ -237,7 +237,7 @@ class Gyro:
 
     @single_request
     def gyro_samples(self, spacecraft: str, id: str) -> Call[models.GyroSamples]:
-        """One block with its samples; raises `NotFound`.
+        """Read a gyro block with its samples; raises `NotFound`.
 
         >>> recorded = client.submit_gyro("XTE", block)
         >>> samples = client.gyro_samples("XTE", recorded.id)

@@ -1,4 +1,4 @@
-"""Models as tables of pyarrow and pandas, where these are installed."""
+"""Conversion of models to tables of pyarrow and pandas, where these are installed."""
 
 from collections.abc import Sequence
 from importlib import import_module
@@ -17,10 +17,10 @@ if TYPE_CHECKING:
 
 
 def table_of(rows: Sequence[msgspec.Struct], kind: type[msgspec.Struct]) -> "pa.Table":
-    """A table with a row for each model of one kind.
+    """Arrow table with a row for each model of one kind.
 
     The column of a part is named `counts.unique`; free settings are columns of JSON text.  The
-    columns depend on the kind alone, so a table without rows has them, too.
+    columns depend on the kind only, so a table without rows has them too.
     """
     arrow = _package("pyarrow")
     described = inspect.type_info(kind)
@@ -46,7 +46,7 @@ def table_of(rows: Sequence[msgspec.Struct], kind: type[msgspec.Struct]) -> "pa.
 
 
 def table_of_history(history: "History") -> "pa.Table":
-    """A table with a row for each point of a history."""
+    """Arrow table with a row for each point of a history."""
     arrow = _package("pyarrow")
     columns: dict[str, Any] = {"unix_s": arrow.array(history.unix_s, arrow.float64())}
     for name in ("time", "id", "batch", "batches"):
@@ -61,7 +61,7 @@ def table_of_history(history: "History") -> "pa.Table":
 
 
 def pandas_of(table: "pa.Table") -> "pd.DataFrame":
-    """A table of pyarrow as a data frame of pandas."""
+    """Convert an Arrow table to a pandas data frame."""
     _package("pandas")
     return table.to_pandas()
 
@@ -76,7 +76,7 @@ def _package(name: str) -> Any:
 
 
 def _is_free(kind: inspect.Type) -> bool:
-    """True if a field holds settings of any shape."""
+    """True if the type of a field allows settings of any shape."""
     return isinstance(kind, inspect.DictType) and isinstance(kind.value_type, inspect.AnyType)
 
 

@@ -1,4 +1,4 @@
-"""The asynchronous client.  `_sync` is made from these modules: see `client/generate.py`.
+"""The asynchronous client; `_sync` is generated from these modules, see `client/generate.py`.
 
-Only `backend.py` is written for each by hand.
+Only `backend.py` is written by hand in both folders.
 """

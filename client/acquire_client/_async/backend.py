@@ -1,4 +1,4 @@
-"""The differences between waiting in an event loop and in a thread: here, in an event loop."""
+"""Functions that differ between waiting in an event loop and in a thread: for an event loop."""
 
 import asyncio
 from collections import deque
@@ -14,7 +14,7 @@ sleep = asyncio.sleep
 
 
 async def iterated(source: Source[T]) -> AsyncIterator[T]:
-    """The items of either kind of source."""
+    """Iterate over the items of an asynchronous or a plain source."""
     if isinstance(source, AsyncIterable):
         async for item in source:
             yield item
@@ -26,7 +26,7 @@ async def iterated(source: Source[T]) -> AsyncIterator[T]:
 async def bounded_map(
     function: Callable[[T], Awaitable[R]], source: Source[T], at_once: int
 ) -> AsyncIterator[R]:
-    """The results of a function for each item, in order, of which some are at work at a time.
+    """Apply a function to each item, at most `at_once` at a time; results in order.
 
     An item is taken from the source only when there is room for it.
     """

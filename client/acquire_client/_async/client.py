@@ -1,4 +1,4 @@
-"""The client: batches, runs and replays, every part together, and its live events."""
+"""Client of the service: batches, runs, replays and all other parts, and live events."""
 
 import time
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
@@ -20,7 +20,7 @@ from .connection import AsyncConnection
 
 
 class AsyncBatches(Results, AsyncConnection):
-    """The part of the client that is about many batches, and what-ifs."""
+    """Client methods for submitting many batches, and for what-ifs."""
 
     async def submit_many(
         self, batches: Source[Batch], *, at_once: int = 8
@@ -62,7 +62,7 @@ class AsyncBatches(Results, AsyncConnection):
     async def what_if(
         self, id: str, options: Mapping[str, Any], *, record: bool = False
     ) -> models.Answer | models.WhatIf:
-        """Process a recorded batch again with other options; `record` keeps the result beside it.
+        """Process a recorded batch again with other options; `record` stores the result as well.
 
         >>> latest = await client.latest("XTE")
         >>> votes = await client.what_if(latest.answer.id, {"identifier": "starid"})
@@ -80,12 +80,15 @@ NDJSON = "application/x-ndjson"
 PACKETS = "application/x-tar"
 POLL_S = 0.25
 INTERRUPTED_FOR_S = 20.0
-"""A service that starts marks every replay as interrupted; a process that still works on one
-corrects that with its next lines, which a busy machine may take a while for."""
+"""Seconds for which a replay may be interrupted before it counts as ended.
+
+A service that starts marks every replay as interrupted; a process that still works on one corrects
+that with its next lines, which a busy machine may delay.
+"""
 
 
 class AsyncReplays(AsyncConnection):
-    """The part of the client that is about runs and replays."""
+    """Client methods for replays of telemetry files."""
 
     async def replay(
         self,
@@ -126,11 +129,11 @@ class AsyncReplays(AsyncConnection):
         packets: bool = False,
         spacecraft: str | None = None,
     ) -> models.Replay:
-        """Send a telemetry file as one replay, which the service works on in the background.
+        """Send a telemetry file as one replay, which the service processes in the background.
 
         `lines` is a file, or its bytes in one or many pieces: NDJSON, or with `packets` a tar
-        archive of space packets and their XTCE file; `spacecraft` names their mission.  `run`
-        takes every batch; `alarms` raises alarms for it.
+        archive of space packets and their XTCE file; `spacecraft` names their mission.  `run` gets
+        every batch; `alarms` switches the evaluation of its limits on.
         """
         content = pieces_of(lines) if isinstance(lines, Path) else lines
         response = await self.request(
@@ -139,7 +142,7 @@ class AsyncReplays(AsyncConnection):
             query={"run": run, "alarms": alarms or None, "spacecraft": spacecraft},
             content=content if isinstance(content, bytes) else iterated(content),
             headers={"Content-Type": PACKETS if packets else NDJSON},
-            # Pieces can be read once only, and a second replay would do the same work.
+            # Pieces can be read only once, and a second replay would repeat the work.
             repeat=Repeat.NEVER,
         )
         return decoded(response, models.Replay)
@@ -147,9 +150,9 @@ class AsyncReplays(AsyncConnection):
     async def follow_replay(
         self, id: str, *, every_s: float = POLL_S
     ) -> AsyncIterator[models.Replay]:
-        """The states of a replay until it ends; the last one tells how.
+        """States of a replay until its end; the last one has the final state.
 
-        A restart of the service in between is waited for.
+        Waits through a restart of the service.
         """
         running_s = time.monotonic()
         while True:
@@ -163,15 +166,15 @@ class AsyncReplays(AsyncConnection):
 
 
 SILENCE_S = 45.0
-"""The service sends something every 15 seconds; without it the connection is lost."""
+"""Seconds of silence after which an event stream counts as lost; the service sends every 15."""
 
 
 class AsyncEvents:
-    """Live events: iterate over it.  No event is left out, and none comes twice.
+    """Live events, as an iterator without gaps or repetitions.
 
-    `last` is the number of the latest event that was handed out, or that the service says to be
-    the latest; iterating again, or `events(after=last)` of another client, goes on after it.
-    None: nothing was heard yet.
+    `last` is the number of the latest event returned, or named as the latest by the service;
+    iterating again, or `events(after=last)` of another client, continues after it.  None: nothing
+    was received yet.
     """
 
     def __init__(self, connection: AsyncConnection, query: Query, after: int | None) -> None:
@@ -205,7 +208,7 @@ class AsyncEvents:
                     yield block
 
     def _taken(self, block: Block) -> Event | None:
-        """The event of a block, which is not there for what only tells the place in the stream."""
+        """Event in a block of the stream; None for a block with only a position."""
         if block.kind == "reset" and block.id is not None:
             after, self.last = self.last, block.id
             raise EventsLost(after, block.id)
@@ -218,16 +221,16 @@ class AsyncEvents:
 
 
 class AsyncClient(AsyncBatches, AsyncReplays, Runs, Access, Alarms, Calibrations, Spacecraft, Gyro):
-    """A client of the service at an address; a context manager that closes its connections.
+    """Client of the service at an address; a context manager that closes its connections.
 
-    `token` is sent with each request.  A request that may be sent twice is sent again after a
-    lost connection, and where the service asks for it, until the service has not answered for
-    `give_up_after_s`.  `timeout_s` is how long one attempt may wait for the next part of an
-    answer.  `trust_env` uses the proxies that the environment names; `verify` is the context of
-    TLS, or False to trust every certificate.
+    `token` is sent with each request.  A request that may be repeated is sent again after a lost
+    connection, and where the service asks for it, until the service has not answered for
+    `give_up_after_s`.  `timeout_s` bounds the wait for the next part of an answer.  `trust_env`
+    uses the proxies that the environment names; `verify` is the context of TLS, or False to trust
+    every certificate.
 
-    Raises `InvalidArgument`, a `ValueError`, for an address or a token that is none; every method
-    raises `NoAnswer` and the `Problem` of the service's answer.
+    Raises `InvalidArgument`, a `ValueError`, for an invalid address or token; every method raises
+    `NoAnswer` and the `Problem` of the service's answer.
     """
 
     def events(

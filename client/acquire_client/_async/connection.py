@@ -1,4 +1,4 @@
-"""Sending requests, again where that may help and is safe; lists, read page by page."""
+"""Connection that sends requests, repeats them if useful and safe, and reads lists by pages."""
 
 import ssl
 from collections.abc import AsyncIterator
@@ -30,7 +30,7 @@ JSON = {"Content-Type": "application/json"}
 
 
 class AsyncConnection(Caller):
-    """The connections to a service; `AsyncClient` explains the arguments."""
+    """Connections to a service; `AsyncClient` explains the arguments."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class AsyncConnection(Caller):
             base_url=self.url,
             headers=bearer_of(token),
             timeout=httpx.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
-            # As many as are asked for at once: `at_once` is the bound.
+            # No limit of its own: `at_once` is the bound.
             limits=httpx.Limits(max_connections=None, max_keepalive_connections=20),
             trust_env=trust_env,
             verify=verify,
@@ -61,11 +61,11 @@ class AsyncConnection(Caller):
         await self.aclose()
 
     async def aclose(self) -> None:
-        """Close the connections."""
+        """Close the connections to the service."""
         await self._http.aclose()
 
     async def ping(self) -> None:
-        """See that a service answers, at the first attempt.
+        """Check with a single attempt that a service answers.
 
         Raises `NoAnswer` where none does, `UnexpectedAnswer` where it is not this service.
         """
@@ -90,11 +90,11 @@ class AsyncConnection(Caller):
         headers: dict[str, str] | None = None,
         repeat: Repeat | None = None,
     ) -> httpx.Response:
-        """The answer to any request of the API; `body` is sent as JSON, `content` as it is.
+        """Send any request of the API and return the answer; `body` is sent as JSON.
 
-        Methods other than GET, PUT and DELETE are sent again only where the service has not
-        received them, unless `repeat` says otherwise.  Raises `NoAnswer` or the `Problem` of
-        the answer.
+        `content` is sent unchanged.  Methods other than GET, PUT and DELETE are sent again only
+        where the service has not received them, unless `repeat` says otherwise.  Raises `NoAnswer`
+        or the `Problem` of the answer.
         """
         if repeat is None:
             safe = method.upper() in ("GET", "HEAD", "PUT", "DELETE")
@@ -119,7 +119,7 @@ class AsyncConnection(Caller):
     async def stream(
         self, path: str, query: Query, headers: dict[str, str], silence_s: float
     ) -> AsyncIterator[AsyncIterator[bytes]]:
-        """The bytes of an answer as they come; raises the `Problem` of another answer.
+        """Stream the bytes of an answer as they arrive; raises the `Problem` of an error.
 
         A stream that is silent for `silence_s` counts as lost.  Nothing is sent again.
         """
@@ -133,28 +133,28 @@ class AsyncConnection(Caller):
             yield response.aiter_bytes()
 
     async def _carry_out(self, call: Call[T]) -> T:
-        """Send a request, and read its answer."""
+        """Send the request of a call, and read its answer."""
         asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
         response = await self.request(call.method, call.path, repeat=call.repeat, **asked)
         return call.read(response)
 
     def _listed(self, listing: Listing[Row]) -> "AsyncItems[Row]":
-        """The items of a long list."""
+        """Iterator over the items of a paged list."""
         return AsyncItems(self, listing)
 
     async def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
-        """The answer to a GET as a model."""
+        """Send a GET request; the answer as a model."""
         return decoded(await self.request("GET", path, query=query), kind)
 
     async def post(
         self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED
     ) -> T:
-        """The answer to a POST of JSON as a model."""
+        """Send a POST request with JSON; the answer as a model."""
         return decoded(await self.request("POST", path, body=body, repeat=repeat), kind)
 
 
 class AsyncItems(Generic[Row]):
-    """The items of a list: iterate over it, more than once if you like.
+    """Items of a paged list, which can be iterated repeatedly.
 
     Batches that the service records meanwhile neither repeat nor hide items.
     """
@@ -163,7 +163,7 @@ class AsyncItems(Generic[Row]):
         self._connection, self._listing = connection, listing
 
     async def __aiter__(self) -> AsyncIterator[Row]:
-        # The type is known only now, which the checker of types does not allow.
+        # The type is known only at run time, which type checkers do not allow.
         page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
         query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:
@@ -175,13 +175,13 @@ class AsyncItems(Generic[Row]):
             query["cursor"] = page.next_cursor
 
     async def all(self) -> list[Row]:
-        """Every item."""
+        """Read all items of the list."""
         return [item async for item in self]
 
     async def to_arrow(self) -> "pa.Table":
-        """A table with a row for each item; raises `PackageMissing` without pyarrow."""
+        """Arrow table with a row for each item; raises `PackageMissing` without pyarrow."""
         return table_of(await self.all(), self._listing.kind)
 
     async def to_pandas(self) -> "pd.DataFrame":
-        """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""
+        """Data frame with a row for each item; `PackageMissing` without pandas and pyarrow."""
         return pandas_of(await self.to_arrow())

@@ -1,4 +1,4 @@
-"""The differences between waiting in an event loop and in a thread: here, in a thread."""
+"""Functions that differ between waiting in an event loop and in a thread: for a thread."""
 
 import time
 from collections import deque
@@ -16,7 +16,7 @@ iterated = iter
 
 
 def bounded_map(function: Callable[[T], R], source: Source[T], at_once: int) -> Iterator[R]:
-    """The results of a function for each item, in order, of which some are at work at a time.
+    """Apply a function to each item, at most `at_once` at a time; results in order.
 
     An item is taken from the source only when there is room for it.
     """
@@ -30,5 +30,5 @@ def bounded_map(function: Callable[[T], R], source: Source[T], at_once: int) -> 
         while window:
             yield window.popleft().result()
     finally:
-        # Requests that are on their way are waited for, the others are not begun.
+        # Wait for requests in progress; do not start the others.
         pool.shutdown(cancel_futures=True)

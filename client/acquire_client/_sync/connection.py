@@ -1,4 +1,4 @@
-"""Sending requests, again where that may help and is safe; lists, read page by page."""
+"""Connection that sends requests, repeats them if useful and safe, and reads lists by pages."""
 
 import ssl
 from collections.abc import Iterator
@@ -30,7 +30,7 @@ JSON = {"Content-Type": "application/json"}
 
 
 class Connection(Caller):
-    """The connections to a service; `Client` explains the arguments."""
+    """Connections to a service; `Client` explains the arguments."""
 
     def __init__(
         self,
@@ -48,7 +48,7 @@ class Connection(Caller):
             base_url=self.url,
             headers=bearer_of(token),
             timeout=httpx.Timeout(timeout_s, connect=min(CONNECT_S, timeout_s)),
-            # As many as are asked for at once: `at_once` is the bound.
+            # No limit of its own: `at_once` is the bound.
             limits=httpx.Limits(max_connections=None, max_keepalive_connections=20),
             trust_env=trust_env,
             verify=verify,
@@ -61,11 +61,11 @@ class Connection(Caller):
         self.close()
 
     def close(self) -> None:
-        """Close the connections."""
+        """Close the connections to the service."""
         self._http.close()
 
     def ping(self) -> None:
-        """See that a service answers, at the first attempt.
+        """Check with a single attempt that a service answers.
 
         Raises `NoAnswer` where none does, `UnexpectedAnswer` where it is not this service.
         """
@@ -90,11 +90,11 @@ class Connection(Caller):
         headers: dict[str, str] | None = None,
         repeat: Repeat | None = None,
     ) -> httpx.Response:
-        """The answer to any request of the API; `body` is sent as JSON, `content` as it is.
+        """Send any request of the API and return the answer; `body` is sent as JSON.
 
-        Methods other than GET, PUT and DELETE are sent again only where the service has not
-        received them, unless `repeat` says otherwise.  Raises `NoAnswer` or the `Problem` of
-        the answer.
+        `content` is sent unchanged.  Methods other than GET, PUT and DELETE are sent again only
+        where the service has not received them, unless `repeat` says otherwise.  Raises `NoAnswer`
+        or the `Problem` of the answer.
         """
         if repeat is None:
             safe = method.upper() in ("GET", "HEAD", "PUT", "DELETE")
@@ -119,7 +119,7 @@ class Connection(Caller):
     def stream(
         self, path: str, query: Query, headers: dict[str, str], silence_s: float
     ) -> Iterator[Iterator[bytes]]:
-        """The bytes of an answer as they come; raises the `Problem` of another answer.
+        """Stream the bytes of an answer as they arrive; raises the `Problem` of an error.
 
         A stream that is silent for `silence_s` counts as lost.  Nothing is sent again.
         """
@@ -133,26 +133,26 @@ class Connection(Caller):
             yield response.iter_bytes()
 
     def _carry_out(self, call: Call[T]) -> T:
-        """Send a request, and read its answer."""
+        """Send the request of a call, and read its answer."""
         asked = {name: getattr(call, name) for name in ("query", "body", "content", "headers")}
         response = self.request(call.method, call.path, repeat=call.repeat, **asked)
         return call.read(response)
 
     def _listed(self, listing: Listing[Row]) -> "Items[Row]":
-        """The items of a long list."""
+        """Iterator over the items of a paged list."""
         return Items(self, listing)
 
     def get(self, kind: type[T], path: str, query: Query | None = None) -> T:
-        """The answer to a GET as a model."""
+        """Send a GET request; the answer as a model."""
         return decoded(self.request("GET", path, query=query), kind)
 
     def post(self, kind: type[T], path: str, body: Any, repeat: Repeat = Repeat.IF_REFUSED) -> T:
-        """The answer to a POST of JSON as a model."""
+        """Send a POST request with JSON; the answer as a model."""
         return decoded(self.request("POST", path, body=body, repeat=repeat), kind)
 
 
 class Items(Generic[Row]):
-    """The items of a list: iterate over it, more than once if you like.
+    """Items of a paged list, which can be iterated repeatedly.
 
     Batches that the service records meanwhile neither repeat nor hide items.
     """
@@ -161,7 +161,7 @@ class Items(Generic[Row]):
         self._connection, self._listing = connection, listing
 
     def __iter__(self) -> Iterator[Row]:
-        # The type is known only now, which the checker of types does not allow.
+        # The type is known only at run time, which type checkers do not allow.
         page_kind: Any = Page[self._listing.kind]  # type: ignore[name-defined]
         query = {"limit": ITEMS_A_PAGE, **self._listing.query}
         while True:
@@ -172,13 +172,13 @@ class Items(Generic[Row]):
             query["cursor"] = page.next_cursor
 
     def all(self) -> list[Row]:
-        """Every item."""
+        """Read all items of the list."""
         return list(self)
 
     def to_arrow(self) -> "pa.Table":
-        """A table with a row for each item; raises `PackageMissing` without pyarrow."""
+        """Arrow table with a row for each item; raises `PackageMissing` without pyarrow."""
         return table_of(self.all(), self._listing.kind)
 
     def to_pandas(self) -> "pd.DataFrame":
-        """The same as a data frame; raises `PackageMissing` without pandas and pyarrow."""
+        """Data frame with a row for each item; `PackageMissing` without pandas and pyarrow."""
         return pandas_of(self.to_arrow())
