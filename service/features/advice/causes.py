@@ -161,6 +161,8 @@ def star_table(sample: PeriodSample, sky: SkyModel) -> StarTable:
             ]
     angles = [row["a_priori_angle_deg"] for row in sample.rows]
     kinds = (np.int64, np.int64, "U1", *[np.float64] * 4)
+    # The first, empty part gives each column its type where the sample has no star; numpy's own
+    # annotations know no sequence of kinds.
     batch_of, tracker_of, outcome, magnitude, off_axis, offset_sigmas, offset_mag = (
         np.concatenate([np.empty(0, kind), *parts])  # type: ignore[call-overload]
         for kind, parts in zip(kinds, columns, strict=True)

@@ -126,7 +126,7 @@ def watch_run(
 @router.serves(
     "POST /runs/{run}/forget",
     Policy("operate", "body"),
-    Returns("What is removed, or would be.", Forgotten),
+    Returns("What was removed, or would be removed.", Forgotten),
     body=ForgetIn,
 )
 def forget_run(
