@@ -41,7 +41,7 @@ CANCEL_WAIT_S = 5.0
 
 
 class ReplayOptions(TypedDict, total=False):
-    """Options of a new replay."""
+    """Options of a new replay of a telemetry file."""
 
     name: str
     total: int | None

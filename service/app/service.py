@@ -199,7 +199,7 @@ class Service:
 
 
 class Events:
-    """Service that reads events."""
+    """Service that reads the recorded events and their numbers."""
 
     def __init__(self, context: Context) -> None:
         self._context = context

@@ -171,7 +171,7 @@ class Ranking(Record, frozen=True, kw_only=True):
 
 
 class GyroBlockRow(Record, frozen=True, kw_only=True):
-    """A recorded gyro block."""
+    """Gyro block as recorded, without its samples."""
 
     component: ClassVar[str] = "GyroBlock"
     client_name: ClassVar[str] = "GyroBlock"

@@ -78,8 +78,8 @@ def line_results(
 ) -> list[LineResult]:
     """Compute the result of each line of telemetry, in order; `compute` gets all new submissions.
 
-    Batches for which `asks_for_last` is true are left out: they need the results recorded before
-    them.
+    Batches for which `asks_for_last` is true are not passed to it: they need the results recorded
+    before them.
     """
     read = [_read(text, lines.run) for text in lines.texts]
     tracked = {

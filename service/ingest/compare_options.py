@@ -192,9 +192,10 @@ _WHICH = {
 def compare(
     pairs: Sequence[Pair], run_again: tuple[RunManyAgain, RunManyAgain], limit_s: float
 ) -> tuple[ComparisonTally, bool]:
-    """Run both sides of each batch; the tally, and True if `limit_s` seconds cut it short.
+    """Run a sample of batches with both sets of options; True as well if time ran out.
 
-    Many batches are solved at once, but singly while each may take seconds.
+    `limit_s` bounds the time in seconds.  Many batches are solved at once, but singly while each
+    may take seconds.
     """
     found, end_s = ComparisonTally(), time.monotonic() + limit_s
     first, count = 0, 1

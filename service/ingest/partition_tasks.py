@@ -219,7 +219,7 @@ class Workers(Protocol):
         """Start or queue a task; returns the function that waits for its result."""
 
     def close(self) -> None:
-        """Abandon the unfinished tasks."""
+        """Abandon the tasks that are not finished."""
 
 
 def attempt(solver: Solver, task: PartitionTask) -> list[Outcome]:

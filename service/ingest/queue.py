@@ -231,7 +231,7 @@ class IngestQueue:
         return [pending for pending in group if pending not in known]
 
     def _recorded_before(self, group: Sequence[PendingBatch]) -> dict[PendingBatch, Answer]:
-        """Stored answers of batches that are recorded, or errors where another body is."""
+        """Look up recorded batches: their stored answers, or errors for names with another body."""
         # Look up identities before keys, each at its own moment: a batch recorded in between is
         # found by its key, or seems new until its transaction finds it.
         try:
@@ -480,7 +480,7 @@ class RecordedCounts:
                     self.stars[*owner, name] += unsaved.counts[name]
 
     def copy(self) -> "RecordedCounts":
-        """Copy of the present counts."""
+        """Copy of the present counts of recorded batches and stars."""
         copied = RecordedCounts()
         with self._lock:
             copied.batches, copied.stars = self.batches.copy(), self.stars.copy()

@@ -318,7 +318,7 @@ def line_groups(
 
 @dataclass
 class _PendingChunk:
-    """Group of lines with its chunk, which is being computed or written."""
+    """Group of a replay's lines with its chunk, which is being computed or written."""
 
     lines: LineGroup
     chunk: BulkChunk

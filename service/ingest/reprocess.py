@@ -71,7 +71,7 @@ class ReprocessPlan:
     catalog: Path | None
     cache_bytes: int
     processes: int = 0
-    """Number of worker processes; 0: one for each core, 1: none but this process."""
+    """Number of worker processes of a reprocessing; 0: one for each core, 1: only this process."""
     track: bool = False
     """True if stars are searched about the run's last attitude, batch after batch."""
 
@@ -343,5 +343,5 @@ class _ChunkSolver:
         return found
 
     def close(self) -> None:
-        """Stop the workers."""
+        """Stop the worker processes."""
         self._workers.close()

@@ -291,7 +291,7 @@ def _turns(
 
     The step between the last two attitudes shows the rotation.  Rates of batches show it if the
     body has turned more than a quarter since the last attitude, or, without an attitude before
-    that, by their errors.
+    that, if the rates exceed their errors.
     """
     both = (last.body_rates_deg_per_s, batch.body_rates_deg_per_s)
     fastest_rad_s = math.radians(float(np.linalg.norm(both, axis=1).max()))

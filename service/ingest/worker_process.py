@@ -49,7 +49,7 @@ class WorkerConfig:
     """Version and digest of the parent's code."""
 
     def solver(self) -> Solver:
-        """Build the worker's solver.
+        """Build the solver of a worker process from its settings.
 
         Raises `BadConfiguration` where the catalog's file has changed, or the code is not the
         parent's.

@@ -137,7 +137,7 @@ def record_block(connection: Connection, block: gyro.GyroBlock, row: Row) -> Rec
 def record_or_refuse(
     connection: Connection, block: gyro.GyroBlock, row: Row
 ) -> Recorded | AcquisitionError:
-    """Record a gyro block, or return the error of `find_block`, which precedes any insert."""
+    """Record a gyro block; a refused one returns its error, and nothing is inserted."""
     try:
         return record_block(connection, block, row)
     except AcquisitionError as error:

@@ -87,7 +87,7 @@ class LimitSettings(Strict):
         return found
 
     def out(self, severity: Severity, value: float, was_out: bool) -> bool:
-        """True if a value is out of the bounds of a severity, or not yet back in them."""
+        """True if a value is out of a severity's bounds, or not back by the hysteresis."""
         bounds, within = self.bounds(severity), self.hysteresis if was_out else 0.0
         above = bounds.high is not None and value > bounds.high - within
         below = bounds.low is not None and value < bounds.low + within

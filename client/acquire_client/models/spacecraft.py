@@ -147,7 +147,7 @@ class Ranking(Model, frozen=True, kw_only=True):
 
 
 class GyroBlock(Model, frozen=True, kw_only=True):
-    """A recorded gyro block."""
+    """Gyro block as recorded, without its samples."""
 
     id: str
     spacecraft: str

@@ -216,7 +216,7 @@ def contents(connection: Connection, made: Sequence[Row]) -> Iterator[tuple[Row,
 
 
 def _adopt(connection: Connection) -> int:
-    """Give some results without a place in the record a negative place and a leaf; counts them."""
+    """Give some results without a place in the record a negative place and a leaf; counted."""
     # Results without a digest get one first.
     chosen = select(results).where(results.c.seq == 0, results.c.digest.is_not(None))
     made = rows_of(connection, chosen.limit(ADOPTED_AT_ONCE))

@@ -382,7 +382,7 @@ def insert_share(
 
 
 def forget_share(connection: Connection, part_id: int, spacecraft: str, run: str) -> None:
-    """Delete the share of an archive part whose batches are recorded again."""
+    """Delete an archive part's share of the trends, since its batches are recorded again."""
     c = tables.archived_hours.c
     own = c.spacecraft == spacecraft, c.run == run, c.part_id == part_id
     connection.execute(delete(tables.archived_hours).where(*own))

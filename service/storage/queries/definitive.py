@@ -45,7 +45,7 @@ MOST_BLOCKS = 48
 
 
 class GradedStretchInfo(Struct, frozen=True, kw_only=True):
-    """An unbroken stretch of a day."""
+    """Unbroken stretch of a day's attitude history with one model of motion."""
 
     model: str
     """`gyro`, or `constant_rate` where no gyro runs: the rate is a random walk."""

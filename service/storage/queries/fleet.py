@@ -38,7 +38,7 @@ MOST_SUMMED = 20_000
 
 _TICK_S = 1e-6
 _Sums = Sequence[tuple[Any, ...]]
-"""Rows of spacecraft, POSIX time of the start of a cell, and counts."""
+"""Database rows of counts: spacecraft, POSIX time at the start of a cell, and the counts."""
 
 
 @dataclass(frozen=True)

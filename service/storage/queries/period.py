@@ -107,7 +107,7 @@ class PeriodStars:
 
     @property
     def read(self) -> int:
-        """Number of sampled batches."""
+        """Number of batches in the sample."""
         return len(self.attitudes.time)
 
 
@@ -129,10 +129,9 @@ def sample_period(
 ) -> PeriodSample:
     """Sample a period: all batches, or pairs of neighbours spread evenly, at most `most` batches.
 
-    Each pair is drawn at random from one of equal parts of the batches, so that the sample neither
-    hits nor misses every period of a periodic effect.  The batches of an hour count as spread
-    evenly over it.  For a long period the hourly counts are read, and no more batches than for a
-    short one.
+    Each pair is drawn at random from one of equal parts of the batches, so that a periodic effect
+    is neither always nor never sampled.  The batches of an hour count as spread evenly over it.
+    For a long period the hourly counts are read, and no more batches than for a short one.
     """
     hours = read_buckets(connection, span, "hour", ("batches",))
     total = int(hours["batches"].sum())

@@ -359,8 +359,8 @@ def sample_batches(
 ) -> BatchSample:
     """Sample a period: all batches, or `size` of them, one from each of as many equal parts.
 
-    They are drawn at random, so that the sample neither hits nor misses every period of a periodic
-    effect; equal seeds draw equal samples.  Archived batches count as earlier than recorded ones.
+    They are drawn at random, so that a periodic effect is neither always nor never sampled; equal
+    seeds draw equal samples.  Archived batches count as earlier than recorded ones.
     """
     conditions = selected.conditions()
     parts = sorted(parts_of(connection, selected), key=lambda each: each.first_ns)

@@ -178,7 +178,7 @@ class Bell:
             self._subscribed.pop(news, None)
 
     def ring(self) -> None:
-        """Wake all subscribers."""
+        """Wake all event loops that wait for events."""
         with self._lock:
             subscribed = list(self._subscribed.items())
         for news, loop in subscribed:
@@ -277,7 +277,7 @@ class HeardEvents:
         self._thread.start()
 
     def close(self) -> None:
-        """End the listening thread."""
+        """Stop the thread that listens for events of other services."""
         self._closed.set()
         self._thread.join()
 

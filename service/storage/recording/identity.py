@@ -95,7 +95,7 @@ class Registry:
 def look_up(
     connection: Connection, identities: Collection[Identity], keys: Collection[OwnKey] = ()
 ) -> Registry:
-    """Look up the recorded results of identities and keys."""
+    """Look up the recorded results that hold the given batch identities and Idempotency-Keys."""
     registry = Registry()
     dialect = dialect_of(connection)
     if identities:

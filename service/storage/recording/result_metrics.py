@@ -58,7 +58,7 @@ def metrics_of(acquisition: Acquisition, stars: MeasuredStars | None = None) -> 
 
 
 def _measures(stars: MeasuredStars) -> Row:
-    """Quantities measured in stars by name, alike for a whole batch and for one tracker."""
+    """Measured values of a batch's or a tracker's stars, by name of the quantity."""
     return {
         name: source.measure(stars)
         for name, source in STORED.items()

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 HEAD = max(each.name[:4] for each in shipped("migrations", "versions").glob("[0-9]*.py"))
-"""The latest revision of `migrations/`."""
+"""Newest schema revision in the folder `migrations/`."""
 UNFINISHED = "copy:"
 """Prefix of the revision of a database that `upkeep.copy` has not finished copying."""
 

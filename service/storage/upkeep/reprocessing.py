@@ -31,7 +31,7 @@ class Reprocessing(Struct, frozen=True, kw_only=True):
     partitions: int
     partitions_done: int
     batches: int
-    """Number of batches in the selected period."""
+    """Number of batches in the period of the reprocessing."""
     before: int
     """Number of the period's batches that the run had before the command began."""
     recorded: int

@@ -54,7 +54,7 @@ PAUSE_S = 0.25
 RETRY_S = 30.0
 LOG_EVERY_S = 60.0
 Owner = tuple[str, str]
-"""A spacecraft and a run."""
+"""Key of a run to be split: spacecraft and run."""
 Place = tuple[int | None, str | None]
 """`time_ns` and id of the batch examined last; None at the beginning."""
 
